@@ -18,41 +18,42 @@ from lidarspec.framing import example_frames
 from lidarspec.sensor_operations import Sensor
 from tests.missing import describe_missing
 
-#: plugins whose tests need an environment of their own: `make test-ros2`.
+#: Plugins with tests that need a separate environment: `make test-ros2`.
 collect_ignore = ["plugins/lidarspec-ros2"]
 
-# Collecting tests makes hundreds of thousands of objects that all stay, so that looking for garbage
-# among them is a waste.
+# Collecting tests makes hundreds of thousands of objects, and all are kept. So garbage collection
+# would waste time.
 gc.disable()
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-#: variables that change what a program does; those of the tests themselves (LIDARSPEC_CAPTURES,
-#: LIDARSPEC_EXAMPLES, LIDARSPEC_KSC) stay.
-CHANGING = ("LIDARSPEC_BACKEND", "LIDARSPEC_THREADS", "LIDARSPEC_DEBUG", "LIDARSPEC_TRUST")
+#: Environment variables that change lidarspec's behaviour; unset for the tests.
+LIDARSPEC_VARIABLES = (
+    "LIDARSPEC_BACKEND",
+    "LIDARSPEC_THREADS",
+    "LIDARSPEC_DEBUG",
+    "LIDARSPEC_TRUST",
+)
 
 
 @pytest.fixture(autouse=True, scope="session")
 def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Run in a directory with no `lidarspec.toml` in it or above, with own folders for settings and
-    kernels.
-    """
+    """Run the tests with separate settings and kernel folders, and no `lidarspec.toml`."""
     base = tmp_path_factory.getbasetemp()
-    (base / "lidarspec.toml").touch()  # the nearest one counts, and none above it is looked at
+    (base / "lidarspec.toml").touch()  # only the nearest file is read
     here = base / "here"
     here.mkdir()
     every = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        for name in CHANGING:
+        for name in LIDARSPEC_VARIABLES:
             patch.delenv(name, raising=False)
         for name in ("XDG_CONFIG_HOME", "APPDATA"):
             patch.setenv(name, str(base / "settings"))
-        patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # one for all workers
-        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # programs that tests start multiply no matrices
-        if os.environ.get(
-            "PYTHONDONTWRITEBYTECODE"
-        ):  # and compile their modules once all the same, beside the sources of nobody
+        patch.setenv("LIDARSPEC_CACHE", str(every / "kernels"))  # shared by all workers
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # child processes need no BLAS threads
+        # Child processes share compiled modules in a temporary folder, for speed.
+        if os.environ.get("PYTHONDONTWRITEBYTECODE"):
             patch.delenv("PYTHONDONTWRITEBYTECODE")
             patch.setenv("PYTHONPYCACHEPREFIX", str(every / "bytecode"))
         patch.chdir(here)
@@ -61,9 +62,7 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _examples_are_made_once() -> Iterator[None]:
-    """Make each example frame once, since thousands of tests use the same frames of the same
-    sensors.
-    """
+    """Cache example frames, because thousands of tests use the same frames."""
     made: weakref.WeakKeyDictionary[Sensor, dict[tuple[str, int], bytes]] = (
         weakref.WeakKeyDictionary()
     )
@@ -82,20 +81,21 @@ def _examples_are_made_once() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def _frozen() -> None:
-    """Exempt everything that exists before a module's first test from garbage collection, which
-    saves time.
+    """Exempt all objects from garbage collection before a module's first test.
+
+    This saves time.
     """
     gc.collect(1)
     gc.freeze()
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage while the tests run."""
+    """Enable garbage collection for the tests."""
     gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print which tests were skipped because a tool or a capture is missing, and how to get it."""
+    """List the tests skipped for a missing tool or capture, and how to get it."""
     skipped = [
         report
         for report in terminalreporter.stats.get("skipped", [])

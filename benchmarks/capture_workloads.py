@@ -40,7 +40,7 @@ HOSTILE = 100_000  # bytes of a hostile stream
 
 
 def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
-    """Return a capture file to scans, against the same packets in memory."""
+    """Return the workload of computing scans from a capture, compared with packets in memory."""
     sensor, rows, path = inputs.sensor(key), inputs.array(key), inputs.capture(key)
     points = len(sensor.decode(rows).points())
 
@@ -116,14 +116,15 @@ def payloads(inputs: Inputs) -> Work:
 
 
 def one_by_one_of(path: Path) -> int:
-    """Return the same payloads as an object each."""
+    """Read the payloads as separate objects; return the sum of their sizes."""
     with CaptureReader(path) as reader:
         return sum(len(datagram.data) for datagram in reader)
 
 
 def live(inputs: Inputs) -> Work:
-    """Packets that come one by one and are decoded every 10 ms; what it costs to decode each by
-    itself beside it.
+    """Return the workload of decoding live packets every 10 ms.
+
+    It is compared with the cost of decoding each packet separately.
     """
     sensor, frames = inputs.sensor("m1"), inputs.frames("m1")
 
@@ -152,7 +153,10 @@ def live(inputs: Inputs) -> Work:
 def as_they_come(
     sensor: ls.Sensor, packets: list[bytes], together: int, backend: str
 ) -> Callable[[], None]:
-    """Decoding to points as often as so many packets have come; receiving is not counted."""
+    """Return a function that decodes live packets in batches of this size.
+
+    The time to receive the packets is not counted.
+    """
 
     def run() -> None:
         decoder = sensor.decoder(backend=backend)
@@ -168,8 +172,9 @@ def as_they_come(
 
 
 def parse(inputs: Inputs, key: str, title: str) -> Work:
-    """One frame after another to a Container, checksum included, against construct on a plain
-    struct.
+    """Return the workload of parsing single frames to Containers, with checksums.
+
+    It is compared with construct on a plain struct.
     """
     sensor, frames = inputs.sensor(key), inputs.frames(key)[:FEW]
     others: Others = {
@@ -191,8 +196,9 @@ def parse(inputs: Inputs, key: str, title: str) -> Work:
 
 
 def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callable[[], None]:
-    """Calls a function for each frame and keeps nothing: memory for all their Containers at once
-    would cost more than they do.
+    """Return a function that parses each frame and discards the result.
+
+    Keeping all Containers would cost more than parsing.
     """
 
     def run() -> None:
@@ -203,8 +209,9 @@ def one_by_one(function: Callable[[bytes], Any], frames: list[bytes]) -> Callabl
 
 
 def hostile(inputs: Inputs) -> Work:
-    """Finding the frames of streams that cost most, of each family on its fastest serial line,
-    against the rate of that line.
+    """Return the workload of finding frames in the most expensive streams.
+
+    Each family is measured on its fastest serial port, and compared with the port's data rate.
     """
     families = {
         tuple(sensor.frames): sensor
@@ -248,14 +255,15 @@ def hostile(inputs: Inputs) -> Work:
 
 
 def line_rate(sensor: ls.Sensor) -> float:
-    """Bytes per second of a sensor's serial line; 0 where it has none."""
+    """Return the bytes per second of a sensor's serial port, 0 if it has none."""
     link = sensor.links.get("data")
     return max(link.bauds) / 10 if isinstance(link, Serial) else 0.0
 
 
 def importing(inputs: Inputs) -> Work:
-    """A new process that imports lidarspec and finds a sensor, against one that imports what this
-    needs at least.
+    """Return the workload of starting a process that imports lidarspec and finds a sensor.
+
+    It is compared with a process that imports only the required libraries.
     """
 
     # As pip leaves packages behind, and not as an editable one is the first time: compiled.

@@ -87,16 +87,16 @@ TARGETS = {".npz": "np.savez", ".csv": "pyarrow.csv", ".parquet": "pyarrow.parqu
 
 
 class Captured(NamedTuple):
-    """Captures of a sensor.
+    """Description of a sensor's captures.
 
     Attributes:
-        title: of the sensor.
-        sensor: its id.
-        rate: bytes of a capture for each second.
-        suffixes: of the formats.
-        period: seconds after which its clock is where it was, so that a capture may be repeated; 0:
-            it is simulated to the end.
-        share: it is so many times smaller than others.
+        title: name of the sensor in the table.
+        sensor: id of the sensor.
+        rate: bytes of a capture per second.
+        suffixes: suffixes of the formats to convert to.
+        period: seconds after which the sensor's clock wraps, so that a capture can be repeated.
+            0: the whole capture is simulated.
+        share: divisor of the usual size of a capture.
     """
 
     title: str
@@ -118,13 +118,14 @@ CAPTURES: Mapping[str, Captured] = {
 
 @dataclass
 class Spent:
-    """What a process took, and what it wrote.
+    """Resources that a process and its children used.
 
     Attributes:
-        seconds, processor: that passed, and of the processors, of those that it started too.
-        memory: bytes, of the largest of these processes.
-        flushed: seconds more until what it wrote was on the disk.
-        size: bytes that it wrote.
+        seconds: elapsed time.
+        processor: processor time in seconds.
+        memory: bytes of the largest process.
+        flushed: additional seconds until the output was on the disk.
+        size: bytes of the output.
     """
 
     seconds: float
@@ -135,8 +136,9 @@ class Spent:
 
 
 def process(*command: object) -> Spent:
-    """Runs Python with these arguments; modules are compiled once, as where they are installed,
-    whatever this process is told.
+    """Run Python with these arguments, and return the resources it used.
+
+    Modules are compiled once, as in an installation, even if PYTHONDONTWRITEBYTECODE is set.
     """
     line = [sys.executable, "-S", "-c", LAUNCHER, sys.executable, *map(str, command)]
     environment = {
@@ -149,7 +151,7 @@ def process(*command: object) -> Spent:
 
 
 def capture(inputs: Inputs, key: str, size: int) -> Path:
-    """Return a simulated capture of about so many bytes."""
+    """Return a simulated capture of about `size` bytes."""
     path, made = inputs.folder / f"{key}-{size}.pcap", CAPTURES[key]
     if path.exists():
         return path
@@ -165,7 +167,7 @@ def capture(inputs: Inputs, key: str, size: int) -> Path:
 
 
 def write_simulated_capture(path: Path, sensor: str, seconds: float) -> Path:
-    """Return a capture of a simulated sensor."""
+    """Write a capture of a simulated sensor; return its path."""
     line = [
         sys.executable,
         "-m",
@@ -182,8 +184,9 @@ def write_simulated_capture(path: Path, sensor: str, seconds: float) -> Path:
 
 
 def write_repeated_capture(once: Path, path: Path, size: int, period: int) -> Path:
-    """A capture of about so many bytes that holds another one again and again, each time a period
-    later; its records have one length.
+    """Write a capture of about `size` bytes that repeats another one; return its path.
+
+    Each repetition is one period later. All records must have the same length.
     """
     data = np.fromfile(once, np.uint8)
     head, records = data[:24], data[24:]
@@ -198,41 +201,40 @@ def write_repeated_capture(once: Path, path: Path, size: int, period: int) -> Pa
 
 @functools.cache
 def points_of(path: Path, sensor: str) -> int:
-    """Return the points of a capture that are written."""
+    """Return the number of points that a conversion of the capture writes."""
     with ls.open(path, sensor) as device:
         return sum(int(scan.points.valid.sum()) for scan in device.scans())
 
 
 def files(out: Path) -> Iterator[Path]:
-    """Return a file itself, or all of a folder."""
+    """Return an iterator of the file itself, or of all files of a folder."""
     return (file for file in (out.rglob("*") if out.is_dir() else [out]) if file.is_file())
 
 
 def flush(out: Path) -> None:
-    """Waits until a file or folder is on the disk."""
+    """Wait until a file or folder is on the disk."""
     for file in files(out):
         with file.open("rb") as opened:
             os.fsync(opened)
 
 
 def clear(folder: Path) -> None:
-    """Takes away what a run left: removing a large file takes a while that is no part of the next
-    run.
+    """Remove the output of a run.
+
+    Removing a large file takes time, which must not be counted in the next run.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
 
 
 def copy(out: Path) -> None:
-    """Copies a file or folder beside itself, onto the disk."""
+    """Copy a file or folder to the same folder, and wait until it is on the disk."""
     for number, file in enumerate(list(files(out))):
         flush(Path(shutil.copyfile(file, out.parent / f"copy-{number}")))
 
 
 class Beside(NamedTuple):
-    """A command that a work is compared with: its arguments, the points that it writes, the modules
-    that it needs.
-    """
+    """A command to compare with: its arguments, number of points, and required modules."""
 
     command: tuple[object, ...]
     amount: int
@@ -247,8 +249,9 @@ def written(
     command: tuple[object, ...],
     commands: Mapping[str, Beside],
 ) -> Work:
-    """A command of lidarspec that writes a file or a folder, beside copying that and beside other
-    commands.
+    """Return the workload of a lidarspec command that writes a file or folder.
+
+    It is compared with copying the output and with other commands.
     """
     spent: dict[str, Spent] = {}
     clear(out.parent)
@@ -303,7 +306,7 @@ def written(
 
 
 def converting(inputs: Inputs, key: str, suffix: str) -> Work:
-    """Return a capture to a file, beside what a user would write."""
+    """Return the workload of converting a capture, compared with code of a user."""
     made, out = CAPTURES[key], inputs.folder / "out" / f"points{suffix}"
     path, part = (
         capture(inputs, key, inputs.size // made.share),
@@ -338,7 +341,7 @@ def converting(inputs: Inputs, key: str, suffix: str) -> Work:
 
 
 def many(inputs: Inputs, suffix: str) -> Work:
-    """Several captures into a folder by four processes, beside one."""
+    """Return the workload of converting several captures with four processes or with one."""
     made, out = CAPTURES["m1"], inputs.folder / "out" / "points"
     part, folder = capture(inputs, "m1", inputs.size // SMALLER), inputs.folder / f"many{suffix}"
     folder.mkdir(exist_ok=True)

@@ -25,7 +25,7 @@ CODES = np.arange(1 << 16)
 
 @functools.cache
 def _m1_tables() -> dict[str, Floats]:
-    """By the raw value as it is loaded little-endian, where the wire is big-endian."""
+    """Return lookup tables by the big-endian raw value loaded as little-endian."""
     code = CODES.astype("<u2").view(">u2").astype(np.float64)
     angle = np.deg2rad(code * 0.01 - 327.68)
     distance = np.where(code > 0, code * 0.005, np.nan)
@@ -37,8 +37,10 @@ def _m1_tables() -> dict[str, Floats]:
 
 
 def m1_points(packets: Bytes) -> Floats:
-    """x y z intensity of RS-LiDAR-M1 packets (n, 1210): float32, (4, n * 125); nan where there is
-    no return.
+    """Return x, y, z and intensity of RS-LiDAR-M1 packets, (n, 1210).
+
+    Returns:
+        float32, (4, n * 125); NaN if there is no return.
     """
     tables = _m1_tables()
     block = np.dtype({"names": ["channels"], "formats": ["V45"], "offsets": [2], "itemsize": 47})
@@ -73,11 +75,13 @@ def m1_points(packets: Bytes) -> Floats:
 
 
 def vlp16_points(packets: Bytes) -> Floats:
-    """x y z intensity of VLP-16 packets (n, 1206) with single return: float32, (4, n * 384); nan
-    where there is no return.
+    """Return x, y, z and intensity of VLP-16 packets with single return, (n, 1206).
 
-    Each firing lies on the way to the next block; where that is further than the sensor turns, the
-    step before counts.
+    The azimuth of each firing is interpolated to the next block. If the step is larger than the
+    sensor can turn, the previous step is used.
+
+    Returns:
+        float32, (4, n * 384); NaN if there is no return.
     """
     slot = np.arange(32)
     elevation = np.deg2rad(
@@ -121,8 +125,10 @@ def vlp16_points(packets: Bytes) -> Floats:
 
 
 def xt32_points(packets: Bytes) -> Floats:
-    """x y z intensity of PandarXT-32 packets (n, 1080) in steps of 4 mm: float32, (4, n * 256); nan
-    where there is no return.
+    """Return x, y, z and intensity of PandarXT-32 packets in steps of 4 mm, (n, 1080).
+
+    Returns:
+        float32, (4, n * 256); NaN if there is no return.
     """
     elevation, offset = np.deg2rad(15.0 - np.arange(32)), np.zeros(32)
     level, rise = (
@@ -157,11 +163,15 @@ def xt32_points(packets: Bytes) -> Floats:
 
 
 def payloads(path: Path) -> Bytes:
-    """The UDP payloads of a little-endian pcap file with Ethernet and IPv4 whose records are all
-    alike: uint8, (n, size), not copied.
+    """Return the UDP payloads of a pcap file with equal records, without copying.
+
+    The file is little-endian, with Ethernet and IPv4.
+
+    Returns:
+        uint8, (n, size).
 
     Raises:
-        ValueError: if they are not.
+        ValueError: if the records differ in length or headers.
     """
     data = np.fromfile(path, np.uint8)
     length = 16 + int(data[32:36].view("<u4")[0])
@@ -174,8 +184,9 @@ def payloads(path: Path) -> Bytes:
 
 
 def m1_scans(path: Path) -> list[Floats]:
-    """x y z intensity of each frame of an RS-LiDAR-M1 in a pcap file, which begins where the packet
-    number falls.
+    """Return x, y, z and intensity of each frame of an RS-LiDAR-M1 in a pcap file.
+
+    A new frame begins when the packet number decreases.
     """
     packets = np.ascontiguousarray(payloads(path))
     number = packets[:, 4].astype(np.intp) << 8 | packets[:, 5]
@@ -184,21 +195,21 @@ def m1_scans(path: Path) -> list[Floats]:
 
 
 class Scratch:
-    """Arrays for a chunk of so many points, used again for the next one."""
+    """Arrays for a chunk of points, reused for the next chunk."""
 
     def __init__(self, points: int) -> None:
         self.index = np.empty(points, np.intp)
         self.single = np.empty((5, points), np.float32)
 
     def directions(self, clockwise: NDArray[np.float64], count: int) -> tuple[Floats, Floats]:
-        """Return the cosine and the sine of angles in degrees, turned counter-clockwise."""
+        """Return the cosine and the sine of angles in degrees, rotated counter-clockwise."""
         angle, east, north = (row[:count] for row in self.single[2:])
         np.multiply(clockwise.reshape(-1), -np.pi / 180, out=angle, casting="same_kind")
         return np.cos(angle, out=east), np.sin(angle, out=north)
 
 
 def lookup(table: Floats, codes: NDArray[Any], scratch: Scratch, out: Floats) -> None:
-    """The table's values for these codes."""
+    """Return the table's values for these codes."""
     index = scratch.index[: len(out)]
     np.copyto(index, codes)
     table.take(index, out=out, mode="wrap")
@@ -210,5 +221,5 @@ def _metres(step: float) -> Floats:
 
 
 def column(buffer: NDArray[Any], offset: int, kind: str, stride: int, count: int) -> NDArray[Any]:
-    """Return a field of each of so many elements that stand at one distance."""
+    """Return one field of elements at a constant stride."""
     return np.ndarray((count,), kind, buffer.view(np.uint8).data, offset, (stride,))

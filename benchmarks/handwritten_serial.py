@@ -20,8 +20,9 @@ NODE_CHUNK = 1 << 16  # nodes
 
 @functools.cache
 def _crc_tables() -> list[NDArray[np.uint8]]:
-    """What each pair of bytes adds to the CRC-8 (0x4d) of the 46 bytes before it, by the pair
-    loaded little-endian.
+    """Return what each pair of bytes adds to the CRC-8 (0x4d) of 46 bytes.
+
+    The tables are indexed by the position of the pair and its little-endian value.
     """
     single = np.arange(256)
     for _ in range(8):
@@ -36,8 +37,9 @@ def _crc_tables() -> list[NDArray[np.uint8]]:
 
 
 def _good(frames: Bytes) -> NDArray[np.bool_]:
-    """Which STL-27L frames (n, 47) have their checksum, angles below 360 degrees and a time of at
-    most 30 s.
+    """Return which STL-27L frames, (n, 47), are valid.
+
+    Their checksum is right, angles are below 360 degrees, and the time is at most 30 s.
     """
     pairs = np.ascontiguousarray(frames[:, : STL_FRAME - 1]).view("<u2")
     crc = np.zeros(len(frames), np.uint8)
@@ -51,9 +53,7 @@ def _good(frames: Bytes) -> NDArray[np.bool_]:
 
 
 def stl27l_points(frames: Bytes) -> Floats:
-    """x y intensity of STL-27L frames (n, 47), those with a wrong checksum left out: float32, (3,
-    points).
-    """
+    """Return x, y and intensity of valid STL-27L frames, (n, 47): float32, (3, points)."""
     found = np.empty((3, len(frames) * STL_POINTS), np.float32)
     end = 0
     for start in range(0, len(frames), STL_CHUNK):
@@ -64,7 +64,7 @@ def stl27l_points(frames: Bytes) -> Floats:
 
 
 def _stl27l_chunk(frames: Bytes, found: Floats, start: int) -> int:
-    """Write the points of good frames from column `start` on; the column after them."""
+    """Write the points of valid frames from column `start` on; return the next column."""
     first, final = (
         np.ascontiguousarray(frames[:, at : at + 2]).view("<u2").astype(np.float64)
         for at in (4, 42)
@@ -87,8 +87,9 @@ def _stl27l_ranges() -> Floats:
 
 
 def stl27l_stream(data: bytes) -> Floats:
-    """x y intensity of the STL-27L frames in a stream of bytes with noise, the leftmost of frames
-    that overlap.
+    """Return x, y and intensity of the STL-27L frames in a stream with noise.
+
+    If frames overlap, the first is used.
     """
     stream = np.frombuffer(data, np.uint8)
     here = np.flatnonzero(stream[: len(stream) - STL_FRAME + 1] == 0x54)
@@ -108,8 +109,10 @@ def stl27l_stream(data: bytes) -> Floats:
 
 
 def _leftmost(spots: NDArray[np.intp], free: int) -> NDArray[np.bool_]:
-    """Which frames at these offsets do not overlap one that was chosen before, the first byte left
-    being at `free`.
+    """Return which frames do not overlap an earlier selected frame.
+
+    Args:
+        free: the first offset at which a frame may start.
     """
     chosen = np.ones(len(spots), np.bool_)
     if bool((np.diff(spots, prepend=free - STL_FRAME) < STL_FRAME).any()):
@@ -120,8 +123,12 @@ def _leftmost(spots: NDArray[np.intp], free: int) -> NDArray[np.bool_]:
 
 
 def m1c1_points(packets: Bytes) -> Floats:
-    """x y intensity of M1C1_Mini packets (n, 10 + 3 k), those with a wrong checksum or angle left
-    out: float32, (3, points).
+    """Return x, y and intensity of valid M1C1_Mini packets, (n, 10 + 3 k).
+
+    Packets with a wrong checksum or angle are left out.
+
+    Returns:
+        float32, (3, points).
     """
     count = (packets.shape[1] - 10) // 3
     step = max(M1C1_CHUNK // count, 1)
@@ -135,7 +142,10 @@ def m1c1_points(packets: Bytes) -> Floats:
 
 
 def _m1c1_good(rows: Bytes) -> NDArray[np.bool_]:
-    """Which packets of one length have their checksum and angles below 360 degrees."""
+    """Return which packets of one length are valid.
+
+    Their checksum is right and angles are below 360 degrees.
+    """
     words = np.ascontiguousarray(rows[:, :10]).view("<u2")
     samples = rows[:, 10:].reshape(len(rows), -1, 3)
     low, middle, high = (
@@ -181,7 +191,10 @@ def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> 
 
 @functools.cache
 def _m1c1_tables() -> tuple[Floats, Floats, Floats]:
-    """Range and correction by the upper two bytes of a sample, intensity by the lower two."""
+    """Return lookup tables of a sample.
+
+    Range and correction are indexed by its upper two bytes, intensity by its lower two.
+    """
     mm = CODES >> 2
     correction = np.rad2deg(
         np.arctan(19.16 * (np.maximum(mm, 1) - 90.15) / (90.15 * np.maximum(mm, 1)))
@@ -195,8 +208,9 @@ def _m1c1_tables() -> tuple[Floats, Floats, Floats]:
 
 
 def m1c1_stream(data: bytes) -> Floats:
-    """x y intensity of the M1C1_Mini packets in a stream of bytes, the leftmost of those that
-    overlap.
+    """Return x, y and intensity of the M1C1_Mini packets in a stream of bytes.
+
+    If packets overlap, the first is used.
     """
     stream = np.frombuffer(data, np.uint8)
     here = np.flatnonzero((stream[:-1] == 0xAA) & (stream[1:] == 0x55))
@@ -233,7 +247,7 @@ def m1c1_stream(data: bytes) -> Floats:
 
 
 def rplidar_points(nodes: Bytes) -> Floats:
-    """x y intensity of RPLIDAR nodes (n, 5), those that are none left out: float32, (3, n)."""
+    """Return x, y and intensity of valid RPLIDAR nodes, (n, 5): float32, (3, n)."""
     head, check = nodes[:, 0], nodes[:, 1]
     angle = column(nodes, 1, "<u2", 5, len(nodes))
     good = ((head ^ head >> 1) & 1 == 1) & (check & 1 == 1) & (angle < 46080)
@@ -254,15 +268,17 @@ def rplidar_points(nodes: Bytes) -> Floats:
 
 
 def rplidar_stream(data: bytes, opening: int) -> Floats:
-    """Return the same of a stream of nodes behind so many other bytes, if nothing disturbs it."""
+    """Return x, y and intensity of an undisturbed stream of nodes after a prefix."""
     stream = np.frombuffer(data, np.uint8)[opening:]
     return rplidar_points(stream[: len(stream) // 5 * 5].reshape(-1, 5))
 
 
 @functools.cache
 def _node_tables() -> tuple[Floats, Floats, Floats, Floats]:
-    """Cosine and sine by the angle's two bytes, range by the distance's, and quality by the first
-    byte.
+    """Return lookup tables of a node.
+
+    Cosine and sine are indexed by the angle's two bytes, range by the distance's, and quality by
+    the first byte.
     """
     angle = -np.deg2rad((CODES >> 1) / 64)
     tables = (

@@ -32,7 +32,7 @@ ANNOUNCED_INTERVAL = 40
 
 
 def streams(subject: SensorUnderTest, length: int) -> dict[str, list[bytes]]:
-    """Return streams of at least `length` bytes by their kind, as pieces: frames and fragments."""
+    """Return streams of at least `length` bytes by kind, as lists of frames and fragments."""
     sensor = subject.sensor
     source = subject.source("hostile 0")
     makers = _makers(subject)
@@ -73,7 +73,7 @@ def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], byt
         return subject.example(name, seed=source.randrange(EXAMPLES))
 
     def behind(source: random.Random, name: str, data: bytes) -> bytes:
-        """Return bytes that begin like a frame, at times behind their announcement."""
+        """Return `data`, sometimes after an announcement of its frame type."""
         announced = after[name]
         return (
             example(source, announced) + data

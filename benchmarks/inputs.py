@@ -54,7 +54,7 @@ class Noisy:
 
     Attributes:
         data: the bytes.
-        intact: the offsets of the frames that nothing happened to.
+        intact: the offsets of the undamaged frames.
     """
 
     data: bytes
@@ -62,11 +62,11 @@ class Noisy:
 
 
 class Inputs:
-    """The inputs of one run, each made when it is first asked for.
+    """The inputs of one run, each made on first use.
 
     Args:
-        folder: where capture files are written.
-        quick: make so few frames that a run takes a moment.
+        folder: folder for capture files.
+        quick: make few frames, for a short run.
         size: bytes of a capture that is converted.
     """
 
@@ -89,12 +89,14 @@ class Inputs:
         ).reshape(-1, size)
 
     def stream(self, key: str) -> bytes:
-        """Return all frames in a row, after what the sensor sends before them."""
+        """Return all frames in a row, after the frames that the sensor sends first."""
         return make_opening_frame(self.sensor(key)) + b"".join(self.frames(key))
 
     def noisy(self, key: str) -> Noisy:
-        """Return the frames with one byte of every fiftieth damaged, and as many runs of noise of a
-        frame's mean length between them.
+        """Return the frames with noise between them and damage in every fiftieth.
+
+        One byte of each damaged frame is changed. The runs of noise are as many, and have the mean
+        length of a frame.
         """
         random = np.random.default_rng(SEED)
         pieces: list[bytes | bytearray] = []

@@ -40,8 +40,9 @@ VELODYNE = {"vlp16": ("VLP16", 754), "vlp32c": ("VLP32C", 1507), "vls128": ("Alp
 
 
 def velodyne_packets(key: str, frames: Sequence[bytes], points: int) -> Contender:
-    """velodyne-decoder on packets, a tenth of a second to a scan, its vectors of packets made
-    beforehand.
+    """Prepare velodyne-decoder on packets, a tenth of a second to a scan.
+
+    Its vectors of packets are made in advance.
     """
     vd, (model, rate) = library("velodyne_decoder"), VELODYNE[key]
     config, turn = vd.Config(), -(-rate // 10)
@@ -55,7 +56,7 @@ def velodyne_packets(key: str, frames: Sequence[bytes], points: int) -> Contende
 
 
 def velodyne_pcap(path: Path, points: int) -> Contender:
-    """velodyne-decoder on a pcap file of VLP-16 packets."""
+    """Prepare velodyne-decoder on a pcap file of VLP-16 packets."""
     vd = library("velodyne_decoder")
     config = vd.Config()
     config.model = vd.Model.VLP16
@@ -63,7 +64,7 @@ def velodyne_pcap(path: Path, points: int) -> Contender:
 
 
 def dpkt_payloads(path: Path, packets: int) -> Contender:
-    """dpkt's objects, from Ethernet to the payload of UDP."""
+    """Prepare dpkt, with an object for each protocol from Ethernet to UDP."""
     dpkt = library("dpkt")
 
     def run() -> int:
@@ -77,7 +78,7 @@ def dpkt_payloads(path: Path, packets: int) -> Contender:
 
 
 def ouster_payloads(path: Path, packets: int) -> Contender:
-    """Return the C++ reader under ouster-sdk: the payloads of a capture into one buffer."""
+    """Prepare ouster-sdk's C++ reader, which copies the payloads of a capture to one buffer."""
     pcap = library("ouster.sdk._bindings.pcap")
     buffer = np.empty(1 << 16, np.uint8)
 
@@ -98,8 +99,9 @@ def ouster_payloads(path: Path, packets: int) -> Contender:
 def ouster_scans(
     frames: Sequence[bytes], metadata: dict[str, dict[str, Any]], points: int
 ) -> Contender:
-    """ouster-sdk on lidar packets, 64 to a scan: all fields and coordinates; its packets are made
-    beforehand.
+    """Prepare ouster-sdk on lidar packets, 64 to a scan: all fields and coordinates.
+
+    Its packets are made in advance.
     """
     core = library("ouster.sdk.core")
     flat = {
@@ -125,19 +127,19 @@ def ouster_scans(
 
 
 def rplidar_nodes(frames: Sequence[bytes]) -> Contender:
-    """Return the package rplidar, what it makes of each node."""
+    """Prepare the package rplidar, which converts each node."""
     parse = library("rplidar")._process_scan
     return Contender(lambda: [parse(frame) for frame in frames], len(frames))
 
 
 def lds2d_stream(model: str, data: bytes, points: int) -> Contender:
-    """lds2d's driver on a byte stream."""
+    """Prepare lds2d's driver on a byte stream."""
     driver = library("lds2d").core.driver_for(model)
     return Contender(lambda: _until_end(driver(_Recorded(data))), points)
 
 
 class _Recorded:
-    """A serial port for lds2d that has sent all its bytes in the end."""
+    """A serial port for lds2d that returns recorded bytes."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._spot = data, 0

@@ -31,12 +31,12 @@ SECONDS, QUICK_SECONDS = 2.0, 0.2
 
 
 class Line:
-    """A line at a rate, and what was measured on it in each run.
+    """A connection with a fixed frame rate, and the measurements of each run.
 
     Args:
         rate: frames per second.
-        opened: makes the two ends of the line: the SOURCE, and the words and descriptors that the
-            sender needs.
+        opened: opens both ends of the connection: the SOURCE, and the arguments and descriptors of
+            the sender.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Line:
         self.share: dict[str, list[float]] = {}
 
     def run(self, backend: str) -> None:
-        """Receive everything, and keep the median delay in ms and the share of a core."""
+        """Receive everything, and record the median delay in ms and the share of a core."""
         with tempfile.TemporaryDirectory() as folder, self._opened() as (source, words, kept):
             path, times = Path(folder, "frames"), Path(folder, "times")
             path.write_bytes(b"".join(self._frames))
@@ -94,7 +94,10 @@ class Line:
 
 
 def arrivals(device: ls.Device, sender: subprocess.Popen[bytes]) -> Iterator[int]:
-    """For each packet when its points were there, until the sender is done."""
+    """Return the time at which the points of each packet were ready.
+
+    It returns when the sender is done.
+    """
     for packets in device.packets(wait=0.15):
         if len(packets):
             columns(packets.points())
@@ -130,7 +133,7 @@ def live(
     rate: float,
     opened: Callable[[], contextlib.AbstractContextManager[Any]],
 ) -> Work:
-    """Return a line at its sensor's rate for some seconds."""
+    """Return the workload of a connection at its sensor's rate for some seconds."""
     seconds = QUICK_SECONDS if inputs.is_quick else SECONDS
     frames = [row.tobytes() for row in inputs.array(key)]
     line, number = Line(inputs.sensor(key), frames, rate, seconds, opened), int(rate * seconds)

@@ -28,17 +28,17 @@ class Timed(Protocol):
     amount: int
 
     def seconds(self, repeats: int, clock: Clock) -> float:
-        """Return the mean seconds of one of several runs in a row."""
+        """Run `repeats` times; return the mean seconds of a run."""
 
 
 @dataclass
 class Contender:
-    """Something that does a work, or a part of it.
+    """A function to time.
 
     Attributes:
-        run: does it once.
-        amount: how many points (or packets, frames, whatever the work counts) that is.
-        after: what follows a run and is not timed.
+        run: runs the function once.
+        amount: number of points, packets or frames of one run.
+        after: called after the runs, not timed.
     """
 
     run: Callable[[], Any]
@@ -46,7 +46,7 @@ class Contender:
     after: Callable[[], None] | None = None
 
     def seconds(self, repeats: int, clock: Clock) -> float:
-        """Return the mean seconds of one of several runs in a row."""
+        """Run `repeats` times; return the mean seconds of a run."""
         start = clock()
         for _ in range(repeats):
             self.run()
@@ -65,11 +65,11 @@ LEAST_STEP = 1e-6
 def measure_contenders(
     contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter
 ) -> Rates:
-    """Seconds for each of the amount, by contender, one figure for each run.
+    """Return the seconds per unit of the amount, by contender, a value for each run.
 
     Args:
-        least: seconds; what takes less is repeated within a run until it takes that long. To see
-            that, each runs twice before; not with 0.
+        least: minimum seconds of a run. A faster contender is repeated within a run. To find the
+            number of repeats, each contender runs twice beforehand; 0 disables this.
     """
     repeats = {
         name: _repeats(contender, least, clock) if least else 1
@@ -88,9 +88,7 @@ def _repeats(contender: Timed, least: float, clock: Clock) -> int:
 
 
 def cpu_seconds() -> float:
-    """What this process, all its threads and the processes that it waited for have taken of the
-    processors.
-    """
+    """Return the processor time of this process and of its finished children."""
     times = [
         resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     ]
@@ -98,7 +96,7 @@ def cpu_seconds() -> float:
 
 
 def times(rates: Rates, fast: str, slow: str) -> float:
-    """How many times as fast the first is as the second: the median over the runs."""
+    """Return the speed of the first relative to the second: the median over the runs."""
     return median(behind / ahead for ahead, behind in zip(rates[fast], rates[slow], strict=True))
 
 

@@ -34,25 +34,26 @@ FEW = 150
 
 
 def no_facts(backend: str, rates: Rates) -> Facts:
-    """Nothing to say besides the times."""
+    """Return no numbers for the last column."""
     return {}
 
 
 @dataclass(frozen=True)
 class Work:
-    """One line of the table for each back end.
+    """A workload: one line of the table for each back end.
 
     Attributes:
-        title: what it is.
-        unit: what is counted.
-        amount, size: of one run, in that unit and in bytes; a size of 0 has no share of memcpy.
-        ours: what lidarspec does, by back end.
-        others: what it is compared with.
-        own: what each back end is compared with of its own, for `facts`.
-        facts: more numbers for the last column, by back end and rates.
-        has_backends: False where the back end changes nothing.
-        after: what follows a run of ours untimed, where a run takes so long that there is one, and
-            none before.
+        title: name of the workload.
+        unit: unit of the amount.
+        amount: number of units in one run.
+        size: bytes of one run; 0 if it is not compared with memcpy.
+        ours: returns lidarspec's function for a back end.
+        others: contenders to compare with.
+        own: returns additional contenders for a back end, for `facts`.
+        facts: returns numbers for the last column, from back end and rates.
+        has_backends: False if the back end makes no difference.
+        after: called after each run of ours, not timed. Set if a run takes so long that it is not
+            repeated.
     """
 
     title: str
@@ -67,7 +68,7 @@ class Work:
     after: Callable[[], None] | None = None
 
     def prepare_others(self) -> tuple[dict[str, Timed], dict[str, str]]:
-        """Prepare the others; return them, and the reason for each that is missing."""
+        """Prepare the contenders; return them, and the reason for each missing one."""
         contenders: dict[str, Timed] = {}
         missing: dict[str, str] = {}
         for name, prepare in self.others.items():
@@ -80,8 +81,9 @@ class Work:
 
 
 def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
-    """The columns that every work wants; an engine that makes them when they are read makes them
-    here.
+    """Return the columns that every workload needs.
+
+    An engine that computes columns on access computes them here.
     """
     if cloud.shape is None:
         return (
@@ -93,22 +95,22 @@ def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
 
 
 def points_of(sensor: ls.Sensor, data: Any, backend: str) -> Callable[[], Any]:
-    """Decoding to x y z intensity."""
+    """Return a function that decodes data to x, y, z and intensity."""
     return lambda: columns(sensor.decode(data, backend=backend).points())
 
 
 def plainly(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
-    """Return the same with the plain evaluation of `points`."""
+    """Return a function that decodes data with the plain evaluation of `points`."""
     return lambda: columns(evaluate_plainly(sensor.decode(data, backend="numpy")).cloud)
 
 
 def evaluating(packets: Packets) -> Callable[[], Any]:
-    """Only the step from packets that are found already to points."""
+    """Return a function that computes the points of decoded packets."""
     return lambda: columns(packets.points())
 
 
 def beside_construct(inputs: Inputs, key: str) -> Others:
-    """construct, plain and compiled, on some of the clean frames that have the full length."""
+    """Prepare construct, plain and compiled, on some undamaged frames of full length."""
     rows = inputs.array(key)
     frames = [row.tobytes() for row in rows[:FEW]]
     points = (
@@ -123,7 +125,7 @@ def beside_construct(inputs: Inputs, key: str) -> Others:
 
 
 def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
-    """Packets of one length in an array."""
+    """Return the workload of packets of one length in an array."""
     sensor, rows = inputs.sensor(key), inputs.array(key)
     points = len(sensor.decode(rows).points())
     others: Others = {
@@ -156,7 +158,7 @@ def in_stream(
     more: Others,
     facts: Any = no_facts,
 ) -> Work:
-    """Return a byte stream to points: framing and checksums included."""
+    """Return the workload of a byte stream to points, with framing and checksums."""
     sensor = inputs.sensor(key)
     points = len(sensor.decode(data).points())
     others: Others = {
@@ -186,13 +188,13 @@ def vlp16(inputs: Inputs) -> Work:
 
 
 def beside_velodyne_decoder(inputs: Inputs, key: str) -> Others:
-    """velodyne-decoder on all packets."""
+    """Prepare velodyne-decoder on all packets."""
     frames = inputs.frames(key)
     return {"velodyne-decoder": lambda: libraries.velodyne_packets(key, frames, len(frames) * 384)}
 
 
 def velodyne(inputs: Inputs, key: str, title: str) -> Work:
-    """Packets of a model that nobody has decoded by hand here."""
+    """Return the workload of packets of a model without a handwritten decoder."""
     sensor, rows = inputs.sensor(key), inputs.array(key)
     points = len(rows) * 384
     others: Others = {
@@ -210,8 +212,9 @@ def beside_ouster_sdk(prepare: Callable[..., Contender], *arguments: Any) -> Tim
 
 
 def ouster(inputs: Inputs) -> Work:
-    """Every field and the coordinates, beside the vendor's own library; without CRCs, which that
-    does not check.
+    """Return the workload of every field and the coordinates, compared with ouster-sdk.
+
+    CRCs are not verified, because ouster-sdk does not verify them.
     """
     sensor, rows = inputs.sensor("ouster"), inputs.array("ouster").copy()
     rows[:, -8:] = 0
@@ -252,7 +255,7 @@ FIXED: Mapping[str, tuple[str, Callable[[ls.Sensor, bytes], ls.Sensor], bool]] =
 
 
 def beside_fixed(inputs: Inputs, key: str) -> Work:
-    """Return the sensor's frames, and the same bytes read with every field at a fixed place."""
+    """Return the workload of the sensor's frames, compared with fields at fixed offsets."""
     title, made, is_stream = FIXED[key]
     sensor, simple = inputs.sensor(key), made(inputs.sensor(key), inputs.frames(key)[0])
     data: Any = b"".join(inputs.frames(key)) if is_stream else inputs.array(key)
@@ -271,7 +274,7 @@ def beside_fixed(inputs: Inputs, key: str) -> Work:
 
 
 def in_text(inputs: Inputs, key: str, title: str) -> Work:
-    """Return a stream of frames in text."""
+    """Return the workload of a stream of frames in text."""
     sensor, data = inputs.sensor(key), b"".join(inputs.frames(key))
     points = len(sensor.decode(data).points())
     others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}
@@ -288,8 +291,9 @@ def rplidar(inputs: Inputs) -> Work:
 
 
 def stl27l_stream(inputs: Inputs) -> Work:
-    """The stream in which frames are damaged and noise stands between them; intact frames that are
-    not found are counted.
+    """Return the workload of a stream with damaged frames and noise.
+
+    Undamaged frames that are not found are counted.
     """
     noisy, sensor = inputs.noisy("stl27l"), inputs.sensor("stl27l")
     frames = inputs.frames("stl27l")[:FEW]

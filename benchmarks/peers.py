@@ -115,6 +115,6 @@ STRUCTS = {
 
 
 def construct_on(key: str, frames: Sequence[bytes], points: int, *, compiled: bool) -> Contender:
-    """construct parsing these frames one after another; no points are made of them."""
+    """Prepare construct on these frames, one at a time, without computing points."""
     parse: Callable[[bytes], Any] = (STRUCTS[key].compile() if compiled else STRUCTS[key]).parse
     return Contender(lambda: [parse(frame) for frame in frames], points)

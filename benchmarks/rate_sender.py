@@ -18,7 +18,7 @@ from pathlib import Path
 
 
 def sender(kind: str, where: str) -> Callable[[bytes], object]:
-    """What sends one frame."""
+    """Return the function that sends one frame."""
     if kind == "udp":
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         made.connect(("127.0.0.1", int(where)))
@@ -34,7 +34,7 @@ def sender(kind: str, where: str) -> Callable[[bytes], object]:
 def main(
     path: str, size: str, rate: str, seconds: str, burst: str, times: str, kind: str, where: str
 ) -> None:
-    """Send, print the number, and wait a moment before the line is closed."""
+    """Send the frames, print their number, and wait a moment before closing."""
     data, step, per_second = Path(path).read_bytes(), int(size), float(rate)
     frames = [data[start : start + step] for start in range(0, len(data), step)]
     number, together, send = int(per_second * float(seconds)), int(burst), sender(kind, where)

@@ -26,7 +26,7 @@ class RemoteContender:
     Args:
         python: the interpreter of the worker's environment.
         prepare: a function of `libraries`.
-        arguments: what it is called with.
+        arguments: arguments of that function.
 
     Raises:
         Missing: if the library is not installed there.
@@ -67,7 +67,7 @@ def prepare_in(python: Path, prepare: Callable[..., Contender], *arguments: Any)
 
 
 def serve() -> None:
-    """Be the worker."""
+    """Run the worker: prepare the contender and answer requests."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints does not get between the replies
     try:

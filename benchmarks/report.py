@@ -80,12 +80,12 @@ def _more(row: Mapping[str, Any]) -> list[str]:
 
 
 def _number(millions: float, unit: str) -> str:
-    """Millions, or where they are few the number itself."""
+    """Format a number in millions, or as it is if it is small."""
     return (
         f"{_figure(millions)} M {unit}" if millions >= 0.01 else f"{_figure(millions * 1e6)} {unit}"
     )
 
 
 def _figure(value: float) -> str:
-    """Three digits, or a whole number."""
+    """Format a number with three digits, or as a whole number."""
     return f"{value:.0f}" if value >= 100 or value == int(value) else f"{value:.3g}"

@@ -52,7 +52,7 @@ SIZE, QUICK_SIZE = 1000, 20  # MB of a capture that is converted
 
 
 def working() -> list[str]:
-    """Return the back ends that can be used here; "auto" stands for one of them."""
+    """Return the back ends available here; "auto" represents one of them."""
     sensor = ls.sensor("ldrobot-stl27l")
     found = []
     for name in BACKENDS:
@@ -77,7 +77,7 @@ def rows(
     least: float,
     clock: Clock,
 ) -> Iterator[dict[str, Any]]:
-    """Yield the lines of a work, one for each back end, all measured in turn."""
+    """Yield the rows of a workload, one for each back end, measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.prepare_others()
     runs, least = (1, 0.0) if work.after else (runs, least)
@@ -119,7 +119,7 @@ def rows(
 
 
 def figures(work: Work, rates: Rates, others: list[str], backend: str) -> dict[str, Any]:
-    """What is measured of a work, by the rates of all contenders."""
+    """Return the figures of a workload from the rates of all contenders."""
     seconds = median(rates["ours"]) * work.amount
     return {
         "seconds": seconds,
@@ -132,14 +132,14 @@ def figures(work: Work, rates: Rates, others: list[str], backend: str) -> dict[s
 
 
 def versions() -> dict[str, str]:
-    """Return the version of each library, or that it is not installed, and why."""
+    """Return the version of each library, or the reason why it is not installed."""
     found = {name: find_version(name) for name in LIBRARIES}
     extras = {name: f"{NOT_INSTALLED} ({reason})" for name, reason in read_failures().items()}
     return {**extras, **found}
 
 
 def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, Any]:
-    """What `--json` writes."""
+    """Return the results for `--json`."""
     machine = {
         "python": platform.python_version(),
         "machine": platform.machine(),
@@ -157,7 +157,7 @@ def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, 
 
 
 def arguments() -> argparse.Namespace:
-    """Return the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
     names = ", ".join(WORKS)
     parser.add_argument(
@@ -216,7 +216,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """1 where a frame was lost that nothing had happened to, else 0."""
+    """Run the benchmarks; return 1 if an undamaged frame was lost, otherwise 0."""
     given = arguments()
     backends = given.backend or working()
     found: list[dict[str, Any]] = []

@@ -39,14 +39,14 @@ OBVIOUS_LIMIT = re.compile(r"; x>=?[01](?=\])| \[x>=?[01]\]")
 
 
 def context(verb: str) -> click.Context:
-    """Return the verb as it is invoked; of "" the command itself."""
+    """Return the context of the verb; of the command itself if the name is ""."""
     top = click.Context(root, info_name="lidarspec", **root.context_settings)
     command = root.get_command(top, verb)
     return click.Context(command, info_name=verb, parent=top) if command else top
 
 
 def paragraphs(verb: str) -> list[str]:
-    """What the verb does, each paragraph in one line."""
+    """Return the description of the verb, each paragraph in one line."""
     return [
         " ".join(text.split())
         for text in inspect.cleandoc(context(verb).command.help or "").split("\n\n")
@@ -54,13 +54,13 @@ def paragraphs(verb: str) -> list[str]:
 
 
 def usage(verb: str) -> str:
-    """How the verb is typed."""
+    """Return the usage line of the verb."""
     command = context(verb)
     return " ".join([command.command_path, *command.command.collect_usage_pieces(command)])
 
 
 def options(verb: str) -> list[tuple[str, str]]:
-    """Return each option of its own as it is typed, and what it does."""
+    """Return each option of the verb as typed, with its help text."""
     own = (
         param
         for param in context(verb).command.params
@@ -107,7 +107,7 @@ def shared_lists() -> list[str]:
 
 
 def shared_names(names: list[str]) -> list[str]:
-    """Return names of shared options, with the name of a group for all of its options."""
+    """Return the names of the shared options; a group's name if all its options are there."""
     words = []
     for group, members in SHARED_OPTIONS.items():
         present = [name for name in members if name in names]
@@ -119,8 +119,8 @@ def shared_names(names: list[str]) -> list[str]:
 def section(verb: str) -> str:
     """Return the generated part of a verb's section.
 
-    Shared options are named only, of the help the first paragraph is printed, and the usage only
-    if it has arguments.
+    Shared options are listed by name only. Of the help, only the first paragraph is printed. The
+    usage is printed only if the verb has arguments.
     """
     lines = ["", paragraphs(verb)[0]]
     typed = usage(verb).replace(" [OPTIONS]", "")
@@ -150,7 +150,7 @@ def page(text: str) -> str:
 
 
 def node(text: str) -> str:
-    """ros2.md with the parameters as they are now."""
+    """Return ros2.md with the current parameters."""
     sys.path.insert(0, str(DOCS.parent / "plugins" / "lidarspec-ros2"))
     from lidarspec_ros2.parameters import PARAMETERS
 
@@ -165,7 +165,7 @@ def node(text: str) -> str:
 
 
 def manual(verb: str) -> str:
-    """Return the manual page of a verb; of "" that of the command."""
+    """Return the manual page of a verb; of the command itself if the name is ""."""
     name = f"lidarspec-{verb}" if verb else "lidarspec"
     said = paragraphs(verb)
     lines = [

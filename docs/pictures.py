@@ -40,7 +40,7 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 
 
 def write_simulated_file(sensor: str, file: Path, duration: str) -> Path:
-    """Return a file with what a simulated sensor sends in a while."""
+    """Write the data of a simulated sensor to a file; return its path."""
     words = ["sim", sensor, "--to", str(file), "-t", duration, "--seed", "7", "-q"]
     subprocess.run(
         [sys.executable, "-m", "lidarspec", *words], check=True, stdout=subprocess.DEVNULL
@@ -81,8 +81,10 @@ def packet() -> str:
 
 
 def page(folder: Path, target: Path) -> None:
-    """The page while a file is played, with the newest frame below the picture, as PNG in few
-    colours.
+    """Return a screenshot of the page while it plays a file, with the newest frame.
+
+    Returns:
+        PNG with few colours.
     """
     from PIL import Image
     from playwright.sync_api import sync_playwright

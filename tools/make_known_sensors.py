@@ -16,7 +16,7 @@ TABLE = ROOT / "lidarspec" / "known_sensors.json"
 
 
 def table() -> str:
-    """Return the table as JSON, one sensor in each line; sensors of other projects are left out."""
+    """Return the table as JSON, one sensor a line, without sensors of other projects."""
     own = {folder.name for folder in (ROOT / "plugins").iterdir()}
     homes = {
         name: plugin
