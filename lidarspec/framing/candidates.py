@@ -30,13 +30,13 @@ from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.weak_frames import WeakRuns, find_runs
 
-#: candidates of one type in a piece; if there are more, the piece is made shorter, so that memory
-#: stays small.
+#: the largest number of candidates of one type in a piece; a piece with more is shortened, so that
+#: memory stays small.
 MAX_CANDIDATES = 1 << 15
-#: constants of a type that are compared at every offset; types with the same ones share the result.
-#: Two exclude nearly all offsets.
+#: the number of constants of a type that are compared at every offset; types with equal constants
+#: share the result. Two exclude nearly all offsets.
 SHARED_MARKS = 2
-#: types that are sorted together, the bits of a number.
+#: the largest number of types that are filtered together: the bits of an integer.
 MAX_TYPES = 64
 
 Bytes1D = NDArray[np.uint8]
@@ -95,12 +95,12 @@ class PieceResult:
 
 
 class Framing:
-    """The frame types of one stream, ready to be looked for.
+    """The frame types of one stream, prepared for searching.
 
     Args:
         codecs: codecs of the incoming frame types by name. If several types match at one offset,
-            the first one in this order is used.
-        sums: function that computes checksums; by default the algorithm of each checksum is used.
+            the first in this order is used.
+        sums: computes checksums; by default the declared algorithms.
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
@@ -126,7 +126,7 @@ class Framing:
         self._filters: dict[tuple[int, ...], ConstantFilter] = {}
 
     def active_types(self, mode: SearchState) -> list[int]:
-        """Return the types that are looked for now, in order."""
+        """Return the active types, in order."""
         active = self._active.get(mode.after)
         if active is None:
             active = [
@@ -138,7 +138,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return the filter by the constants of some types behind the first two of each."""
+        """Return the filter by the constants of some types, after the first two of each."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -149,11 +149,11 @@ class Framing:
         return kind in self._weak
 
     def switches(self, kind: int, mode: SearchState) -> bool:
-        """Return whether a frame of a type changes which types are looked for."""
+        """Return whether a frame of a type changes the active types."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
     def switching(self, mode: SearchState) -> NDArray[np.bool_]:
-        """Return whether a frame of each type changes the types searched, (types + 1,).
+        """Return whether a frame of each type changes the active types, (types + 1,).
 
         The index is the type. The last value, for -1, is False.
         """
@@ -168,7 +168,7 @@ class Framing:
         *,
         gathered: bool = True,
     ) -> Frames:
-        """Return the candidates of a type at some offsets that have its constants.
+        """Return the candidates of a type at offsets with its constants.
 
         Each has its layout and its status.
         """
@@ -178,9 +178,9 @@ class Framing:
 
 
 def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Return the ascending offsets at which no available byte differs from up to two constants.
+    """Return the ascending offsets at which up to two constants match.
 
-    A constant behind the end of the buffer counts as matching.
+    A constant after the end of the buffer counts as matching.
     """
     match: NDArray[np.bool_] | None = None
     for position, mask, value in constants:
@@ -201,13 +201,13 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 
 
 class ConstantFilter:
-    """Sorts offsets by the constants of several types, all types at once.
+    """A filter of offsets by the constants of several types, all types at once.
 
-    A set of types is a number with one bit for each. A table for each offset in a frame has the set
-    of types that allow a byte there, by the byte.
+    A set of types is an integer with one bit for each. For each offset in a frame there is a table
+    of the set of types that allow a byte there, by its value.
 
     Args:
-        constants: of each type, at most `MAX_TYPES`.
+        constants: the constants of each type, for at most `MAX_TYPES` types.
     """
 
     def __init__(self, constants: Sequence[Marks]) -> None:
@@ -219,12 +219,12 @@ class ConstantFilter:
                 table[np.arange(256) & mask != value] &= ~np.uint64(1 << number)
 
     def sort(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
-        """Return the offsets at which the constants of each type match, by its number.
+        """Return the offsets at which the constants of each type match, by type index.
 
-        Constants behind the end of the buffer count as matching. Types without any are missing.
+        Constants after the end of the buffer count as matching. Types without matches are missing.
 
         Args:
-            offsets: ascending.
+            offsets: the offsets to test, ascending.
         """
         if not self._tables:
             return dict.fromkeys(range(int(self._all_types).bit_length()), offsets)
@@ -246,11 +246,11 @@ class ConstantFilter:
 
 @dataclass(frozen=True, eq=False)
 class LiveCandidates:
-    """The candidates of a piece that may be taken while the same types are looked for.
+    """The candidates of a piece that may be accepted while the active types do not change.
 
     Attributes:
-        frames: valid and incomplete candidates in order of offset, at most one per offset: that of
-            the first type in declaration order. Of a weak type, only the first frame of each run.
+        frames: valid and incomplete candidates by offset, at most one per offset, of the first type
+            in declaration order. Of a weak type, only the first frame of each run.
         ends: end offset of each candidate, (n,); for the first frame of a run, the end of the run.
         runs: the runs of each weak type, by type index.
     """
@@ -308,7 +308,7 @@ class Candidates:
         self._judge(offsets_by_kind)
 
     def find_live(self, mode: SearchState) -> LiveCandidates | None:
-        """Return the candidates that may be taken; None if there are too many."""
+        """Return the candidates that may be accepted; None if there are too many."""
         offsets_by_kind = self._find(mode)
         if any(len(offsets) > MAX_CANDIDATES for offsets in offsets_by_kind.values()):
             return None
@@ -348,9 +348,9 @@ class Candidates:
         return Frames.make_empty(self.buffer)
 
     def _wait(self, kinds: Sequence[int]) -> list[Frames]:
-        """Return the candidates of some types whose constants have not all arrived.
+        """Return the candidates of some types with constants that have not arrived.
 
-        There is at most one for each offset, that of the first type.
+        There is at most one for each offset, of the first type.
         """
         first_kinds: dict[int, int] = {}
         for kind in reversed(kinds):
@@ -370,7 +370,7 @@ class Candidates:
         ]
 
     def _find(self, mode: SearchState) -> dict[int, Offsets]:
-        """Return where the constants of types stand that have not been looked for before."""
+        """Return the offsets of new types at which their constants match, by type index."""
         groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active_types(mode):
             if kind not in self._known:
@@ -405,7 +405,7 @@ class Candidates:
             self.judged[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return how many candidates of a type, from the first on, are judged now."""
+        """Return the number of candidates of a type, from the first on, to judge now."""
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]
@@ -428,7 +428,7 @@ def select_live(candidates: Frames, *, final: bool) -> Frames:
 def merge_by_offset(candidates: Sequence[Frames]) -> Frames:
     """Return live candidates of several types by offset, one for each offset.
 
-    At the same offset, the type that comes first is kept.
+    At one offset, the first type in the order is kept.
     """
     parts = [own for own in candidates if len(own)]
     if not parts:

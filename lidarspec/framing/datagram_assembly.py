@@ -1,10 +1,11 @@
-"""Messages that come in several datagrams, joined before they are framed.
+"""Join messages that arrive in several datagrams, before they are framed.
 
-A fragment says of which message it is, which part of it, and how many there are
-(`lidarspec.spec.links.Assembled`). Fragments may come in any order and twice. A message is handed
-on with its last fragment, and never with one of another: what lacks a fragment is given up as soon
-as a few newer messages have begun, a second has passed or the line falls silent, and what comes of
-it later is dropped; both are counted. Datagrams that are no fragments pass as they are.
+A fragment contains the key of its message, its index and the number of fragments
+(`lidarspec.spec.links.Assembled`). Fragments may arrive in any order and twice. A message is
+complete with its last fragment, and never contains a fragment of another message. An incomplete
+message is dropped once a few newer messages have begun, a second has passed, or the line is silent.
+Fragments of it that arrive later are dropped too; both are counted. Datagrams that are not
+fragments pass unchanged.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: messages that are waited for at a time, of which so many are remembered when they are done, and
-#: for how many nanoseconds.
-WAITING = 8
-PATIENCE = 10**9
+#: the largest number of incomplete messages, and of remembered messages that are complete or
+#: dropped; and how long an incomplete message waits.
+MAX_WAITING_MESSAGES = 8
+MAX_WAIT_NS = 10**9
 
-#: the longest payload of a datagram.
-DATAGRAM = 65_535
+#: the largest payload of a datagram.
+MAX_DATAGRAM_BYTES = 65_535
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,11 @@ class _Fragment:
 class _PartialMessage:
     """An incomplete message.
 
-    It has fragments by their index, the offset of the first one in the input, and its time of
-    arrival.
+    Attributes:
+        count: the number of its fragments, or of its bytes.
+        place: the offset in the input of the fragment that arrived first.
+        at: the arrival time of that fragment, ns.
+        parts: the payloads of the fragments by index.
     """
 
     count: int
@@ -60,13 +64,13 @@ class _PartialMessage:
 
 @dataclass(frozen=True, eq=False)
 class JoinedMessages:
-    """Messages, in the order of their last fragments.
+    """Messages, in the order in which they were completed.
 
     Attributes:
-        buffer, starts, sizes, at: as the decoder takes datagrams.
-        places: where each begins in the input.
-        dropped: bytes of messages that were given up before each, and in the end.
-        heads: bytes of fragments that are no payload.
+        buffer, starts, sizes, at: the messages in the form in which the decoder accepts datagrams.
+        places: the offset of each in the input.
+        dropped: the number of bytes dropped before each message, and after the last.
+        heads: the number of bytes of fragments that are not payload.
     """
 
     buffer: NDArray[np.uint8]
@@ -79,32 +83,32 @@ class JoinedMessages:
 
 
 class FragmentAssembler:
-    """Joins the fragments of one link.
+    """A buffer that joins the fragments of one link.
 
     Args:
-        rule: what a fragment says.
-        longest: the most bytes that a message can have.
-        stats: where lost and late fragments are counted.
+        rule: declares the fields of a fragment.
+        longest: the maximum size of a message, bytes.
+        stats: counts lost and late fragments.
 
     Raises:
-        SpecError: where construct alone can read a fragment.
+        SpecError: if the struct of a fragment cannot be compiled.
     """
 
     def __init__(self, rule: Assembled, longest: int, stats: Counters) -> None:
         self._rule = rule
         self._longest = longest
         self._stats = stats
-        layouts = frame_layouts(Frame(rule.struct, max_length=DATAGRAM))
+        layouts = frame_layouts(Frame(rule.struct, max_length=MAX_DATAGRAM_BYTES))
         if isinstance(layouts, NotCompilableError):
             raise rule.wrong(str(layouts))
         self._layouts = layouts
         self._waiting: dict[Hashable, _PartialMessage] = {}
-        self._done: deque[Hashable] = deque(maxlen=WAITING)
+        self._done: deque[Hashable] = deque(maxlen=MAX_WAITING_MESSAGES)
         self._dropped = 0
 
     @property
     def pending(self) -> int:
-        """The bytes of fragments that wait for others."""
+        """The number of bytes in incomplete messages."""
         return sum(message.size for message in self._waiting.values())
 
     def join(
@@ -115,9 +119,11 @@ class FragmentAssembler:
         at: NDArray[np.int64],
         base: int,
     ) -> JoinedMessages:
-        """Return the messages that datagrams complete, among other datagrams.
+        """Return the messages that datagrams complete, and the datagrams that are not fragments.
 
         Args:
+            buffer, starts, sizes: the datagrams.
+            at: their arrival times, ns.
             base: the offset of the first datagram in the input.
         """
         data = list[bytes]()
@@ -129,7 +135,7 @@ class FragmentAssembler:
             np.asarray(starts).tolist(), sizes.tolist(), at.tolist(), strict=True
         ):
             datagram = buffer[start : start + size].tobytes()
-            fragment = self._fragment(datagram)
+            fragment = self._parse_fragment(datagram)
             whole: tuple[bytes, int] | None = (datagram, base)
             if fragment is not None:
                 heads += size - len(fragment.payload)
@@ -155,14 +161,14 @@ class FragmentAssembler:
         )
 
     def give_up(self) -> int:
-        """Wait for nothing any more; the bytes that were waiting."""
+        """Drop all incomplete messages, and return the number of bytes dropped."""
         for key in list(self._waiting):
-            self._lose(key)
+            self._drop(key)
         dropped = self._dropped
         self._dropped = 0
         return dropped
 
-    def _fragment(self, datagram: bytes) -> _Fragment | None:
+    def _parse_fragment(self, datagram: bytes) -> _Fragment | None:
         """Return the fragment in a datagram; None if it is not one."""
         rule = self._rule
         layout = self._layouts.layout(datagram)
@@ -187,27 +193,27 @@ class FragmentAssembler:
         Returns None if other fragments are missing.
         """
         for key in [
-            key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE
+            key for key, message in self._waiting.items() if 0 <= message.at < time - MAX_WAIT_NS
         ]:
-            self._lose(key)
+            self._drop(key)
         partial = self._waiting.get(fragment.key)
         if partial is not None and (
             partial.count != fragment.count
             or partial.parts.get(fragment.index, fragment.payload) != fragment.payload
         ):
-            self._lose(fragment.key)  # a message of the same key has begun
+            self._drop(fragment.key)  # a message of the same key has begun
             partial = None
         elif fragment.index in partial.parts if partial is not None else fragment.key in self._done:
             self._stats.fragments_late += 1
             self._dropped += len(fragment.payload)
             return None
         if partial is None:
-            while len(self._waiting) >= WAITING:
-                self._lose(next(iter(self._waiting)))
+            while len(self._waiting) >= MAX_WAITING_MESSAGES:
+                self._drop(next(iter(self._waiting)))
             partial = self._waiting[fragment.key] = _PartialMessage(fragment.count, place, time)
         partial.parts[fragment.index] = fragment.payload
         if partial.size > self._longest:
-            self._lose(fragment.key)
+            self._drop(fragment.key)
             return None
         if (partial.size if self._rule.in_bytes else len(partial.parts)) < partial.count:
             return None
@@ -215,7 +221,7 @@ class FragmentAssembler:
         self._done.append(fragment.key)
         return b"".join(part for _, part in sorted(partial.parts.items())), partial.place
 
-    def _lose(self, key: Hashable) -> None:
+    def _drop(self, key: Hashable) -> None:
         message = self._waiting.pop(key)
         self._stats.fragments_lost += (
             1 if self._rule.in_bytes else message.count - len(message.parts)

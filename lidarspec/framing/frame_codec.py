@@ -1,7 +1,8 @@
-"""The interface of the engines of frame types: which candidates are frames, and frames as columns.
+"""The interface of the engines of frame types: judge candidates, and make columns of frames.
 
-`lidarspec.framing.frame_engine` has the engines of binary frames, `lidarspec.framing.text_frames`
-that of frames with a wire form.
+`lidarspec.framing.frame_engine` has the engine of binary frames, `lidarspec.framing.text_frames`
+the engine of frames with a wire form, and `lidarspec.framing.plain_frames` the engine of frames
+without layouts.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ class Codec:
 
     Attributes:
         prefix: the constants at the start: offset -> (mask, value).
-        marks: these, whole bytes first, which tell the most.
-        size: that of all its frames, None where they differ.
-        layout: that of all its frames, None where they differ or construct parses them.
-        is_compiled: whether its layouts can be computed; else construct parses each frame.
+        marks: the same constants, whole bytes first, which exclude the most candidates.
+        size: the size of all frames of the type, bytes; None if sizes differ.
+        layout: the layout of all frames; None if layouts differ or construct parses the frames.
+        is_compiled: whether the layouts can be computed; else construct parses each frame.
     """
 
     layout: Layout | None = None
@@ -54,38 +55,41 @@ class Codec:
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        """Return the candidates at these offsets, each with its layout and whether it is a frame.
+        """Return the candidates at some offsets, each with its layout and its status.
 
         Args:
-            offsets: those whose prefix does not match must be left out.
-            stops: where their bytes end, and no more will come; by default with those of the
-                buffer.
-            kind: index of this type.
-            gathered: whether their bytes are wanted too, as `Frames.rows`.
-            sums: what computes checksums; by default their algorithms.
+            buffer: the bytes.
+            offsets: offsets at which the prefix matches.
+            stops: the offset at which the bytes of each candidate end, if no more bytes follow
+                there; by default the end of the buffer.
+            kind: the index of this type.
+            gathered: whether to copy the bytes of candidates to `Frames.rows`.
+            sums: computes checksums; by default the declared algorithms.
         """
         raise NotImplementedError
 
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """Return the common layout of candidates of one size, and their status.
+        """Return the common layout, the status and the plugin errors of candidates.
 
-        The candidates are given as rows. Failures of the plugin are returned as well. Returns None
-        if there is no common layout.
+        Returns None if the candidates do not have a common layout.
+
+        Args:
+            rows: the candidates, all of one size, (n, size).
         """
         return None
 
     def table(self, frames: Iterable[bytes]) -> Table:
-        """Frames known to be of this type, as columns."""
+        """Return frames that are known to be of this type as columns."""
         raise NotImplementedError
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        """Frames of this type, given as the bytes of their structs, as columns."""
+        """Return frames of this type as columns, given the bytes of their structs."""
         return self.table(structs)
 
     def gather(self, frames: Frames) -> Table:
-        """Frames that were found, all of this type, as columns."""
+        """Return accepted frames of this type as columns."""
         return self.table(map(frames.data, range(len(frames))))
 
     @property
@@ -94,7 +98,7 @@ class Codec:
         return self.prefix
 
     def make_checker(self, layout: Layout) -> CandidateChecker:
-        """Return the judge of candidates of a layout that have the constants at the start."""
+        """Return the checker of candidates that have a layout and its first constants."""
         judge = layout.notes.get(CandidateChecker)
         if judge is None:
             self._conditions = self._conditions or StructConditions(

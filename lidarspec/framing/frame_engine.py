@@ -1,8 +1,8 @@
 """The engine of binary frames: judge candidates by their layouts, and make columns of frames.
 
-`CompiledCodec` works on whole batches: the header of a candidate is looked at once, when it is
-judged, and its layout goes with it into the columns. Frames with a wire form have an engine of
-their own (`lidarspec.framing.text_frames`), and so have frames without layouts
+`CompiledCodec` works on whole batches: the header of a candidate is read once, when it is judged,
+and its layout is kept for the columns. Frames with a wire form have their own engine
+(`lidarspec.framing.text_frames`), and so do frames without layouts
 (`lidarspec.framing.plain_frames`). `get_codec` returns the engine of a frame type.
 """
 
@@ -36,15 +36,15 @@ from lidarspec.framing.text_frames import TextCodec
 from lidarspec.framing.variable_lengths import JointChecker, LayoutFamilies, LayoutGroup
 from lidarspec.spec.description import Frame
 
-#: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
+#: how many bytes of candidates are judged together, so that memory stays small on any input.
 BLOCK = 1 << 19
 
 
 class CompiledCodec(Codec):
-    """A frame type whose layouts are compiled.
+    """The engine of a frame type with compiled layouts.
 
     Raises:
-        NotCompilable: where its struct has a part without a computable place.
+        NotCompilableError: if the offset of a part of the struct cannot be computed.
     """
 
     def __init__(self, frame: Frame) -> None:
@@ -148,12 +148,13 @@ class CompiledCodec(Codec):
         sizes: NDArray[np.intp],
         sums: Sums | None,
     ) -> list[LayoutGroup]:
-        """Judge the candidates of related layouts together.
+        """Judge the candidates of similar layouts together.
 
-        Returns the groups that remain to be judged layout by layout.
+        Returns:
+            The groups that remain to be judged layout by layout.
 
         Args:
-            status, sizes: of all candidates, changed here.
+            status, sizes: the status and the size of all candidates, changed here.
         """
         which = together.which
         if stops is None:
@@ -162,7 +163,7 @@ class CompiledCodec(Codec):
             ends = stops[which]
         is_whole = offsets[which] + sizes[which] <= ends
         partial = which[~is_whole]
-        status[partial], sizes[partial] = _partial(
+        status[partial], sizes[partial] = _judge_incomplete(
             buffer, offsets[partial], ends[~is_whole], together.layouts[0], sizes[partial]
         )
         whole = which[is_whole]
@@ -193,11 +194,12 @@ class CompiledCodec(Codec):
         gathered: bool,
         sums: Sums | None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp], NDArray[np.uint8] | None]:
-        """Candidates of one layout.
+        """Judge the candidates of one layout.
 
         Returns:
-            The status of each; how many bytes it has, or how many tell more; and the bytes of those
-            that are whole, one a row, if these are wanted, are in front, and are not too many.
+            The status of each candidate; its size in bytes, or the number of bytes needed to
+            decide; and the bytes of complete candidates, (n, size), if `gathered`, and if these
+            candidates are the first ones and not too many. Otherwise None.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))
@@ -222,7 +224,7 @@ class CompiledCodec(Codec):
         sizes = np.full(number, layout.size)
         status[whole] = judged
         ends = len(buffer) if stops is None else stops[~whole]
-        status[~whole], sizes[~whole] = _partial(
+        status[~whole], sizes[~whole] = _judge_incomplete(
             buffer, offsets[~whole], ends, layout, sizes[~whole]
         )
         return status, sizes, kept
@@ -236,7 +238,7 @@ class CompiledCodec(Codec):
     def gather(self, frames: Frames) -> CompiledTable:
         """Return frames of this type as columns.
 
-        Nothing is copied if the frames take at least half of the buffer.
+        No bytes are copied if the frames fill at least half of the buffer.
         """
         if frames.rows is not None and frames.layout is not None:
             if 2 * frames.rows.size >= len(frames.buffer):
@@ -270,7 +272,7 @@ class CompiledCodec(Codec):
         return CompiledTable(self.schema, groups)
 
 
-def _partial(
+def _judge_incomplete(
     buffer: NDArray[np.uint8],
     offsets: NDArray[np.intp],
     stops: NDArray[np.intp] | int,
@@ -279,11 +281,11 @@ def _partial(
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
     """Return the status of incomplete candidates, and the bytes needed to decide.
 
-    A candidate is still possible, or already refuted by a constant or a length.
+    A candidate is incomplete, or already excluded by a constant or a length.
 
     Args:
-        layout: whose constants and lengths they have.
-        sizes: of each as a whole.
+        layout: the layout of the candidates.
+        sizes: the size of each candidate once complete.
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()
@@ -300,7 +302,7 @@ def _partial(
 
 @functools.lru_cache(maxsize=2048)
 def get_codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
-    """Return the engine of a frame type, always the same one.
+    """Return the engine of a frame type; repeated calls return the same object.
 
     Frames without layouts are parsed by construct, one at a time.
     """

@@ -1,10 +1,11 @@
 """The engine of frames without layouts: construct parses one candidate at a time.
 
-Such a struct has a part whose place no formula of header fields gives. `lidarspec show` names the
+In such a struct the offset of a part does not follow from header fields. `lidarspec show` names the
 part and the reason.
 
-If this part is a text up to a terminator, the terminators of all candidates are found at once. A
-candidate without one in reach, or with another constant behind it, never gets to construct.
+If this part is a text up to a terminator, the terminators of all candidates are found at once.
+Construct does not parse a candidate without a terminator in reach, or with a wrong constant after
+it.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class _Text:
     Attributes:
         begin: its offset in a frame.
         terminator: the byte that ends it.
-        following: the constant bytes that are the first to be checked behind it, by their offset
-            from the terminator.
+        following: the constant bytes that are checked first after it, by their offset from the
+            terminator.
     """
 
     begin: int
@@ -57,11 +58,14 @@ class _Text:
     def judge(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], ends: NDArray[np.intp]
     ) -> NDArray[np.uint8]:
-        """Return `SHORT` for candidates without a terminator, `CONSTANT` for those with another
-        constant behind it, and `VALID` for the others, (n,).
+        """Return the status of candidates by the terminator of the text, (n,).
+
+        It is `SHORT` without a terminator, `CONSTANT` with a wrong constant after it, else `VALID`.
 
         Args:
-            ends: where the bytes of each end.
+            buffer: the bytes.
+            offsets: the offset of each candidate.
+            ends: the offset at which the bytes of each candidate end.
         """
         terminators = np.flatnonzero(buffer == self.terminator)
         places = next_places(terminators, offsets + self.begin, len(buffer))
@@ -74,14 +78,15 @@ class _Text:
 
 
 def _find_text(root: tree.Node) -> _Text | None:
-    """Return the text with which the computable places of a struct end; None if another part is
-    checked before its terminator can be.
+    """Return the text that follows the part of a struct with known offsets.
+
+    Returns None if there is no such text, or if another part is checked before its terminator.
     """
     begin = 0
     terminator = b""
     distance = 1
     following = dict[int, int]()
-    for node in _fields(root):
+    for node in _iter_fields(root):
         if isinstance(node, tree.Opaque) and node.terminator and not terminator:
             terminator = node.terminator
             begin = distance - 1
@@ -101,13 +106,13 @@ def _find_text(root: tree.Node) -> _Text | None:
     return _Text(begin, terminator[0], following)
 
 
-def _fields(node: tree.Node) -> Iterator[tree.Node]:
-    """Yield the fields of a struct in order, and a node with a checksum behind its fields."""
+def _iter_fields(node: tree.Node) -> Iterator[tree.Node]:
+    """Yield the fields of a struct in order, and each checksum after its fields."""
     if isinstance(node, tree.Struct):
         for member in node.members:
-            yield from _fields(member)
+            yield from _iter_fields(member)
     elif isinstance(node, tree.Sealed):
-        yield from _fields(node.body)
+        yield from _iter_fields(node.body)
         yield node
     else:
         yield node
@@ -119,9 +124,10 @@ def _is_free(info: tree.FieldInfo) -> bool:
 
 
 class PlainCodec(Codec):
-    """A frame type that construct parses, one candidate at a time.
+    """The engine of a frame type that construct parses, one candidate at a time.
 
-    `reason` says why it is not compiled.
+    Attributes:
+        reason: the reason why the type is not compiled.
     """
 
     is_compiled = False

@@ -1,12 +1,12 @@
 """Judge many candidates at a time by constants, checksums and plausibility.
 
-The order is that of the counters: a candidate with a wrong constant is none at all, one with a
-wrong checksum is counted as such, and only what is intact is asked whether it is plausible.
+The order is the order of the counters: a candidate with a wrong constant is not counted, a wrong
+checksum is counted as such, and only intact candidates are tested for plausibility.
 
-A frame's `plausible` is traced once. What it combines with ``&`` are conditions of their own, and
-one that depends on no more than two bytes beside each other is evaluated for all that these can
-hold. Frames are then judged by looking these bytes up, with the same answers, without making a
-column of every field. What cannot be traced is evaluated as it stands.
+A frame's `plausible` function is traced once. Operands of ``&`` become separate conditions.
+A condition on at most two adjacent bytes is evaluated for all values of these bytes. Frames are
+then judged by table lookups, with the same results, without making a column of every field.
+Conditions that cannot be traced are evaluated by calling the function.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, P
 from lidarspec.spec.description import Frame
 from lidarspec.spec.tree import FieldInfo
 
-#: values of a few bits that are compared one by one.
+#: the largest number of allowed values of a few bits that are compared one after another.
 ALLOWED = 2
 
 #: by what became of the parts of a frame: `parts.FOUND`, `CUT_OFF`, `LENGTH`, `CONSTANT`, `FAILED`.
@@ -62,14 +62,15 @@ Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
 class CandidateChecker:
-    """Judges candidates of one layout, whose first constants (`prefix`) are known to be right.
+    """The checks of candidates of one layout, with first constants (`prefix`) that match.
 
     Args:
-        met: what the struct's own conditions ask of values.
-        checks: the test of plausibility, taken apart; None where only the function itself can tell.
+        met: the conditions of the struct on values.
+        checks: the conditions of the plausibility function; None if only the function itself can
+            decide.
 
     Attributes:
-        checks: all tests of values that need no call of the frame's own function.
+        checks: all tests of values that do not call the plausibility function.
         is_complete: whether these are all tests of values.
     """
 
@@ -106,9 +107,9 @@ class CandidateChecker:
         """Return the status of each candidate, (n,).
 
         Args:
-            rows: the candidates, whole, one a row.
-            errors: failures of the plugin are added to these.
-            sums: what computes checksums; by default their algorithms.
+            rows: the complete candidates, (n, size).
+            errors: errors of the plugin are added to it.
+            sums: computes checksums; by default the declared algorithms.
         """
         status = np.zeros(len(rows), np.uint8)
         self.check_constants(status, rows)
@@ -121,7 +122,7 @@ class CandidateChecker:
         if self._checks is not None:
             self._check(status, rows, self._checks)
         elif self._frame.plausible is not None:
-            _check_valid(status, rows, lambda some: self._ask_plugin(some, errors))
+            _check_valid(status, rows, lambda some: self._call_plausible(some, errors))
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
@@ -139,7 +140,7 @@ class CandidateChecker:
             if np.count_nonzero(held) < len(held):
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
-    def _ask_plugin(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
+    def _call_plausible(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
         return check_plausibility(
             self._frame,
             CompiledTable(self._schema, [LayoutRows(self._layout, np.arange(len(rows)), rows)]),
@@ -150,7 +151,7 @@ class CandidateChecker:
 def _check_valid(
     status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]
 ) -> None:
-    """Judge those that are valid so far."""
+    """Judge the candidates that are valid so far, and set their status."""
     if not np.count_nonzero(status):
         status[:] = judge(rows)
         return
@@ -166,9 +167,9 @@ def _check_valid_parts(
     errors: list[PluginError],
     sums: Sums | None,
 ) -> None:
-    """Judge candidates that are valid so far by their parts.
+    """Judge the candidates that are valid so far by their parts.
 
-    The parts have to fill their room, and their checksums have to be right.
+    The parts have to fill their region, and their checksums have to match.
     """
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
@@ -178,7 +179,7 @@ def _check_valid_parts(
 def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """Return the status of each frame, (n,), by its parts."""
+    """Return the status of each frame by its parts, (n,)."""
     buffer, walked = region.in_rows(rows)
     status = OF_PARTS[walked.status]
     errors += walked.errors
@@ -198,7 +199,7 @@ def _check_parts(
 def check_seal(
     seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one of its checksums."""
+    """Return `VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one checksum."""
     try:
         wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
@@ -208,9 +209,11 @@ def check_seal(
 
 
 def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
-    """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test.
+    """Return `VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame, (n,), by `plausible`.
 
-    The frames are of one layout, so that no array is padded.
+    Args:
+        table: frames of one layout, so that no array is padded.
+        errors: errors of the plugin are added to it.
     """
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -229,12 +232,12 @@ def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) ->
 
 
 class StructConditions:
-    """The tests of one frame type: its own, and those of its struct.
+    """The conditions of one frame type: of its plausibility function and of its struct.
 
     Args:
         plausible: as in `Frame`.
-        schema: of the frame.
-        layout: any of its layouts, to trace it on.
+        schema: the schema of the frame.
+        layout: any layout of the frame, used to trace the function.
     """
 
     def __init__(
@@ -244,7 +247,7 @@ class StructConditions:
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def make_struct_conditions(self, layout: Layout) -> list[Check]:
-        """Return the conditions of the struct on the values of frames of a layout, as checks."""
+        """Return the conditions of the struct on frames of a layout, as checks."""
         every = (
             (
                 one,
@@ -255,7 +258,7 @@ class StructConditions:
         return [self._check(one, leaves) for one, leaves in every]
 
     def checks(self, layout: Layout) -> list[Check] | None:
-        """Return the checks that frames of a layout have to pass, as rows of bytes.
+        """Return the checks on rows of bytes that frames of a layout have to pass.
 
         Returns None if only the function itself can decide.
         """
@@ -269,7 +272,7 @@ class StructConditions:
             part.fields[0].axes and all(0 in leaf.shape for leaf in own.values())
             for part, own in zip(self._parts, leaves, strict=True)
         ):
-            # a test on no elements holds, and what is combined with it is a test on none either
+            # a test on an empty array holds, and so does any combination with it
             return []
         checks = list[Check]()
         together = list[Expression]()
@@ -287,16 +290,14 @@ class StructConditions:
 
     def _check(self, part: FrameTest, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
-        first, last = _window(leaves.values())
+        first, last = _find_window(leaves.values())
         if (
             last - first > 2
             or any(leaf.info.kind == "bytes" for leaf in leaves.values())
             or len(places) > 1
             or any(len(shape) != len(strides) for shape, strides in places)
         ):
-            return functools.partial(
-                find_passing, part, leaves
-            )  # more bytes than a table is made for
+            return functools.partial(find_passing, part, leaves)  # too many bytes for a table
         key = (
             part,
             *(
@@ -309,37 +310,37 @@ class StructConditions:
                 path: replace(leaf.shift(first), shape=(), strides=())
                 for path, leaf in leaves.items()
             }
-            self._tables[key] = _table(part, single, last - first)
+            self._tables[key] = _make_table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
         return LookupCondition(self._tables[key], first, shape, strides)
 
 
 @dataclass(frozen=True, eq=False)
 class ConditionGroup:
-    """Conditions on fields outside of arrays, which share what they have in common."""
+    """Conditions on fields outside of arrays, which share common subexpressions."""
 
     parts: tuple[Expression, ...]
 
     @functools.cached_property
     def fields(self) -> tuple[FieldInfo, ...]:
-        """The fields that the conditions are made of, each once."""
+        """The fields in the conditions, each once."""
         every = {info.path: info for part in self.parts for info in part.fields}
         return tuple(every.values())
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-        """Return whether all conditions hold, frame by frame; see `Expression.values`."""
+        """Return whether all conditions hold, for each frame; see `Expression.values`."""
         return functools.reduce(np.bitwise_and, evaluate_expressions(self.parts, raw))
 
 
 @dataclass(frozen=True, eq=False)
 class _LookupTable:
-    """For which values of some bytes, taken as one integer, a condition holds.
+    """The values of some bytes, read as one integer, for which a condition holds.
 
     Attributes:
-        limits: from one to another; None where they are no such range.
-        bits: else the bits that it depends on, and what they may be, if that is little; None where
-            it is not.
-        listed: for each value.
+        limits: the first and the last of these values; None if they are not consecutive.
+        bits: otherwise, the bits that the condition depends on and their allowed values; None if
+            there are more than two values.
+        listed: whether the condition holds, for each value.
     """
 
     dtype: np.dtype[Any]
@@ -348,12 +349,12 @@ class _LookupTable:
     bits: tuple[int, tuple[int, ...]] | None = None
 
     def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return whether the condition holds for each of the values, of their shape."""
+        """Return whether the condition holds for each of the values, of the same shape."""
         if self.limits is not None:
             low, high = map(values.dtype.type, self.limits)
             return np.asarray(
                 values - low <= high - low if low else values <= high
-            )  # what is below wraps round
+            )  # values below the limits wrap to large ones
         if self.bits is not None:
             mask, allowed = self.bits
             left = values & values.dtype.type(mask)
@@ -375,8 +376,8 @@ class LookupCondition:
     It applies to each frame, or to each element of an array.
 
     Attributes:
-        offset: of the first of these bytes.
-        shape, strides: of the arrays that they are in.
+        offset: the offset of the first of these bytes.
+        shape, strides: the shape and strides of their arrays.
     """
 
     table: _LookupTable
@@ -388,7 +389,7 @@ class LookupCondition:
         """Return whether the condition holds in each frame, (n,)."""
         if not len(rows):
             return np.empty(0, np.bool_)
-        held = self._each(rows)
+        held = self._hold_each(rows)
         if not self.shape:
             return held
         if held.all():
@@ -396,20 +397,21 @@ class LookupCondition:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether the condition holds in each frame, (n,).
+        """Return whether the condition holds in each frame, (n,), for arrays of own lengths.
 
         Args:
-            lengths: the length of the outermost array in each frame, (n,), at most that of the row.
+            lengths: the length of the outermost array in each frame, (n,), at most its room in the
+                row.
         """
-        held = self._each(rows)
+        held = self._hold_each(rows)
         if not self.shape:
             return held
         held = np.asarray(held.reshape(*held.shape[:2], math.prod(held.shape[2:])).all(axis=2))
         held |= np.arange(held.shape[1]) >= lengths[:, None]
         return np.asarray(held.all(axis=1))
 
-    def _each(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Return whether it holds for each element, (n, *shape)."""
+    def _hold_each(self, rows: Bytes2D) -> NDArray[np.bool_]:
+        """Return whether the condition holds for each element, (n, *shape)."""
         view = view_elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
         if view.itemsize == 1:
             values = view
@@ -418,12 +420,12 @@ class LookupCondition:
         return self.table.holds(values)
 
 
-def _table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
-    """Return a condition on so many bytes, at most two."""
+def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
+    """Return the table of a condition on `size` bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(
             np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16
-        )  # so that it takes little memory at a time
+        )  # so that memory stays small
         listed = np.concatenate(
             [
                 find_passing(part, leaves, codes.view(np.uint8).reshape(len(codes), -1))
@@ -433,11 +435,11 @@ def _table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTab
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
             return _LookupTable(dtype, (int(true[0]), int(true[-1])), listed)
-    return _LookupTable(dtype, None, listed, _bits(listed))
+    return _LookupTable(dtype, None, listed, _find_bits(listed))
 
 
-def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
-    """Return the bits that a list depends on, and their allowed values.
+def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
+    """Return the bits that a table depends on, and their allowed values.
 
     Returns None unless there are one or two allowed values.
     """
@@ -453,8 +455,11 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     return None
 
 
-def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
-    """First byte that the first elements of some fields take, and the one after their last."""
+def _find_window(leaves: Iterable[Leaf]) -> tuple[int, int]:
+    """Return the first byte of some fields, and the byte after their last.
+
+    In arrays only the first elements count.
+    """
     spans = [leaf.byte_span for leaf in leaves]
     if spans:
         return (min(start for start, _ in spans), max(stop for _, stop in spans))
@@ -473,5 +478,5 @@ def _parts(
         if not isinstance(answer, TracedColumn):
             return None
         return [Expression.of(node, schema) for node in split_condition(answer.node)]
-    except Exception:  # the function itself will say so, frame by frame
+    except Exception:  # calling the function reports the error for each frame
         return None

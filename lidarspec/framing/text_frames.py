@@ -1,7 +1,7 @@
 """The engine of frames with a wire form: text, or escaped bytes.
 
-The form finds where candidates end, and decodes them to the bytes of the struct, one at a time.
-These are grouped by layout and judged in bulk, as binary frames are.
+The form finds the end of each candidate and decodes it to the bytes of the struct, one candidate at
+a time. The structs are grouped by layout and judged together, like binary frames.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Fr
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import NO_END, find_ends
 
-#: Candidates of a piece that are remembered with their structs.
+#: the largest number of candidates of a piece that are remembered with their structs.
 MAX_REMEMBERED = 64
 
 
 class TextCodec(Codec):
-    """A frame type with a wire form, whose structs are judged by their layouts.
+    """The engine of a frame type with a wire form.
 
     Raises:
-        SpecError: for a struct whose fields have no computable place.
+        SpecError: if the offset of a field of the struct cannot be computed.
     """
 
     def __init__(self, frame: Frame, coder: FormCoder) -> None:
         super().__init__(frame)
         self._coder = coder
-        #: Structs of the frames that were found last, since these become columns next.
+        #: the structs of the frames found last, by their bytes, since they become columns next.
         self._found = dict[bytes, bytes]()
         self.size = None
         self.prefix = {offset: (0xFF, byte) for offset, byte in coder.prefix.items()}
@@ -45,7 +45,7 @@ class TextCodec(Codec):
 
     @property
     def _checked_constants(self) -> Mapping[int, tuple[int, int]]:
-        return {}  # the prefix is one of the text, not of the struct
+        return {}  # the prefix belongs to the text, not to the struct
 
     def survey(
         self,
@@ -74,12 +74,12 @@ class TextCodec(Codec):
     def _judge_whole(
         self, frames: Frames, which: Sequence[int], status: NDArray[np.uint8], sums: Sums | None
     ) -> None:
-        """Judge candidates that end where the form says; those alike are decoded once.
+        """Judge complete candidates; equal candidates are decoded once.
 
         Args:
-            frames: all candidates; failures of the plugin are added to it.
-            which: indices of those to be judged.
-            status: of all candidates, changed here.
+            frames: all candidates; errors of the plugin are added to it.
+            which: the indices of the candidates to judge.
+            status: the status of all candidates, changed here.
         """
         errors = list[PluginError]()
         decode = functools.lru_cache(MAX_REMEMBERED)(functools.partial(self._decode, errors=errors))
@@ -105,9 +105,9 @@ class TextCodec(Codec):
         }
 
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
-        """Return the status and the struct of a candidate that ends where the form says.
+        """Return the status and the struct of a complete candidate.
 
-        If there is a struct, it has to be judged; its status replaces the one returned.
+        If the struct is not None, it still has to be judged, and its status replaces this one.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -131,7 +131,7 @@ class TextCodec(Codec):
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
         """Return structs by layout, and the indices of refused structs by refusal.
 
-        Structs with no layout of their size are left out.
+        Structs without a layout of their size are left out.
         """
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes

@@ -1,16 +1,15 @@
-"""Candidates of many lengths, judged together.
+"""Judge candidates of many lengths together.
 
-A false header announces any length, so noise with headers in it has candidates of hundreds of
-layouts, with one or two candidates each. Judging the candidates of a layout takes a few dozen calls
-of NumPy, whether there is one or a thousand. Most of these layouts differ only in the length of an
-array at their end: they have the same constants, checksums over the same bytes up to the same
-distance from the end, and tests of the same fields. `LayoutFamilies` finds such layouts. Their
-candidates become rows of one array, and whatever follows a candidate in its row is left out: a
-checksum gets zeros in its place, which do not change those in `ZERO_EXTENDED`, and a test leaves
-out elements.
+A false header can contain any length, so noise with headers has candidates of hundreds of layouts,
+with one or two candidates each. Judging the candidates of a layout takes a few dozen NumPy calls,
+for one candidate or a thousand. Most of these layouts differ only in the length of an array at
+their end: they have the same constants, checksums over the same bytes up to the same distance from
+the end, and tests of the same fields. `LayoutFamilies` finds such layouts. Their candidates become
+rows of one array, and bytes after the end of a candidate are ignored: a checksum gets zeros
+instead, which do not change the checksums in `ZERO_EXTENDED`, and a test leaves out elements.
 
-The verdicts are those of `plausibility.CandidateChecker`. A test that is more than a lookup of one
-or two bytes is left to it.
+The results are the same as from `plausibility.CandidateChecker`, which also does all tests that are
+more than a lookup of one or two bytes.
 """
 
 from __future__ import annotations
@@ -32,21 +31,22 @@ Offsets = NDArray[np.intp]
 Status = NDArray[np.uint8]
 #: A layout, and the indices of its candidates.
 LayoutGroup = tuple[Layout, Offsets]
-#: Makes the judge of a layout.
+#: returns the checker of a layout.
 MakeJudge = Callable[[Layout], CandidateChecker]
 
-#: Layouts are judged together if they are at least so many, and have fewer candidates each.
+#: layouts are judged together if there are at least `MANY_LAYOUTS` with fewer than
+#: `MANY_CANDIDATES` candidates each.
 MANY_LAYOUTS = 4
 MANY_CANDIDATES = 16
-#: The checksums that zeros behind the data do not change.
+#: checksums that do not change if zeros are appended to the data.
 ZERO_EXTENDED: tuple[type[Checksum], ...] = (Sum, WordXor, Xor)
-#: Rows of one array are at most so many times as long as the shortest of them, unless they have
-#: only a few bytes.
+#: the longest row of an array is at most `MAX_STRETCH` times as long as the shortest row, or has at
+#: most `SHORT_ROW_BYTES`.
 MAX_STRETCH = 4
 SHORT_ROW_BYTES = 64
-#: Keys remembered, so that garbage does not fill the memory.
+#: the largest number of remembered keys, so that noise does not fill the memory.
 MAX_KEYS = 1024
-#: Bytes of rows that are judged at a time.
+#: the size of the rows that are judged at a time, bytes.
 BLOCK_BYTES = 1 << 19
 
 
@@ -55,9 +55,9 @@ class LayoutFamily:
     """The key by which layouts that differ only in the length of an array are grouped.
 
     Attributes:
-        number: the same for all that are alike.
-        lengths: of the outermost array of each test, in the order of `CandidateChecker.checks`; 0
-            for a test of no array.
+        number: the number of the family.
+        lengths: the length of the outermost array of each test, in the order of
+            `CandidateChecker.checks`; 0 for a test outside of arrays.
     """
 
     number: int
@@ -65,7 +65,7 @@ class LayoutFamily:
 
 
 class LayoutFamilies:
-    """Tells which layouts of a frame type are alike."""
+    """The families of the layouts of a frame type."""
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
@@ -90,15 +90,15 @@ class LayoutFamilies:
                 alike.setdefault(likeness.number, []).append(((layout, which), likeness))
         together = []
         for some in alike.values():
-            some_groups, likenesses = zip(*some, strict=True)
+            some_groups, families = zip(*some, strict=True)
             if len(some) < MANY_LAYOUTS:
                 left += some_groups
             else:
-                together.append(JointChecker(some_groups, likenesses, make_judge))
+                together.append(JointChecker(some_groups, families, make_judge))
         return together, left
 
     def find_family(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
-        """Return the relation of a layout to others, for judging them together.
+        """Return the family of a layout.
 
         Returns None if its candidates cannot be judged together with others.
         """
@@ -119,11 +119,11 @@ class LayoutFamilies:
             if len(self._numbers) >= MAX_KEYS:
                 self._numbers.clear()
             self._numbers[key] = next(self._next)
-        return LayoutFamily(self._numbers[key], tuple(map(_length, judge.checks)))
+        return LayoutFamily(self._numbers[key], tuple(map(_find_length, judge.checks)))
 
 
 def _is_extended(seal: Seal) -> bool:
-    """Return whether zeros behind the bytes that a checksum covers do not change it."""
+    """Return whether zeros after the covered bytes do not change a checksum."""
     return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
 
 
@@ -153,23 +153,23 @@ def _test_key(check: Check) -> Hashable:
 
 
 class JointChecker:
-    """Judges candidates of layouts that are alike.
+    """The checks of candidates of layouts of one family.
 
     Args:
         groups: the layouts with their candidates.
-        likenesses: of each layout.
+        families: the family of each layout.
 
     Attributes:
-        layouts: those of the groups.
+        layouts: the layouts of the groups.
         which: the indices of all candidates, (n,).
-        forms: which of the layouts each of them has, (n,).
-        is_final: whether valid candidates are frames; else they have passed only some of the tests.
+        forms: the index of each candidate's layout, (n,).
+        is_final: whether valid candidates are frames; otherwise some tests remain.
     """
 
     def __init__(
         self,
         groups: Sequence[LayoutGroup],
-        likenesses: Sequence[LayoutFamily],
+        families: Sequence[LayoutFamily],
         make_judge: MakeJudge,
     ) -> None:
         self.layouts = [layout for layout, _ in groups]
@@ -177,7 +177,7 @@ class JointChecker:
         self.forms = np.repeat(np.arange(len(groups)), [len(which) for _, which in groups])
         self._judge = make_judge
         self._sizes = np.array([layout.size for layout in self.layouts], np.intp)
-        self._lengths = np.array([likeness.lengths for likeness in likenesses], np.intp).T
+        self._lengths = np.array([family.lengths for family in families], np.intp).T
         first = make_judge(self.layouts[0])
         self.is_final = first.is_complete and all(
             isinstance(check, LookupCondition) for check in first.checks
@@ -187,7 +187,7 @@ class JointChecker:
         """Return some of the candidates with their layouts.
 
         Args:
-            chosen: whether each of `self.which` is wanted, (n,).
+            chosen: a mask of `self.which`, (n,).
         """
         found = (
             (layout, self.which[chosen & (self.forms == form)])
@@ -198,18 +198,18 @@ class JointChecker:
     def judge(
         self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None
     ) -> Status:
-        """Return the status of whole candidates, (k,).
+        """Return the status of complete candidates, (k,).
 
         Args:
-            offsets: where they begin, (k,).
-            forms: which of the layouts each has, (k,).
-            sums: what computes checksums; by default their algorithms.
+            offsets: the offset of each candidate, (k,).
+            forms: the index of each candidate's layout, (k,).
+            sums: computes checksums; by default the declared algorithms.
         """
         status = np.empty(len(offsets), np.uint8)
         sizes = self._sizes[forms]
-        for which in _by_size(sizes):
+        for which in _iter_by_size(sizes):
             longest = forms[which[-1]].item()
-            rows = _rows(buffer, offsets[which], self.layouts[longest].size)
+            rows = _gather_rows(buffer, offsets[which], self.layouts[longest].size)
             status[which] = self._judge_rows(rows, sizes[which], forms[which], longest, sums)
         return status
 
@@ -233,14 +233,14 @@ class JointChecker:
         return status
 
 
-def _length(check: Check) -> int:
-    """Return how many elements the outermost array of a test has; 0 if it is of no array."""
+def _find_length(check: Check) -> int:
+    """Return the length of the outermost array of a test; 0 outside of arrays."""
     if isinstance(check, LookupCondition) and check.shape:
         return check.shape[0]
     return 0
 
 
-def _by_size(sizes: Offsets) -> Iterator[Offsets]:
+def _iter_by_size(sizes: Offsets) -> Iterator[Offsets]:
     """Yield the indices of candidates in groups of similar size.
 
     Each group is ascending by size, with rows of at most `BLOCK_BYTES` together.
@@ -256,10 +256,10 @@ def _by_size(sizes: Offsets) -> Iterator[Offsets]:
         start = stop
 
 
-def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
+def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
     """Return `size` bytes from each offset on, (n, size).
 
-    Bytes behind the end of the buffer are 0.
+    Bytes after the end of the buffer are 0.
     """
     first = int(offsets.min())
     if int(offsets.max()) + size > len(buffer):
@@ -269,15 +269,14 @@ def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
 
 
 def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
-    """Return which candidates have the right checksum, (n,).
+    """Return a mask of the candidates with the right checksum, (n,).
 
-    In each row, the bytes behind those that the checksum covers move to the end, where the longest
-    layout has them.
+    In each row, the bytes after the covered bytes move to the end, as in the longest layout.
 
     Args:
-        seal: of the longest layout, which fills its row.
-        sizes: of the candidates, (n,).
-        sums: what computes checksums.
+        seal: the checksum of the longest layout, which fills its row.
+        sizes: the sizes of the candidates, (n,).
+        sums: computes checksums.
     """
     size = rows.shape[1]
     tail = size - seal.spans[-1][1]

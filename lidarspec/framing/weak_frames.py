@@ -1,15 +1,15 @@
 """Weak frames: accepted only in runs.
 
 A frame of five bytes without a checksum is valid at every sixth offset of noise. A type with
-`confirm=k` is therefore accepted only where k or more valid frames follow one another without a
-byte between, and then the whole run is.
+`confirm=k` is therefore accepted only if k or more valid frames follow one another without a gap.
+Then the whole run is accepted.
 
-This is a filter over the verdicts that every type gets. A candidate goes on with another one that
-begins at its last byte plus one, unless a type that is earlier in the order has a frame there.
-Candidates that begin a run of at least k are heads; those with a run that reaches the end of the
-bytes may become heads, and wait. The search takes a head as any other candidate, with the end of
-its whole run, so that it never sees the rest. A run that the bytes before have confirmed already
-goes on with any valid candidate.
+This is a filter over the results that every type gets. A candidate is followed by the candidate
+that begins directly after its last byte, unless an earlier type in the order has a frame there. The
+first candidate of a run of at least k is a head. If a run reaches the end of the bytes, its first
+candidate may become a head, and waits. The search handles a head like any other candidate, with
+the end of its whole run, so it skips the other frames of the run. A run that was accepted in
+the bytes before continues with any valid candidate.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class WeakRuns:
     """The runs of one weak type in a piece of a stream.
 
     Attributes:
-        frames: the candidates of the type that are valid or short of bytes, by offset: n of them.
-        following: the row of the candidate with which the run of each goes on, (n + 2,); n if the
-            run ends there, and n + 1 if that depends on bytes that follow the piece. The last two
-            stand for these themselves.
+        frames: the n candidates of the type that are valid or incomplete, by offset.
+        following: the row of the next candidate in the run of each, (n + 2,); n if the run ends
+            there, and n + 1 if that depends on bytes after the piece. The last two elements are n
+            and n + 1 themselves.
         confirm: the shortest run that is accepted.
-        is_single: whether a frame of the type changes which types are looked for, so that one is
-            taken at a time.
+        is_single: whether a frame of the type changes the active types, so that frames are accepted
+            one at a time.
     """
 
     frames: Frames
@@ -45,7 +45,7 @@ class WeakRuns:
 
     @cached_property
     def ends(self) -> Indices:
-        """The offset of the end of the run of each candidate, (n,)."""
+        """The end offset of the run of each candidate, (n,)."""
         ends = self.frames.starts + self.frames.sizes
         if self._jumps:
             return ends[self._jumps[-1]]
@@ -86,9 +86,9 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """The rows that are 1, 2, 4, 8 ... frames further on in a run, each (n,).
+        """The rows that are 1, 2, 4, 8 ... frames further in a run, each (n,).
 
-        Past the end of a run they are its last row, which the last of them reaches for all.
+        Past the end of a run they are its last row. In the last array, all runs have ended.
         """
         count = len(self.frames)
         rows = np.arange(count)
@@ -116,11 +116,11 @@ def find_runs(
     """Return the runs of a weak type.
 
     Args:
-        candidates: of the type, by offset, with any status.
+        candidates: the candidates of the type, by offset, with any status.
         earlier: the valid and waiting candidates of types that are earlier in the order, by offset.
         confirm: the shortest run that is accepted.
-        is_single: whether a frame of the type changes which types are looked for.
-        final: no bytes follow: candidates that are short of bytes are invalid.
+        is_single: whether a frame of the type changes the active types.
+        final: whether no bytes follow: incomplete candidates are then invalid.
     """
     frames = candidates.select(candidates.status <= (VALID if final else SHORT))
     is_short = frames.status == SHORT
@@ -142,7 +142,7 @@ def find_runs(
 
 
 def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the rows of some values among ascending ones, and whether they are among them."""
+    """Return the rows of values in an ascending array, and whether they are in it."""
     if not len(values):
         return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)
     rows = np.minimum(values.searchsorted(wanted), len(values) - 1)

@@ -14,7 +14,7 @@ from construct import Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, VarInt, th
 import lidarspec as ls
 from lidarspec import Sensor, SpecError
 from lidarspec.explaining.input_segments import iter_pieces
-from lidarspec.framing.datagram_assembly import PATIENCE, WAITING
+from lidarspec.framing.datagram_assembly import MAX_WAIT_NS, MAX_WAITING_MESSAGES
 from lidarspec.spec import Assembled, Chunk, Udp
 from tests.shapes.fragments import FRAGMENT, SENSOR
 
@@ -83,13 +83,17 @@ def test_duplicate_and_late_fragments_are_dropped_and_counted() -> None:
     assert packets.stats.fragments_late == len(fragments(1)) + 1
     late = [
         fragments(1)[0],
-        *(fragment for number in range(2, WAITING + 2) for fragment in fragments(number)[:-1]),
+        *(
+            fragment
+            for number in range(2, MAX_WAITING_MESSAGES + 2)
+            for fragment in fragments(number)[:-1]
+        ),
         *fragments(1)[1:],
     ]
     numbers, packets = counters(late)
     assert numbers == []
     assert packets.stats.fragments_late == len(fragments(1)) - 1
-    assert packets.stats.fragments_lost == WAITING + len(fragments(1)) - 1
+    assert packets.stats.fragments_lost == MAX_WAITING_MESSAGES + len(fragments(1)) - 1
 
 
 def test_fragments_of_two_messages_with_one_number_are_not_spliced() -> None:
@@ -108,7 +112,7 @@ def test_memory_is_bounded_whatever_comes() -> None:
     for _ in range(2000):
         head = dict(message=source.randrange(65536), index=source.randrange(3), count=200)
         decoder.feed(FRAGMENT.build(head) + bytes(1000))
-    assert decoder.stats.pending <= WAITING * SENSOR.frames["data"].max_length
+    assert decoder.stats.pending <= MAX_WAITING_MESSAGES * SENSOR.frames["data"].max_length
     decoder.finish()
     assert decoder.stats.pending == 0
     assert decoder.stats.bytes_in == decoder.stats.bytes_skipped
@@ -118,12 +122,12 @@ def test_an_incomplete_message_times_out() -> None:
     decoder = SENSOR.decoder()
     first, *rest = fragments(1)
     decoder.feed(first, 0)
-    assert [found for fragment in rest for found in decoder.feed(fragment, PATIENCE // 2)]
-    decoder.feed(fragments(2)[0], PATIENCE)
+    assert [found for fragment in rest for found in decoder.feed(fragment, MAX_WAIT_NS // 2)]
+    decoder.feed(fragments(2)[0], MAX_WAIT_NS)
     assert not [
-        found for fragment in fragments(2)[1:] for found in decoder.feed(fragment, 3 * PATIENCE)
+        found for fragment in fragments(2)[1:] for found in decoder.feed(fragment, 3 * MAX_WAIT_NS)
     ]
-    decoder.feed(fragments(3)[0], 4 * PATIENCE)
+    decoder.feed(fragments(3)[0], 4 * MAX_WAIT_NS)
     assert decoder.stats.pending
     decoder.idle()
     assert not decoder.stats.pending
