@@ -227,7 +227,7 @@ class CLayout:
         Raises:
             ExportError: if its value may exceed 64-bit integers.
         """
-        if tree.width(value) > tree.MOST_BITS:
+        if tree.width(value) > tree.MAX_FORMULA_BITS:
             raise ExportError("a formula may exceed a 64-bit integer")
         return tree.write(
             value,

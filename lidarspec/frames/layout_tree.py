@@ -365,7 +365,7 @@ class HeaderWalk:
     ) -> None:
         """Add the fields of the element type of an empty array.
 
-        No bytes, constants or conditions are added.
+        Bytes and constants are not added, and conditions on these fields apply to no element.
         """
         start = self.cursor
         constants = dict(self.constants)

@@ -66,10 +66,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Address:
-    """An IP address such as "192.168.1.10".
+    """An IP address, for example "192.168.1.10".
 
     Its field has 4 bytes, an array of 4 numbers or a number of 32 bits; 16 bytes for IPv6. Among
-    the `values` of a command it is this computer's own address, as the sensor sees it.
+    the `values` of a command it is this computer's own address, as seen by the sensor.
     """
 
     def words(self, room: int | None) -> str:
@@ -123,14 +123,14 @@ Taken = Range | Text | Address | Octets
 
 @dataclass(frozen=True)
 class Count:
-    """A running number in `Command.values`; each command sent has the next one.
+    """A running number in `Command.values`; each command that is sent has the next number.
 
     Args:
-        bits: the width of the number; it wraps to 0.
+        bits: the width of the number; after the largest number it continues with 0.
         first: the number of the first command.
 
     Raises:
-        SpecError: for fewer than 1 bit, or a first number that does not fit.
+        SpecError: if `bits` is below 1, or `first` does not fit.
     """
 
     bits: int
@@ -144,7 +144,7 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """Return the number of the command that is sent as the `index`-th one, from 0."""
+        """Return the number of the command with this index, counted from 0."""
         return (self.first + index) % (1 << self.bits)
 
 
@@ -184,7 +184,7 @@ def argument(given: Any) -> Argument:
     bytes).
 
     Raises:
-        SpecError: for anything else.
+        SpecError: for an invalid declaration.
     """
     match given:
         case (str(path), int() | float() as low, int() | float() as high):

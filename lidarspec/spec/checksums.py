@@ -5,9 +5,9 @@ the bytes of one message. `single` returns a faster function for many calls;
 `lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the names
 of CRC catalogues.
 
-A CRC's register is kept in wire order: the low byte is the one that is combined with the next data
-byte. With `refin` that is the usual reflected register, otherwise the usual register aligned left
-with its bytes swapped. One formula serves both.
+The register of a CRC is kept in wire order: its low byte is combined with the next byte of data.
+With `refin` this is the usual reflected register, otherwise the usual register aligned left with
+its bytes swapped. So one formula is enough for both.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class Checksum(ABC):
 
     @abstractmethod
     def describe(self) -> str:
-        """Return a short name for people, such as "XOR-8"."""
+        """Return a short name to display, for example "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """Return the checksum of each row; the default computes them one by one.
+        """Return the checksum of each row; by default with one call for each row.
 
         Args:
             rows: frames of one length, shape (n, m).
@@ -321,7 +321,7 @@ def _crc(width: int, poly: int, init: int = 0, *, reflected: bool = False, xorou
 
 _ONES = 0xFFFF_FFFF
 
-#: name -> parameters; the most used ones first.
+#: name -> parameters, the most used first.
 CRCS: dict[str, Crc] = {
     "CRC-32": _crc(32, 0x04C11DB7, _ONES, reflected=True, xorout=_ONES),
     "CRC-16/MODBUS": _crc(16, 0x8005, 0xFFFF, reflected=True),
@@ -378,8 +378,8 @@ def name_of(crc: Crc) -> str:
 
 
 def single(algorithm: Checksum) -> Single:
-    """Return a function from bytes to their checksum, for one frame at a time."""
-    kind = type(algorithm)  # exactly these classes: a subclass may compute something else
+    """Return a function from bytes to their checksum, for single frames."""
+    kind = type(algorithm)  # not isinstance: a subclass may compute another checksum
     if kind is Xor:
         return _xor
     if kind is Sum:

@@ -198,7 +198,7 @@ class Frame:
     def room(self) -> int:
         """The maximum size of the struct in bytes.
 
-        In a wire form, two characters can stand for a number of eight bytes.
+        In a wire form, two characters can encode a number of eight bytes.
         """
         if self.wire is None:
             return self.max_length
@@ -285,7 +285,10 @@ class Command:
 
     @property
     def fixed(self) -> Mapping[str, Any]:
-        """The values that are the same in every frame, by path: neither filled in nor arguments."""
+        """The values that are the same in every frame, by path.
+
+        They are neither filled in nor arguments.
+        """
         taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
         return {path: value for path, value in self.values.items() if path not in taken}
 
@@ -312,7 +315,7 @@ class Relative:
 
 
 class FrameTypes(dict[str, Frame]):
-    """The frame types of a sensor by name; a missing name raises UnknownFrame."""
+    """The frame types of a sensor by name; a missing name raises `UnknownFrame`."""
 
     def __init__(self, sensor: str, frames: Mapping[str, Frame]) -> None:
         super().__init__(frames)
@@ -323,6 +326,6 @@ class FrameTypes(dict[str, Frame]):
 
 
 def freeze(value: object, *names: str) -> None:
-    """Replace mappings of a frozen dataclass by read-only copies."""
+    """Replace mappings in fields of a frozen dataclass by read-only copies."""
     for name in names:
         object.__setattr__(value, name, MappingProxyType(dict(getattr(value, name))))

@@ -68,7 +68,10 @@ _FACTORS: dict[str, dict[str, Fraction]] = {
 
 
 def factor(unit: str, target: str) -> Fraction | None:
-    """Return `unit` in `target` units, None if they measure different quantities."""
+    """Return the size of `unit` in `target` units.
+
+    Returns None if they measure different quantities.
+    """
     if unit == target:
         return Fraction(1)
     return _FACTORS.get(target, {}).get(unit)
@@ -80,7 +83,10 @@ def is_unit(unit: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Split "324.27deg" into number and unit; the unit is "" if there is none."""
+    """Split a text into number and unit: "324.27deg" into "324.27" and "deg".
+
+    The unit is "" for a bare number.
+    """
     known = sorted({unit for table in _FACTORS.values() for unit in table}, key=len, reverse=True)
     for unit in known:
         if text.endswith(unit) and _is_number(text[: -len(unit)]):
@@ -125,7 +131,7 @@ def duration(text: str) -> float:
 
 
 def share(text: str) -> float:
-    """Return the number that "1%" or "0.01" stands for.
+    """Return the value of "1%" or "0.01" as a number.
 
     Raises:
         ValueError: if it is not a number.
@@ -558,7 +564,7 @@ class Parts(layer.Partition):
         return names[-1]
 
     def _built(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
-        """Build a part as the first kind that accepts it; return kind, value, bytes."""
+        """Build a part as the first kind that accepts it; return kind, value and bytes."""
         faults = list[ConstructError]()
         for name, case in self.cases.items():
             stream = io.BytesIO()

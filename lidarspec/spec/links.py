@@ -158,12 +158,12 @@ class Tcp(Link):
 class Http(Link):
     """Requests to the web server of the sensor.
 
-    The frames of its commands are `HttpRequest`, those of its replies `HttpReply`.
+    Commands are `HttpRequest` frames, and replies are `HttpReply` frames.
 
     Args:
-        port: of the server.
+        port: the port of the server.
         timeout: maximum seconds for a whole request.
-        largest: the maximum size of a reply's body in bytes; a longer one is an error.
+        largest: the maximum size of a reply's body in bytes; a longer reply is an error.
     """
 
     port: int = 80
@@ -177,5 +177,5 @@ class Http(Link):
 
 
 def is_datagram(link: Link | None) -> bool:
-    """Return whether each datagram of a link is a frame; False without a link."""
+    """Return whether each datagram of a link is a frame; False for None."""
     return link is not None and link.datagrams

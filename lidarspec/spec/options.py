@@ -1,7 +1,7 @@
-"""Options of a sensor: the values that each one takes, from the annotations of `configure`.
+"""Options of a sensor: which values each accepts, from annotations of `configure`.
 
-The `configure` function of a plugin declares its options as keyword parameters. Their annotations
-decide here, in one place, which values are valid: ``Literal["cm", "mm"]``, ``int | None``,
+The `configure` function of a plugin declares its options as keyword parameters. This module alone
+decides which values are valid, from their annotations: ``Literal["cm", "mm"]``, ``int | None``,
 ``str | Path | Learned``.
 """
 
@@ -26,9 +26,9 @@ MAX_LEARNED_BYTES = 1 << 20
 
 
 class Learned(bytes):
-    """Content that a sensor reported, as the value of an option that otherwise is a file.
+    """Content reported by a sensor, as the value of an option that usually is a file.
 
-    It is never a path. An option takes it if its parameter has it in the annotation,
+    It is never a path. An option accepts it if its parameter has it in the annotation,
     ``calibration: str | Path | Learned``.
     """
 
@@ -36,7 +36,7 @@ class Learned(bytes):
         return f"Learned({len(self)} bytes)"
 
     def to_dict(self) -> dict[str, str]:
-        """Return the content as JSON data, such as for the header of a recording."""
+        """Return the content as JSON data, for example for the header of a recording."""
         return {"learned": base64.b64encode(zlib.compress(self)).decode()}
 
     @classmethod
@@ -169,7 +169,7 @@ class OptionType:
         return any(kind not in _TESTS or _TESTS[kind](value) for kind in self.types)
 
     def describe(self) -> str:
-        """Return the accepted values for a message, such as "'cm' or 'mm'"."""
+        """Return the accepted values for a message, for example "'cm' or 'mm'"."""
         words = [repr(choice) for choice in self.choices]
         for kind in self.types:
             is_part_of_path = kind is str and self.is_file
@@ -201,7 +201,7 @@ def option_types(function: Callable[..., Any] | None) -> dict[str, OptionType]:
 
 
 def _evaluate(option: str, annotation: str, names: Mapping[str, Any]) -> object:
-    """Return the object that the text of an annotation stands for."""
+    """Return the object for an annotation that is written as text."""
     holder = SimpleNamespace(__annotations__={option: annotation})
     try:
         return get_type_hints(holder, globalns=dict(names))[option]

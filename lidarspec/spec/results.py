@@ -63,7 +63,7 @@ class Extra:
 
     Args:
         values: a column, an array or a number; nan if a point has no value.
-        unit: such as "m/s"; "" for a pure number. The default for values that are an unchanged
+        unit: for example "m/s"; "" for a pure number. The default for values that are an unchanged
             field is the field's unit.
         dtype: a numeric NumPy type. The default is the type of the wire for values that are an
             unchanged integer field, bool for conditions, and float32 otherwise. In an integer type

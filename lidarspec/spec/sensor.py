@@ -2,8 +2,8 @@
 
 A description is immutable. It checks that its parts fit together when it is made. The engines
 (`frames`, `framing`, `points`, `packets`, `scans`) are functions of a description. Plugins and
-users make a `lidarspec.Sensor`, the subclass whose methods call the engines; its module,
-`sensor_operations`, stands above them.
+users make a `lidarspec.Sensor`, the subclass with methods that call the engines. Its module,
+`sensor_operations`, is a layer above the engines.
 """
 
 from __future__ import annotations
@@ -121,11 +121,11 @@ class SensorDescription:
 
     @property
     def data_frame(self) -> str:
-        """The name of the frame type with the points; with several, the chosen one.
+        """The name of the frame type with the points; if there are several, the selected one.
 
         Raises:
             UsageError: for a sensor without points; the message lists its frame types.
-            UnknownFrame: if there is none yet, for a sensor that needs a file first.
+            UnknownFrame: for a sensor that needs a file first and has no frame types yet.
         """
         names = self.data_frames
         self.require_points()
@@ -176,7 +176,9 @@ class SensorDescription:
         return tuple(dict.fromkeys(path.partition(".")[0] for path in self.info.values()))
 
     def points_of(self, frame: str) -> Callable[[Any], Points]:
-        """Return the `points` function of a frame type: its own, or for data the sensor's.
+        """Return the `points` function of a frame type.
+
+        A data frame without its own function has the function of the sensor.
 
         Args:
             frame: a name, or "name.path" for the parts of a frame.
@@ -218,10 +220,10 @@ class SensorDescription:
         )
 
     def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
-        """Return the path of the parts that have a frame's `points` or `imu`.
+        """Return the path of the parts of a frame that have `points` or `imu`.
 
         Returns:
-            "" if the frame itself has them, or if there is no such frame.
+            "" if the frame itself has the function, or if the frame does not exist.
         """
         if frame not in self.frames:
             return ""
@@ -234,7 +236,7 @@ class SensorDescription:
     def simulation_of(self, frame: str) -> Simulation:
         """Return the simulation facts of a frame type.
 
-        For data, the sensor's facts fill in those that the frame does not declare.
+        For a data frame, facts that it does not declare are those of the sensor.
         """
         declared = self.frames[frame]
         if declared.data:
@@ -255,7 +257,7 @@ class SensorDescription:
 
     @property
     def counts_losses(self) -> bool:
-        """Whether lost packets are counted: by a counter, or a clock with a declared pace."""
+        """Whether lost packets are counted, by a counter or by a clock with a declared pace."""
         if self.sequence is not None:
             return True
         return self.clock is not None and self.clock.pace is not None
@@ -269,7 +271,7 @@ class SensorDescription:
 
 
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
-    """Return a sensor with only these frame types, and without everything that names others.
+    """Return a sensor with only these frame types, without references to others.
 
     It has no commands, no state, and no fields with information about the device.
     """
@@ -282,7 +284,7 @@ def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
 
 
 def _check_sensor(sensor: SensorDescription) -> None:
-    """Raise SpecError if a fact is invalid, or a part refers to one that does not exist."""
+    """Raise `SpecError` if a fact is invalid or refers to a missing part."""
     check_simulation(sensor.simulation)
     _check_facts(sensor)
     for name, frame in sensor.frames.items():
@@ -301,7 +303,7 @@ def _check_sensor(sensor: SensorDescription) -> None:
 
 
 def _check_points(sensor: SensorDescription) -> None:
-    """Raise SpecError if a sensor with data frames lacks a fact about its points or scans."""
+    """Raise `SpecError` if a fact about points or scans is missing."""
     if sensor.points is None and any(
         frame.data and frame.points is None for frame in sensor.frames.values()
     ):
@@ -314,7 +316,7 @@ def _check_points(sensor: SensorDescription) -> None:
 
 
 def _check_facts(sensor: SensorDescription) -> None:
-    """Raise SpecError for a fact that is invalid on its own."""
+    """Raise `SpecError` for a fact that is invalid by itself."""
     if not _ID.fullmatch(sensor.id):
         raise SpecError(
             "invalid id: expected vendor-model in lower case with hyphens",
@@ -375,7 +377,7 @@ def _comes_in_datagrams(sensor: SensorDescription, frame: Frame) -> bool:
 
 
 def _check_command(sensor: SensorDescription, name: str, command: Command) -> None:
-    """Raise SpecError if a command refers to something that the sensor does not have."""
+    """Raise `SpecError` if a command refers to a part that the sensor does not have."""
     frames = [command.frame, *command.replies, command.refusal]
     _check_names(sensor, f"commands.{name}", frames, sensor.frames)
     _check_names(sensor, f"commands.{name}.link", [command.link], sensor.links)
@@ -415,7 +417,7 @@ def _check_clock(sensor: SensorDescription) -> None:
 def _check_names(
     sensor: SensorDescription, path: str, names: Iterable[str | None], table: Mapping[str, Any]
 ) -> None:
-    """Raise SpecError for the first name that is not in a table; None is valid.
+    """Raise `SpecError` for the first name that is not in a table; None is valid.
 
     A sensor without frames, which needs a file first, is not checked.
     """
@@ -430,20 +432,20 @@ def _check_names(
 
 @dataclass(frozen=True)
 class Configure:
-    """``sensor.configure(...)``: returns a sensor with options.
+    """Callable that makes a sensor with options: ``sensor.configure(...)``.
 
-    Every sensor has the options in `OPTIONS`. The others are those of the sensor's own function.
+    Every sensor has the options in `OPTIONS`. The sensor's own function declares the others.
     """
 
     sensor: SensorDescription
     function: Callable[..., SensorDescription] | None
 
     def __call__(self, **options: Any) -> SensorDescription:
-        """Return a new sensor with these options; the old one is not changed.
+        """Return a new sensor with these options; the old sensor is not changed.
 
         Raises:
             UnknownOption: for an option that the sensor does not have.
-            UsageError: for a value that an option does not take.
+            UsageError: for a value that an option does not accept.
             PluginError: if the sensor's own function fails in another way.
         """
         sensor = self.sensor
@@ -466,7 +468,7 @@ class Configure:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The names of the sensor's own options that take a path."""
+        """The names of the sensor's own options that accept a path."""
         return tuple(name for name, option in self.types.items() if option.is_file)
 
     def takes(self, name: str, value: object) -> bool:
@@ -476,10 +478,10 @@ class Configure:
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Return the options of an untrusted file in `folder`.
 
-        They are numbers, words, learned content, and paths of files beside it.
+        Valid values are numbers, words, learned content, and paths of files in or below the folder.
 
         Raises:
-            UsageError: for a path that leads anywhere else, and for other values.
+            UsageError: for a path out of the folder, or another value.
         """
         checked = dict(options)
         for name, value in options.items():
@@ -528,7 +530,7 @@ class Configure:
 
 
 def _refuse_pipe(path: str | PathLike[str]) -> None:
-    """Raise UsageError for a pipe or device, which may never end."""
+    """Raise `UsageError` for a pipe or device, which may never end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise UsageError(
             f"{path!s}: expected a regular file, not a pipe or device; write its content to a"
@@ -537,7 +539,7 @@ def _refuse_pipe(path: str | PathLike[str]) -> None:
 
 
 def _check_cut(sensor: SensorDescription, degrees: object) -> None:
-    """Raise UsageError unless scans of a sensor can be cut at an angle, and it is one."""
+    """Raise `UsageError` if the angle is invalid, or scans cannot be cut at an angle."""
     has_angle = isinstance(sensor.scan, OnWrap) or (
         isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle)
     )

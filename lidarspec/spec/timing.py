@@ -52,14 +52,14 @@ class OnFlag:
 
 @dataclass(frozen=True)
 class OnChange:
-    """Cut before every packet (or row) in which the field `name` differs from the one before.
+    """Cut before every packet (or row) in which the field `name` changes.
 
     Args:
         name: a field path.
-        angle: the path of a field that grows evenly as a rotating sensor turns, the angle at which
-            a packet begins; "" if there is none. It is used to find a masked sector, in which scans
-            are then cut, and by `configure(cut=)`.
-        full: growth of `angle` in one turn, in its unit.
+        angle: the path of a field with the angle at which a packet begins. It increases evenly as a
+            rotating sensor turns. "" if the frame has no such field. It is used to find a masked
+            sector, in which scans are then cut, and by `configure(cut=)`.
+        full: the increase of `angle` in one revolution, in its unit.
     """
 
     name: str
@@ -83,7 +83,7 @@ class OnJump:
 
 @dataclass(frozen=True)
 class OnRewind:
-    """Cut before every packet in which the field `name` is lower than in the one before."""
+    """Cut before every packet in which the field `name` decreases."""
 
     name: str
 
@@ -143,7 +143,9 @@ class Clock:
 
 @dataclass(frozen=True)
 class Sequence:
-    """A counter of packets; a jump is a loss, unless a clock with a declared pace shows none.
+    """A counter of packets. A jump is a loss.
+
+    If a clock with a declared pace shows no gap, the jump is not a loss.
 
     Args:
         field: path of the counter.
@@ -161,14 +163,14 @@ def unix_time(
 ) -> Any:
     """Return the seconds from 1970-01-01 to a date of the Gregorian calendar, in UTC.
 
-    Works on numbers, arrays and columns, for the `source` of a `Clock`. A fraction of a second is a
-    term of its own there, so that nanoseconds stay exact.
+    The arguments are numbers, arrays or columns. It is used in the `source` of a `Clock`, where a
+    fraction of a second is a separate term, so that nanoseconds stay exact.
 
     Args:
-        year: with its century, such as 2026.
+        year: with its century, for example 2026.
         month: 1 to 12.
         day: 1 to 31.
-        hour, minute, second: of the day, and of each other; not limited to their range.
+        hour, minute, second: the time of day; values beyond the usual range are added.
 
     Returns:
         float64, the broadcast shape; whole seconds are exact.

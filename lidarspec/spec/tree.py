@@ -65,17 +65,19 @@ def to_exact(number: float | int) -> Fraction:
 
 @dataclass(frozen=True, eq=False)
 class Adapter:
-    """Functions between the raw values of a field and those of a parsed frame.
+    """Functions between the raw values of a field and the values in a parsed frame.
 
-    construct's ExprAdapter and texts are read so. A column has the values of the parsed frame.
+    They describe construct's ExprAdapter and its texts. Columns have the decoded values too, unless
+    `dtype` is uint8 for bytes.
 
     Attributes:
-        decode: from an integer, or the bytes of the field.
-        encode: from a value and the size of a field of bytes.
-        dtype: of a column; uint8 for bytes, of which a column has those of the wire.
-        allowed: the raw values that can be decoded; None if all can, or if only decoding tells.
-        is_partial: whether some raw values cannot be decoded, so that such frames are invalid.
-        form: how it is stored, for people; "" for a plain number.
+        decode: the function of an integer, or of the bytes of the field.
+        encode: the function of a value, and of the size of a field of bytes.
+        dtype: the dtype of a column; uint8 if columns have the bytes of the wire.
+        allowed: the raw values that can be decoded; None if all can, or if only `decode` can test
+            it.
+        is_partial: whether some raw values cannot be decoded, so that these frames are invalid.
+        form: how the value is stored, as text to display; "" for a plain number.
     """
 
     decode: Callable[[Any], Any]
@@ -96,7 +98,7 @@ class Adapter:
         Args:
             raw: integers, or bytes along the last axis.
         """
-        values, where, shape = _distinct(raw, is_bytes=is_bytes)
+        values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         decoded = np.empty(len(values), self.dtype)
         for index, value in enumerate(values):
             decoded[index] = self.decode(value)
@@ -104,7 +106,7 @@ class Adapter:
 
     def can_decode(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[np.bool_]:
         """Return which raw values can be decoded, as booleans of the shape of the fields."""
-        values, where, shape = _distinct(raw, is_bytes=is_bytes)
+        values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         valid = np.zeros(len(values), np.bool_)
         for index, value in enumerate(values):
             try:
@@ -115,10 +117,13 @@ class Adapter:
         return np.asarray(valid[where]).reshape(shape)
 
 
-def _distinct(
+def _find_distinct(
     raw: NDArray[Any], *, is_bytes: bool
 ) -> tuple[list[Any], NDArray[np.intp], tuple[int, ...]]:
-    """Return the distinct values of a column, the index of each value, and the column's shape."""
+    """Return the distinct values of a column, their indices, and the column's shape.
+
+    Each value of the column has an index into the distinct values.
+    """
     if not is_bytes:
         values, where = np.unique(raw, return_inverse=True)
         return values.tolist(), where.reshape(-1), raw.shape
@@ -206,7 +211,7 @@ class FieldInfo:
     def raw(self, physical: Any) -> Any:
         """Convert physical values to raw values.
 
-        Values of an integer field are rounded to the nearest raw value, ties to the even one.
+        Values of an integer field are rounded to the nearest raw value, ties to the even value.
 
         Args:
             physical: a number in the field's unit, or an array of any shape.
@@ -286,8 +291,8 @@ class Ref:
     """A reference to the raw value of a field before the formula.
 
     Attributes:
-        path: from the top of the frame, dotted. Without indices, a field in an array is the one of
-            the same element.
+        path: from the top of the frame, dotted. Without indices, it refers to the field in the same
+            element of each array.
         info: the field.
     """
 
@@ -312,14 +317,14 @@ class Op:
 
 @dataclass(frozen=True, eq=False)
 class Untraced:
-    """An expression that cannot be converted to a formula, e.g. a Python function with branches.
+    """An expression that cannot be converted to a formula.
 
-    construct reads the frames of a struct with such an expression, one at a time.
+    An example is a Python function with branches. construct reads the frames of a struct that
+    contains it, one at a time.
 
     Attributes:
         reason: why it cannot be converted, with the path of its part.
-        text: the expression as the author wrote it, with whole paths of fields; "?" for a
-            function.
+        text: the expression of the spec, with whole paths of fields; "?" for a function.
     """
 
     reason: str
@@ -472,7 +477,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return the operator or constant with which a formula may give a fraction; None without."""
+    """Return an operator or constant that may give a fraction; None without."""
     for part in parts(formula):
         if isinstance(part, float):
             return part
@@ -490,12 +495,12 @@ def parts(formula: Formula) -> Iterator[Formula]:
 
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
-    """Return the fields that a formula depends on, each once, in the order of the formula."""
+    """Return the fields that a formula depends on, each once, in order."""
     return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
 
 
 #: maximum width of the values of a formula that is evaluated in 64-bit integers.
-MOST_BITS = 62
+MAX_FORMULA_BITS = 62
 
 
 def width(formula: Formula) -> int:
@@ -798,15 +803,15 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """A value of a parsed frame that has no bytes of its own, and that is ignored when it is built.
+    """A value of a parsed frame that has no bytes of its own. `build` ignores it.
 
     Attributes:
         info: the value as a field.
-        kind: "computed" from other fields (construct's Computed), the "offset" of its place in the
-            frame (Tell), the "size" or the "bytes" of a part before it (RawCopy), or the node
-            whose bytes follow, "peeked" (Peek).
-        formula: of a computed value; None if it is `constant`.
-        constant: the value of a computed one without fields.
+        kind: "computed" from other fields (construct's Computed), its own "offset" in the frame
+            (Tell), the "size" or the "bytes" of a part before it (RawCopy), or "peeked", the value
+            of the following bytes (Peek).
+        formula: the formula of a computed value; None if it is `constant`.
+        constant: a computed value that depends on no field.
         part: the path of the part that is measured or copied.
         node: the node that is peeked.
     """
@@ -837,13 +842,13 @@ class Opaque:
 
     Attributes:
         info: the part as a field.
-        kind: the name of its construct class, which may be the author's own.
+        kind: the name of its construct class, which may be a class of the plugin.
         reason: why it cannot be converted to another node.
         inside: the nodes in it, if it is a bit block or a struct. They have no offsets.
         size: in bytes; None if it depends on the bytes themselves.
-        form: how a field is stored: "text up to" its terminator, else its kind.
+        form: how a field is stored: "text up to" its terminator, otherwise its kind.
         in_bits: True for a bit block.
-        terminator: the byte that ends any bytes; b"" if the part is not read as such.
+        terminator: the byte that ends a sequence of arbitrary bytes; b"" for other parts.
     """
 
     name: str
@@ -904,7 +909,7 @@ def nodes(node: Node) -> Iterator[Node]:
 
 
 def formulas(node: Node) -> tuple[Formula, ...]:
-    """Return the formulas of a node itself, without those of the nodes below it."""
+    """Return the formulas of a node itself, without formulas of the nodes below it."""
     match node:
         case Blob():
             return (node.size,)
@@ -961,7 +966,7 @@ def size(node: Node) -> Formula | None:
 
 
 def total(sizes: Iterable[Formula | None]) -> Formula | None:
-    """Return the sum of sizes, None if one of them is None."""
+    """Return the sum of sizes; None if any of them is None."""
     sum_: Formula | None = 0
     for each in sizes:
         sum_ = combine("+", sum_, each)
@@ -969,7 +974,10 @@ def total(sizes: Iterable[Formula | None]) -> Formula | None:
 
 
 def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
-    """Return a sum, difference or product in its simplest form, None if an operand is None."""
+    """Return a sum, difference or product in its simplest form.
+
+    Returns None if an operand is None.
+    """
     if one is None or other is None:
         return None
     neutral = 1 if symbol == "*" else 0
@@ -1075,9 +1083,10 @@ class Scope:
 
 
 class Beside(Scope):
-    """The context of a value that stands in no struct of its own (construct's RawCopy).
+    """The context of a value that has no struct of its own (construct's RawCopy).
 
-    Its own names are those of its bytes and place. Expressions of the value see the outer context.
+    It has names for the bytes and the offsets of the value. For other names, expressions of the
+    value see the outer context.
     """
 
     def __init__(self, scope: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -1092,7 +1101,7 @@ class Beside(Scope):
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A computed value, as later expressions read it.
+    """A computed value, in the form that later expressions read.
 
     Attributes:
         content: a formula or a constant; `Untraced` if no formula gives it.
@@ -1239,7 +1248,7 @@ def _find_label_value(ref: Ref, label: str) -> int:
     """Return the raw value of a label.
 
     Raises:
-        Untraceable: if the field has no such label.
+        UntraceableExpressionError: if the field does not have this label.
     """
     for value, name in ref.info.labels.items():
         if name == str(label):

@@ -96,7 +96,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         return AlongAxis(tuple(axes.values()), array)
 
     def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
-        """Return the numbers with an axis for each name; axes of other arrays have length 1.
+        """Return the numbers with an axis for each name; missing axes have length 1.
 
         Args:
             names: last parts of paths; the own axes are among them.
@@ -136,11 +136,11 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
     Args:
         start, end: first and last angle of each packet, shape (n, 1), in the unit of `full`.
         count: points per packet, a number or a column (n, 1); 1 gives `start`.
-        full: the whole circle in that unit; an end below the start is one turn further.
+        full: the whole circle in that unit. An end below the start is one turn further.
 
     Returns:
-        float64, shape (n, count), not wrapped, so that differences are positive. With a column as
-        `count`, as many as the longest packet has; those beyond the count of a packet are not used.
+        float64, shape (n, count), not wrapped, so that differences are positive. If `count` is a
+        column, its largest value is used, and values beyond the count of a packet have no meaning.
 
     Raises:
         SpecError: if every end that differs from its start is whole turns away, so that all points
@@ -154,17 +154,16 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
 
 def steps(count: Array) -> Array:
-    """Return the index of each sample of a packet: 0, 1, 2 ... up to the largest count.
+    """Return the index of each sample of a packet: 0, 1, 2 ...
 
     For times, for example: ``steps(f.count) / RATE``.
 
     Args:
-        count: samples of each packet, a number or a column; it has to be the count of the innermost
+        count: samples of each packet, a number or a column. It has to be the count of the innermost
             array.
 
     Returns:
-        Integers, shape (count,); with a column as `count` as many as the longest packet of the
-        batch has, as its arrays do.
+        Integers, shape (count,). If `count` is a column, its largest value in the batch is used.
     """
     if hasattr(count, "steps"):
         return count.steps()
@@ -209,7 +208,7 @@ def previous(a: Array, step: int = 1) -> Array:
 
 
 def last(a: Array, where: Array | None = None) -> Array:
-    """Return the most recent value, this one included, for which `where` was true.
+    """Return the most recent value for which `where` is true, including this value.
 
     Args:
         where: a condition of the shape of `a`; by default that `a` is not nan.
@@ -233,22 +232,22 @@ def last(a: Array, where: Array | None = None) -> Array:
 def between_blocks(
     azimuth: Array, ahead: Array, *, fastest: Array, repeat: bool = True, full: float = 360.0
 ) -> Array:
-    """Return how far a rotor turns from each block to the next one.
+    """Return the angle that a rotor turns from each block to the next.
 
-    A step that is longer than the rotor can turn is a loss or a masked sector. The last good step
+    A step that is longer than the rotor can turn is a loss or a masked sector. The last valid step
     in stream order replaces it.
 
     Args:
         azimuth: azimuth of each block, in the unit of `full`.
-        ahead: azimuth of the next block that does not share it, such as ``following(azimuth)``.
-        fastest: how far the sensor turns from block to block at its highest speed, in the unit of
+        ahead: azimuth of the next block with another azimuth, for example ``following(azimuth)``.
+        fastest: the angle from block to block at the highest speed of the sensor, in the unit of
             `full`. Encoder readings vary, so steps may be up to 25 % longer.
-        repeat: False returns nan in place of the last good step.
+        repeat: False returns nan in place of the last valid step.
         full: the whole circle in the unit of `azimuth`.
 
     Returns:
-        float64, the shape of `azimuth`; the shorter way round, so negative if the readings jitter;
-        nan before the first good step.
+        float64, the shape of `azimuth`. Steps are measured the shorter way round, so they are
+        negative if the readings jitter. nan before the first valid step.
     """
     step = ahead - azimuth
     step = step - full * np.rint(step / full)
@@ -259,7 +258,10 @@ def between_blocks(
 
 
 def stack(*columns: Array) -> Array:
-    """Return columns side by side on a new innermost axis: k of shape (n, b) give (n, b, k)."""
+    """Return columns side by side on a new innermost axis.
+
+    From k columns of shape (n, b), it makes one of shape (n, b, k).
+    """
     return _apply(side_by_side, *columns)
 
 
@@ -286,11 +288,11 @@ def take(table: Array, index: Array) -> Array:
 
     Args:
         table: (m,), a number for each index; or (m, k), a row for each index, along the array of k
-            elements inside those of `index`.
+            elements inside the arrays of `index`.
 
     Returns:
-        float64, the shape of `index`; for rows with k as the length of the inner array: an index of
-        shape (n, 16, 1) gives (n, 16, k).
+        float64, the shape of `index`. For a table of rows, the length of the inner array becomes k:
+        an index of shape (n, 16, 1) gives (n, 16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
@@ -310,7 +312,7 @@ def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
 
 
 class TableLookup:
-    """Function of an index that returns the entries of a table, (m,); nan if there is none."""
+    """Function of an index that returns entries of a table, (m,); nan outside it."""
 
     def __init__(self, entries: Any) -> None:
         self.entries = entries
@@ -353,7 +355,7 @@ def _shift(a: Array, step: int) -> Array:
 
 
 def _apply(function: Callable[..., Any], *values: Array) -> Array:
-    """Return `function` of arrays; a column applies the function itself."""
+    """Return `function` of arrays; if one is a column, the column applies the function."""
     for value in values:
         if hasattr(value, "apply_function"):
             return value.apply_function(function, *values)

@@ -1,8 +1,8 @@
-"""Adapters of construct as functions between the values on the wire and those of a parsed frame.
+"""Convert adapters of construct to functions between raw and decoded values.
 
-An adapter is called with values of its field, and no context. If it needs one, or if it fails for
-some numbers, only construct can apply it. All values of a byte are tried, and some hundred of wider
-fields. An adapter that does not give the bytes back is refused: it would lose them.
+An adapter is called with values of its field, without a context. If it needs a context, or fails
+for some numbers, only construct can apply it. All values of a byte are tried, and several hundred
+values of a wider field. An adapter that does not restore the raw value is refused.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from construct import BitsInteger, BytesInteger, Construct, FormatField, Subcons
 
 from lidarspec.spec import tree
 
-#: how many values of a field wider than a byte are tried.
-SAMPLES = 200
+#: number of random values to try for a field that is wider than a byte.
+TRIAL_COUNT = 200
 
-#: adapters with a meaning of their own.
+#: adapters with a known meaning, which are handled elsewhere.
 _KNOWN = (construct.Enum, construct.Validator, construct.StringEncoded)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The result of some values of an adapter.
+    """The results of an adapter for trial values.
 
     Attributes:
-        valid: the raw values that it takes.
-        values: what it makes of them.
-        failed: whether it fails for some values.
-        lost: a raw value that it does not give back, and what it gives; None without.
+        valid: the raw values that it accepts.
+        values: the decoded values.
+        failed: whether it fails for some raw values.
+        lost: a raw value that it does not restore, and the raw value it returns instead; None if it
+            restores all.
     """
 
     valid: tuple[Any, ...]
@@ -44,8 +45,9 @@ class Trial:
 
 
 def int_adapter(con: Construct) -> tree.Adapter | None:
-    """Return an adapter of an integer as functions; None for another construct, or if only
-    construct can apply it.
+    """Return the functions of an adapter of an integer.
+
+    Returns None for another construct, or if only construct can apply the adapter.
     """
     if not is_int_adapter(con):
         return None
@@ -54,14 +56,14 @@ def int_adapter(con: Construct) -> tree.Adapter | None:
     if not trial.valid or is_partial or trial.lost is not None:
         return None
     allowed = trial.valid if trial.failed else None
-    return _make(
+    return _make_adapter(
         functools.partial(_decode_int, con), functools.partial(_encode_int, con), trial, allowed
     )
 
 
 @functools.lru_cache(maxsize=4096)
 def without_int_adapters(con: Construct) -> Construct:
-    """Return a copy of a bit block with integers in place of their adapters."""
+    """Return a copy of a bit block with plain integers in place of their adapters."""
     if int_adapter(con) is not None:
         return without_int_adapters(con.subcon)
     if not isinstance(con, Subconstruct | construct.Struct):
@@ -76,7 +78,10 @@ def without_int_adapters(con: Construct) -> Construct:
 
 
 def is_int_adapter(con: Construct) -> bool:
-    """Return whether a construct is an adapter of an integer without a meaning of its own."""
+    """Return whether a construct is a general adapter of an integer.
+
+    Adapters with a known meaning (`_KNOWN`) are not general.
+    """
     if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
         return False
     return _int_bits(con.subcon) > 0
@@ -84,23 +89,25 @@ def is_int_adapter(con: Construct) -> bool:
 
 @functools.lru_cache(maxsize=4096)
 def try_values(con: Construct) -> Trial:
-    """Try values of an adapter of an integer."""
+    """Return the results of an adapter of an integer for trial values."""
     bits = _int_bits(con.subcon)
     is_signed = _is_signed(con.subcon)
     if bits <= 8:
         raws: Sequence[int] = range(1 << bits)
     else:
-        import random  # finding a sensor does without it
+        import random  # imported here because finding a sensor does not need it
 
         source = random.Random(bits)
         edges = [0, 1, 2, (1 << bits) - 1, 1 << (bits - 1), (1 << (bits - 1)) - 1]
-        raws = [*edges, *(source.getrandbits(bits) for _ in range(SAMPLES))]
+        raws = [*edges, *(source.getrandbits(bits) for _ in range(TRIAL_COUNT))]
     if is_signed:
         raws = [raw - (1 << bits) if raw >> (bits - 1) else raw for raw in raws]
-    return _try(raws, functools.partial(_decode_int, con), functools.partial(_encode_int, con))
+    return _run_trial(
+        raws, functools.partial(_decode_int, con), functools.partial(_encode_int, con)
+    )
 
 
-def _try(
+def _run_trial(
     raws: Sequence[Any], decode: Callable[[Any], Any], encode: Callable[[Any, int], Any]
 ) -> Trial:
     valid = []
@@ -109,7 +116,7 @@ def _try(
     for raw in raws:
         try:
             value = decode(raw)
-        except Exception:  # the author's code may raise anything, above all without a context
+        except Exception:  # a function of a plugin may raise anything, for example without context
             continue
         valid.append(raw)
         values.append(value)
@@ -122,7 +129,7 @@ def _try(
     return Trial(tuple(valid), tuple(values), len(valid) < len(raws), lost)
 
 
-def _make(
+def _make_adapter(
     decode: Callable[[Any], Any],
     encode: Callable[[Any, int], Any],
     trial: Trial,
@@ -169,17 +176,17 @@ def _is_signed(con: Any) -> bool:
 
 
 def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
-    """Return a text as functions: its encoding, and the characters that fill its field."""
+    """Return the functions of a text, from its encoding and its padding."""
     inner = con.subcon
     while isinstance(inner, Subconstruct) and not isinstance(inner, construct.NullStripped):
         inner = inner.subcon
-    decode = functools.partial(_decode_text, con.encoding, _stripped(inner))
-    encode = functools.partial(_encode_text, con, _stripped(inner))
+    decode = functools.partial(_decode_text, con.encoding, _find_stripped(inner))
+    encode = functools.partial(_encode_text, con, _find_stripped(inner))
     form = f"text {con.encoding}"
     return tree.Adapter(decode, encode, np.dtype(object), is_partial=True, form=form)
 
 
-def _stripped(con: Construct) -> Construct | None:
+def _find_stripped(con: Construct) -> Construct | None:
     return con if isinstance(con, construct.NullStripped) else None
 
 
@@ -194,8 +201,11 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
 
 
 def part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return a part of a fixed number of bytes as functions; None if only construct can read it."""
-    size = _size_alone(con)
+    """Return the functions of a part of fixed size.
+
+    Returns None if only construct can read the part.
+    """
+    size = _find_independent_size(con)
     if not size:
         return None
 
@@ -205,28 +215,28 @@ def part_adapter(con: Construct) -> tree.Adapter | None:
     def encode(value: Any, _: int) -> Any:
         return con.build(value)
 
-    import random  # finding a sensor does without it
+    import random  # imported here because finding a sensor does not need it
 
     source = random.Random(size)
     ascii_bytes = bytes(source.choice(b"abcdef") for _ in range(size))
-    raws = [bytes(size), ascii_bytes, *(source.randbytes(size) for _ in range(SAMPLES))]
-    trial = _try(raws, decode, encode)
+    raws = [bytes(size), ascii_bytes, *(source.randbytes(size) for _ in range(TRIAL_COUNT))]
+    trial = _run_trial(raws, decode, encode)
     is_struct = any(isinstance(value, dict) for value in trial.values)
     if not trial.valid or trial.lost is not None or is_struct:
         return None
-    return _make(decode, encode, trial, is_partial=trial.failed, form=_form(con))
+    return _make_adapter(decode, encode, trial, is_partial=trial.failed, form=_describe_form(con))
 
 
-def _form(con: Construct) -> str:
-    """Return how a part is stored, for people."""
+def _describe_form(con: Construct) -> str:
+    """Return a description of how a part is stored."""
     if isinstance(con, BytesInteger):
         order = "le" if con.swapped else "be"
         return f"{'int' if con.signed else 'uint'}{8 * int(con.length)} {order}"
     return type(con).__name__
 
 
-#: what needs no more than its own bytes.
-_ALONE = (
+#: constructs that depend on no other bytes.
+_INDEPENDENT_KINDS = (
     FormatField,
     BytesInteger,
     construct.Bytes,
@@ -243,12 +253,12 @@ _ALONE = (
 )
 
 
-def _size_alone(con: Construct) -> int:
-    """Return the fixed size of a part that needs no more than its own bytes; else 0."""
+def _find_independent_size(con: Construct) -> int:
+    """Return the fixed size of a part that depends on no other bytes, else 0."""
     pending = [con]
     while pending:
         part = pending.pop()
-        if not isinstance(part, _ALONE):
+        if not isinstance(part, _INDEPENDENT_KINDS):
             return 0
         pending += [part.subcon] if isinstance(part, Subconstruct) else getattr(part, "subcons", [])
     try:

@@ -280,7 +280,7 @@ class _Builder:
             not isinstance(formula, tree.Untraced)
             and all(_is_near(ref, place.info) for ref in asked)
             and all(map(_is_whole, tree.parts(formula)))
-            and (is_fractional or tree.width(formula) <= tree.MOST_BITS)
+            and (is_fractional or tree.width(formula) <= tree.MAX_FORMULA_BITS)
         )
         if not is_computable:
             return None
@@ -644,7 +644,7 @@ class _Builder:
             ]
             if (
                 not asked
-                and tree.width(condition) <= tree.MOST_BITS
+                and tree.width(condition) <= tree.MAX_FORMULA_BITS
                 and all(map(_is_whole, tree.parts(condition)))
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)

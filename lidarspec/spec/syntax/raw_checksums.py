@@ -1,8 +1,8 @@
 """Recognise construct's Checksum of a RawCopy as a seal of the struct that has both.
 
-``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` is the same as
-`Checksummed` with a function for its algorithm. The argument of the function is found by calling
-its expression with an object that records the names that it is asked for.
+``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` equals a `Checksummed`
+with the function as its algorithm. The covered part is found by calling the expression of the
+Checksum with an object that records the names it reads.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from construct import Construct, Struct
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.syntax.replacements import BoundedPart, SealedStruct
 
-#: maximum width of a checksum that is judged in bulk.
-MAX_BITS = 64
+#: maximum width of a checksum for many frames at once, in bits.
+MAX_CHECKSUM_BITS = 64
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class FunctionChecksum(Checksum):
 
     Attributes:
         function: returns the checksum, a number or bytes.
-        takes_part: whether it takes the whole part of construct's RawCopy, in place of its bytes.
+        takes_part: whether its argument is the whole value of construct's RawCopy, not only the
+            bytes.
     """
 
     function: Callable[[Any], int | bytes]
@@ -49,7 +50,7 @@ class FunctionChecksum(Checksum):
 
 @dataclass(frozen=True)
 class _Names:
-    """The names that an expression asks for, from the struct that it is in."""
+    """Records the names that an expression reads from the struct that contains it."""
 
     names: tuple[str, ...] = ()
 
@@ -63,16 +64,17 @@ class _Names:
 
 
 def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
-    """Return the members of a struct with plain fields in place of checksums of a RawCopy.
+    """Return the members of a struct without its checksums of a RawCopy.
 
     Returns:
-        The members, and for each of these checksums the arguments of a `Sealing`.
+        The members, with plain fields in place of these checksums, and for each of them the
+        arguments of a `SealedStruct`.
     """
     found = list[Construct]()
     seals = list[dict[str, Any]]()
     for member in members:
         checksum = _strip(member)
-        over = _covered_part(checksum, members) if member.name else None
+        over = _find_covered_part(checksum, members) if member.name else None
         if over is None or not isinstance(checksum, construct.Checksum):
             found.append(member)
             continue
@@ -93,20 +95,23 @@ def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
     return struct
 
 
-def _covered_part(
+def _find_covered_part(
     checksum: Construct, members: Sequence[Construct]
 ) -> tuple[tuple[str, ...], bool] | None:
-    """Return the names of the RawCopy that a checksum is made of, and whether its function takes
-    the whole part; None for another checksum.
+    """Return the names of the RawCopy that a checksum covers.
+
+    Returns:
+        The names, and whether the function of the checksum takes the whole value of the RawCopy.
+        None for another checksum.
     """
     if not isinstance(checksum, construct.Checksum):
         return None
     try:
         asked = checksum.bytesfunc(_Names())
         bits = 8 * int(checksum.checksumfield.sizeof())
-    except Exception:  # the author's function may do anything with what it is given
+    except Exception:  # a function of a plugin may raise anything
         return None
-    if not isinstance(asked, _Names) or bits > MAX_BITS:
+    if not isinstance(asked, _Names) or bits > MAX_CHECKSUM_BITS:
         return None
     if asked.names[-1:] == ("data",) and _is_raw_copy(members, asked.names[:-1]):
         return asked.names[:-1], False
@@ -128,7 +133,7 @@ def _is_raw_copy(members: Sequence[Construct], names: Sequence[str]) -> bool:
 
 
 def _strip(con: Construct) -> Construct:
-    """Return a construct without its name, and without a length in front of it."""
+    """Return a construct without its name and without a length before it."""
     while isinstance(con, construct.Renamed | construct.Prefixed | BoundedPart):
         con = con.subcon
     return con

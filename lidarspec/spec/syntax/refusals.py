@@ -1,5 +1,7 @@
-"""What no frame can be described by: names that clash, constructs that lose bits, run code or never
-end; with path and reason.
+"""Refuse structs that cannot describe a frame.
+
+These are structs with clashing names, and constructs that lose bits, run code or have no end. The
+error has the path and the reason.
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ from lidarspec.spec.syntax.structs import (
     unwrap,
 )
 
-#: names that `points` and the engine need for themselves.
+#: field names that are reserved for `points` and the engine.
 RESERVED = frozenset({"state", "on"})
 SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_"))
 
-#: the rule under which `lidarspec check` explains it, and the reason.
+#: refused construct -> the rule that `lidarspec check` explains, and the reason.
 _REFUSED: dict[type, tuple[str, str]] = {
     type(construct.Pickled): ("LS110", "Pickled executes code from the wire: use other fields"),
     construct.FlagsEnum: (
@@ -67,12 +69,12 @@ _REFUSED: dict[type, tuple[str, str]] = {
     ),
 }
 
-#: what gives a greedy part its end, and what has none of its own.
-_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
+#: constructs that limit a greedy part.
+_BOUNDED_KINDS = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
 
 
-#: of what stands in a struct without a name, what to write in its place.
-_INSTEAD: dict[type, str] = {
+#: construct in a struct without a name -> the message with a replacement.
+_UNNAMED_REASONS: dict[type, str] = {
     HeldCheck: (
         "a Check must have a name: 'valid' / Check(...); or use plausible=lambda f: ...,"
         " which is vectorized"
@@ -88,17 +90,17 @@ _INSTEAD: dict[type, str] = {
 
 
 def check_struct(con: Construct) -> SpecError | None:
-    """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
+    """Raise `SpecError` if a construct cannot describe a frame.
 
     Returns:
-        Why its frames have no end on a byte stream; None if they have one.
+        An error if the frames have no end in a byte stream; None if they have an end.
 
     Raises:
         SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses
-            bits or never ends.
+            bits or never ends. It has the path and the reason.
     """
     endless = _check_ends(con, "", bounded=False)
-    for path, part, in_bits in _walk(con, "", in_bits=False):
+    for path, part, in_bits in _iter_constructs(con, "", in_bits=False):
         lost = try_values(part).lost if is_int_adapter(part) else None
         if lost is not None and not isinstance(part, construct.FlagsEnum):
             raw, back = lost
@@ -133,14 +135,15 @@ def check_struct(con: Construct) -> SpecError | None:
 def _check_ends(
     con: Construct, path: str, *, bounded: bool, is_last: bool = True
 ) -> SpecError | None:
-    """Refuse greedy parts, unless they are the last in one that has an end or in the frame; and
-    what such a one would drop.
+    """Refuse greedy parts without an end, and bounded parts that lose bytes.
+
+    A greedy part is valid at the end of the frame, or of a part that has an end.
 
     Returns:
-        Why a frame has no end on a stream, if its last part is greedy.
+        An error if the last part of the frame is greedy, so that it has no end in a stream.
 
     Raises:
-        SpecError: for another greedy part without an end.
+        SpecError: for another greedy part without an end, or for a part that loses bytes.
     """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}".strip(".")
@@ -163,18 +166,18 @@ def _check_ends(
     for child in below:
         passes = not hasattr(con, "subcons") or child is below[-1]
         passes = passes and not isinstance(con, Array | construct.GreedyRange)
-        is_bounded = isinstance(con, (*_BOUNDED, *RECODING)) or (passes and bounded)
+        is_bounded = isinstance(con, (*_BOUNDED_KINDS, *RECODING)) or (passes and bounded)
         error = _check_ends(child, path, bounded=is_bounded, is_last=passes and is_last)
         endless = endless or error
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
-    # A named part behind its length has a field for it, which is held to the size of the part.
+    # A named part after its length has a length field, which must equal the size of the part.
     is_held = isinstance(con, BoundedPart) and not is_greedy(con.subcon, (construct.NullStripped,))
     if (
-        isinstance(con, _BOUNDED)
+        isinstance(con, _BOUNDED_KINDS)
         and not is_held
         and not fits
-        and not _fills(con.subcon, padded=is_sized)
+        and not _reads_all_bytes(con.subcon, padded=is_sized)
     ):
         name = "Prefixed" if isinstance(con, BoundedPart) else type(con).__name__
         if isinstance(con, BoundedPart | construct.NullTerminated):
@@ -189,15 +192,19 @@ def _check_ends(
     return endless
 
 
-def _fills(con: Construct, *, padded: bool) -> bool:
-    """Whether a part takes up all bytes that it is given, and builds them again; `padded`: with
-    zeros behind it where it is shorter.
+def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
+    """Return whether a part reads all its bytes and builds the same bytes again.
+
+    Args:
+        padded: whether zeros are added after a part that is too short.
     """
     if isinstance(con, construct.NullStripped):
         return padded and con.pad == b"\0" and con.subcon is construct.GreedyBytes
-    if isinstance(con, (Array, *_BOUNDED)) or not children(con):
+    if isinstance(con, (Array, *_BOUNDED_KINDS)) or not children(con):
         return con is construct.GreedyBytes
-    return isinstance(con, construct.GreedyRange) or _fills(children(con)[-1], padded=padded)
+    return isinstance(con, construct.GreedyRange) or _reads_all_bytes(
+        children(con)[-1], padded=padded
+    )
 
 
 def _check_focus(con: construct.FocusedSeq, path: str) -> None:
@@ -224,7 +231,7 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
                 kind = type(unwrap(child))
-                reason = _INSTEAD.get(
+                reason = _UNNAMED_REASONS.get(
                     kind, f"an unnamed {kind.__name__} would lose its value: give it a name"
                 )
                 raise SpecError(reason, path=path, rule="LS105")
@@ -258,8 +265,9 @@ def _check_measures(
     measure: tuple[float, float, str],
     measures_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
-    """Refuse a field that branches measure in different steps or units: it is one column, and has
-    one of each.
+    """Refuse a field that has different scales or units in different branches.
+
+    It is one column, which has one scale and one unit.
     """
     if isinstance(con, construct.Renamed):
         if path:
@@ -282,11 +290,13 @@ def _check_measures(
             _check_measures(child, path, measure, measures_by_path)
 
 
-def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Construct, bool]]:
+def _iter_constructs(
+    con: Construct, path: str, *, in_bits: bool
+) -> Iterator[tuple[str, Construct, bool]]:
     if con.name is not None and isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}" if path else con.name
     yield path, con, in_bits
     if isinstance(con, construct.Transformed | construct.Restreamed):
         in_bits = True
     for child in children(con):
-        yield from _walk(child, path, in_bits=in_bits)
+        yield from _iter_constructs(child, path, in_bits=in_bits)

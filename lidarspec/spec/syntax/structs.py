@@ -59,7 +59,7 @@ from lidarspec.spec.syntax.replacements import (
 )
 
 if TYPE_CHECKING:
-    import random  # finding a sensor does without it
+    import random  # imported here because finding a sensor does not need it
 
     #: field path -> what draws its value in place of chance
     Drawn = Mapping[str, Callable[[random.Random], Any]]
