@@ -63,10 +63,10 @@ from lidarspec.spec.syntax.structs import (
 
 
 def frame_tree(con: Construct) -> tree.Node:
-    """The tree of a struct.
+    """Return the tree of a struct.
 
     Raises:
-        SpecError: for a constant that its Enum has no value for.
+        SpecError: for a constant name that its Enum does not have.
     """
     return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
@@ -86,10 +86,10 @@ def _build_twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Bui
 
 
 def _trace(expression: Any, scope: tree.Scope) -> Any:
-    """Return the value of an expression whose fields are symbols.
+    """Return the value of an expression in which symbols replace the fields.
 
-    Expressions of construct are walked here instead of called, since calling ``~`` evaluates
-    ``not value``, and the truth of a symbol is not known.
+    Expressions of construct are walked here instead of called, because calling ``~`` evaluates
+    ``not value``, and a symbol has no truth value.
     """
     if isinstance(expression, BinExpr):
         return expression.op(_trace(expression.lhs, scope), _trace(expression.rhs, scope))
@@ -103,24 +103,24 @@ def _trace(expression: Any, scope: tree.Scope) -> Any:
     return expression
 
 
-def _spell(expression: Any, path: str) -> str:
-    """An expression of the part at `path` as its author wrote it, with fields by their whole paths;
-    "?" for a function.
+def _format_expression(expression: Any, path: str) -> str:
+    """Return an expression as text with whole paths of fields; "?" for a function.
+
+    Args:
+        path: the path of the part that contains the expression.
     """
     text = repr(expression)
     if " at 0x" in text:
         return "?"
     return re.sub(
         r"\bthis(?:\.\w+)+",
-        functools.partial(_whole_path, path),
+        functools.partial(_expand_path, path),
         re.sub(r"\['(\w+)'\]", r".\1", text),
     )
 
 
-def _whole_path(path: str, way: re.Match[str]) -> str:
-    """``this.count`` or ``this._.count`` in the part at `path` as the path from the top of the
-    frame.
-    """
+def _expand_path(path: str, way: re.Match[str]) -> str:
+    """Return the whole path of ``this.count`` or ``this._.count`` in the part at `path`."""
     names = path.split(".")[:-1]
     for name in way[0].split(".")[1:]:
         if name == "_root":
@@ -133,8 +133,9 @@ def _whole_path(path: str, way: re.Match[str]) -> str:
 
 
 def to_seen(info: tree.FieldInfo, raw: int) -> Any:
-    """A raw value as the expressions of a struct see it: where construct's Enum has a name for it,
-    that name.
+    """Return a raw value as expressions of a struct read it.
+
+    It has its name if construct's Enum has a name for it.
     """
     if raw in info.labels:
         return construct.EnumIntegerString.new(raw, info.labels[raw])
@@ -142,7 +143,7 @@ def to_seen(info: tree.FieldInfo, raw: int) -> Any:
 
 
 def to_unnamed(raw: int) -> Any:
-    """A raw value that construct's Enum has no name for."""
+    """Return a raw value without a name in its Enum, as construct does."""
     return construct.EnumInteger(raw)
 
 
@@ -163,12 +164,14 @@ class _Context:
     in_bits: bool = False
     #: number of bytes up to the end of the enclosing part, if its length is declared elsewhere.
     room: tree.Formula | None = None
-    #: returns the offset in the frame, None if no formula gives it; None in parts, whose offset in
+    #: the frame is not known.
+    #: returns the offset in the frame, or None if no formula gives it. It is None in parts, because
+    #: their offset in the frame is not known.
     #: the frame is not known.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
     def inside(self, **changes: Any) -> _Context:
-        """The place with some facts of the field changed."""
+        """Return the context with some facts of the field changed."""
         return replace(self, info=replace(self.info, **changes))
 
 
@@ -196,12 +199,14 @@ class _Builder:
         self._measured: dict[tree.Scope, list[tuple[int, SizeField]]] = {}
 
     def node(self, con: Construct, place: _Context) -> tree.Node:
-        """The node of a construct, whatever it is."""
+        """Return the node of a construct of any class."""
         inner, place = self._unwrap_describing(con, place)
         name = place.name
         info = place.info
         is_block = isinstance(inner, construct.Transformed | construct.Restreamed)
-        if not place.in_bits and (is_block or (isinstance(inner, BytesInteger) and _is_odd(inner))):
+        if not place.in_bits and (
+            is_block or (isinstance(inner, BytesInteger) and _is_variable_integer(inner))
+        ):
             return self._block(inner, place)
         if is_block:
             return self.node(inner.subcon, place)
@@ -214,7 +219,7 @@ class _Builder:
             count = self._formula(inner.count, place)
             inside = place.inside(axes=(*info.axes, axis), default=None)
             if inside.offset is not None:
-                inside = replace(inside, offset=_no_offset)
+                inside = replace(inside, offset=_return_no_offset)
             return tree.Repeat(name, axis, count, self.node(inner.subcon, inside), info.default)
         if isinstance(inner, Partition):
             return self._parts(inner, place)
@@ -234,7 +239,7 @@ class _Builder:
             room = self._formula(inner.length, place)
             return self.node(inner.subcon, replace(place, room=room))
         if isinstance(inner, construct.GreedyRange | construct.RepeatUntil) and not place.in_bits:
-            return self._filling(inner, place)
+            return self._fill_with_elements(inner, place)
         if isinstance(inner, RawPart):
             return self._raw(inner, place)
         if isinstance(inner, construct.Check):
@@ -250,13 +255,14 @@ class _Builder:
         return self._leaf(inner, place)
 
     def _make_derived(self, con: Construct, place: _Context) -> tree.Node | None:
-        """Return the node of a value that is not on the wire; None for another construct, or if
-        only construct can compute it.
+        """Return the node of a value without bytes of its own.
+
+        Returns None for another construct, or if only construct can compute the value.
         """
         if isinstance(con, construct.Computed):
             return self._make_computed(con, place)
         if con is construct.Tell and place.offset is not None:
-            info = _integer(place.info)
+            info = _describe_integer(place.info)
             offset = place.offset()
             if offset is None:
                 reason = f"{info.path}: Tell in an array, or after a part of unknown size"
@@ -265,7 +271,7 @@ class _Builder:
             return tree.Derived(info, "offset")
         if isinstance(con, construct.Peek):
             node = self.node(con.subcon, place)
-            if isinstance(tree.size(node), int) and all(map(_is_free, tree.nodes(node))):
+            if isinstance(tree.size(node), int) and all(map(_accepts_any_bytes, tree.nodes(node))):
                 return tree.Derived(place.info, "peeked", node=node)
         return None
 
@@ -278,7 +284,7 @@ class _Builder:
         is_fractional = tree.fraction_in(formula) is not None
         is_computable = (
             not isinstance(formula, tree.Untraced)
-            and all(_is_near(ref, place.info) for ref in asked)
+            and all(_is_single_value(ref, place.info) for ref in asked)
             and all(map(_is_whole, tree.parts(formula)))
             and (is_fractional or tree.width(formula) <= tree.MAX_FORMULA_BITS)
         )
@@ -287,10 +293,12 @@ class _Builder:
         self._add_value(place, formula)
         is_float = is_fractional or any(ref.info.kind == "float" for ref in asked)
         info = replace(place.info, dtype=np.dtype(float), kind="float", bits=64)
-        return tree.Derived(info if is_float else _integer(place.info), "computed", formula)
+        return tree.Derived(
+            info if is_float else _describe_integer(place.info), "computed", formula
+        )
 
     def _raw(self, con: RawPart, place: _Context) -> tree.Struct:
-        """Return a part as the value of a struct that also has its bytes and their place."""
+        """Return a RawCopy as a struct of the value, its bytes and its offsets."""
         info = place.info
         scope = tree.Beside(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
@@ -316,22 +324,22 @@ class _Builder:
         part = inside.info.path
         behind = (
             tree.Derived(data, "bytes", part=part),
-            tree.Derived(_integer(field("length")), "size", part=part),
-            tree.Derived(_integer(field("offset2")), "offset"),
+            tree.Derived(_describe_integer(field("length")), "size", part=part),
+            tree.Derived(_describe_integer(field("offset2")), "offset"),
         )
-        before = tree.Derived(_integer(field("offset1")), "offset")
+        before = tree.Derived(_describe_integer(field("offset1")), "offset")
         return tree.Struct(place.name, info.path, (before, value, *behind), info.docs)
 
     def _add_value(self, place: _Context, content: Any) -> None:
-        """Let later expressions read a computed value."""
+        """Add a computed value for later expressions to the scope."""
         if place.scope is not None:
             place.scope.add(place.name, tree.Value(content))
 
     def _unwrap_describing(self, con: Construct, place: _Context) -> tuple[Construct, _Context]:
-        """Remove the wrappers that only describe a field, such as its name, unit and labels.
+        """Remove the wrappers that only describe a field, for example its name and unit.
 
         Returns:
-            The wrapped construct, and the place with the facts that the wrappers declare.
+            The wrapped construct, and the context with the facts that the wrappers declare.
         """
         while True:
             if isinstance(con, construct.Renamed):
@@ -350,13 +358,13 @@ class _Builder:
                     }
                 )
             elif isinstance(con, Const):
-                place = place.inside(const=_constant(con))
+                place = place.inside(const=_find_constant(con))
             elif isinstance(con, LimitedNumber):
                 place = place.inside(allowed=con.allowed)
             elif isinstance(con, CountField):
                 place = place.inside(held=True)
             elif isinstance(con, SizeField):
-                place = place.inside(rebuilt=self._measuring(con, place), held=True)
+                place = place.inside(rebuilt=self._measure_part(con, place), held=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
                 if place.scope is None:
@@ -371,13 +379,13 @@ class _Builder:
             con = con.subcon
 
     def _adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
-        """Return an adapter of an integer whose wrappers say nothing of its values."""
+        """Return the adapter of an integer, unless wrappers already give its values a meaning."""
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
         return int_adapter(con)
 
     def _default(self, value: Any, place: _Context) -> Any:
-        """Return the value of a construct Default: itself, or a formula of a function."""
+        """Return the value of a construct Default, or a formula if it is a function."""
         if callable(value):
             return self._formula(value, place)
         return value
@@ -391,8 +399,14 @@ class _Builder:
         is_key: bool = False,
         may_be_fraction: bool = False,
     ) -> tree.Formula:
-        """A count, length, condition, key or computed value as data, as far as it can be written
-        down.
+        """Return a count, length, condition, key or computed value as a formula.
+
+        Returns `tree.Untraced` with the reason if it cannot be converted.
+
+        Args:
+            known: the scope of the expression, if it is not the scope of `place`.
+            is_key: whether named values may be compared by their names.
+            may_be_fraction: whether the result may be a fraction.
         """
         if isinstance(expression, int):
             return int(expression)
@@ -423,13 +437,13 @@ class _Builder:
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         path = place.info.path
-        return tree.Untraced(f"{path}: {reason}", _spell(expression, path))
+        return tree.Untraced(f"{path}: {reason}", _format_expression(expression, path))
 
     def _select(self, con: construct.Switch, place: _Context) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
         labels = key.info.labels if isinstance(key, tree.Ref) else {}
         raw = {name: value for value, name in labels.items()}
-        # construct looks a value that has a name up by that name alone
+        # construct finds the case of a named value only by its name
         values = {
             case: raw.get(str(case), case) if isinstance(case, str) else case
             for case in con.cases
@@ -442,7 +456,7 @@ class _Builder:
             else:
                 reason = f"a case for {odd[0]!r}, which is not an integer"
             path = place.info.path
-            key = tree.Untraced(f"{path}: {reason}", _spell(con.keyfunc, path))
+            key = tree.Untraced(f"{path}: {reason}", _format_expression(con.keyfunc, path))
         if isinstance(key, tree.Untraced):
             values = {case: case for case in con.cases}
         cases = tuple(
@@ -476,7 +490,7 @@ class _Builder:
             offset = (
                 None
                 if place.offset is None
-                else functools.partial(_offset_behind, place.offset, members, len(members))
+                else functools.partial(_find_offset_after, place.offset, members, len(members))
             )
             inside = _Context(described, scope, child.name or "", place.in_bits, offset=offset)
             part = unwrap(child)
@@ -487,7 +501,8 @@ class _Builder:
                 PaddingField,
             ):
                 inside = replace(
-                    inside, room=self._padding(filler, inside, _from(members, filler.of[0]))
+                    inside,
+                    room=self._padding(filler, inside, _sum_member_sizes(members, filler.of[0])),
                 )
             elif place.room is not None and child is con.subcons[-1]:
                 inside = replace(
@@ -500,10 +515,12 @@ class _Builder:
         self.scopes[info.path] = scope
         made = tree.Struct(place.name, info.path, tuple(members), info.docs)
         for index, sizing in self._measured.pop(scope):
-            part = _below(made, sizing.of[sizing.out :])
+            part = _find_below(made, sizing.of[sizing.out :])
             self.sizes[index] = tree.total(
                 (
-                    _from(members, sizing.since, part.name) if sizing.since else tree.size(part),
+                    _sum_member_sizes(members, sizing.since, part.name)
+                    if sizing.since
+                    else tree.size(part),
                     sizing.plus,
                 )
             )
@@ -512,7 +529,7 @@ class _Builder:
     def _padding(
         self, con: PaddingField, place: _Context, size: tree.Formula | None
     ) -> tree.Formula | None:
-        """The bytes behind a part of this size."""
+        """Return the number of padding bytes after a part of this size."""
         number = self._formula(con.modulus if con.to is None else con.to, place)
         if con.to is not None:
             return tree.combine("-", number, size)
@@ -520,10 +537,11 @@ class _Builder:
             return size
         return tree.calculate("%", tree.calculate("-", size), number)
 
-    def _measuring(self, con: SizeField, place: _Context) -> tree.Formula | None:
-        """Return the formula for the size of a part, None in the first pass.
+    def _measure_part(self, con: SizeField, place: _Context) -> tree.Formula | None:
+        """Return the formula for the size of a part; None in the first pass.
 
-        Registers the SizeOf field, so that `_struct` computes the size when the struct is complete.
+        Also registers the SizeOf field, so that `_struct` computes the size when the struct is
+        complete.
         """
         scope = place.scope
         self.rebuilding = True
@@ -538,16 +556,17 @@ class _Builder:
         self._measured[scope].append((index, con))
         self.sizes.append(None)
         size = self._sizes[index] if self._sizes else None
-        # The length of the part is declared by this very field: keep the value that is given.
+        # This field also determines the length of the part, so its given value is kept.
         if isinstance(size, tree.Ref) and size.path == place.info.path:
             return None
         return size
 
-    def _filling(
+    def _fill_with_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return the number of elements of one size that fill a part; what only construct can read
-        if the number depends on the elements.
+        """Return an array of the elements of one size that fill a part.
+
+        If their number depends on the elements, it is a node that only construct can read.
         """
         axis = axis_path(place.info)
         element = self.node(
@@ -555,13 +574,13 @@ class _Builder:
             replace(
                 place.inside(axes=(*place.info.axes, axis)),
                 room=None,
-                offset=None if place.offset is None else _no_offset,
+                offset=None if place.offset is None else _return_no_offset,
             ),
         )
         size = tree.size(element)
         kind = author_class(con)
         if isinstance(con, construct.RepeatUntil) or place.room is None:
-            return tree.Opaque(place.name, place.info, kind, _INSTEAD[kind], (element,))
+            return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
             reason = "elements of variable size that fill a length: use Parts(element, within=...)"
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
@@ -571,7 +590,7 @@ class _Builder:
         info = place.info
         scope = place.scope
         axis = axis_path(place.info)
-        assert scope is not None  # since parts are a member of a struct
+        assert scope is not None  # because parts are a member of a struct
         elements = [
             self.node(case, replace(place.inside(axes=(*info.axes, axis)), offset=None))
             for case in con.cases.values()
@@ -579,7 +598,7 @@ class _Builder:
         kinds = list[tree.Kind]()
         outer = dict[tree.Ref, None]()
         for (name, case), element in zip(con.cases.items(), elements, strict=True):
-            root, following = self._alone(case, con.following, place)
+            root, following = self._make_part_frame(case, con.following, place)
             kinds.append(tree.Kind(name, element, root, following))
             asked = [
                 ref
@@ -609,10 +628,10 @@ class _Builder:
             place.name, axis, tuple(kinds), count, size, within, tuple(outer), total
         )
 
-    def _alone(
+    def _make_part_frame(
         self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
-        """A part as a frame in itself, and the size of the one behind it."""
+        """Return a part as a frame of its own, and the size of the part after it."""
 
         def around(builder: _Builder) -> _Context:
             assert place.scope is not None
@@ -627,8 +646,10 @@ class _Builder:
         return root, rule
 
     def _check(self, con: construct.Check, place: _Context) -> tree.Node:
-        """A condition on fields that stand side by side, as far as 64-bit integers hold what it
-        comes to.
+        """Return the node of a condition.
+
+        If it uses fields of another array or frame, or may exceed 64 bits, only construct can
+        read it.
         """
         condition = self._formula(con.func, place)
         info = place.info
@@ -691,9 +712,9 @@ class _Builder:
             place.scope.add(name, _seen_value(info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
-            node: tree.Node = _number(info, con.length, is_big=big)
-        elif isinstance(con, BytesInteger) and not _is_odd(con) and con.length <= 8:
-            node = _number(info, con.length, is_big=not con.swapped)
+            node: tree.Node = _make_number(info, con.length, is_big=big)
+        elif isinstance(con, BytesInteger) and not _is_variable_integer(con) and con.length <= 8:
+            node = _make_number(info, con.length, is_big=not con.swapped)
         elif place.room is not None and (
             isinstance(con, PaddingField) or con is construct.GreedyBytes
         ):
@@ -718,19 +739,17 @@ class _Builder:
                 name,
                 info,
                 kind,
-                _INSTEAD.get(kind, f"{kind} has no fixed offset"),
+                _OPAQUE_REASONS.get(kind, f"{kind} has no fixed offset"),
                 size=size,
-                form=_form(con),
-                terminator=_terminator(con),
+                form=_describe_form(con),
+                terminator=_find_terminator(con),
             )
         if not name and info.const is not None and not isinstance(node, tree.Opaque):
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
 
     def _encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
-        """Return bytes with functions that make the value of a part of them; None if only
-        construct can read the part.
-        """
+        """Return bytes with functions that decode them; None if only construct can read them."""
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
             return None
@@ -749,7 +768,10 @@ class _Builder:
         return tree.Blob(place.name, replace(known, adapter=adapter), size)
 
     def _text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
-        """Return the bytes of a text; None if it ends with a terminator or the datagram."""
+        """Return the size of a text in bytes.
+
+        Returns None if it ends with a terminator or the datagram.
+        """
         inner = con.subcon
         if inner is construct.GreedyBytes:
             return place.room
@@ -764,11 +786,11 @@ class _Builder:
         return None
 
     def _block(self, con: Construct, place: _Context) -> tree.Node:
-        """A bit block: the bits of each field come from probing construct itself."""
+        """Return a bit block. The bits of each field are found by probing construct."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
             size = int(con.sizeof())
-            fields = _probe(without_int_adapters(con), size)
+            fields = _probe_block(without_int_adapters(con), size)
         except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
@@ -797,14 +819,14 @@ class _Builder:
 
 
 def _seen_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
-    """Return a field as later expressions read it."""
+    """Return a field in the form that later expressions read."""
     ref = tree.Ref(info.path, info)
     if info.adapter is None:
         return ref
     unknown = tree.Untraced(f"{info.path}: a Python function makes the value of {info.path}", "?")
     try:
         value = info.adapter.decode(tree.Symbol(ref))
-    except Exception:  # the author's function may do anything with a symbol
+    except Exception:  # a function of a plugin may raise anything for a symbol
         return tree.Value(unknown)
     return tree.Value(value.formula if isinstance(value, tree.Symbol) else unknown)
 
@@ -812,7 +834,7 @@ def _seen_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
 def _is_whole(formula: tree.Formula) -> bool:
     """Return whether an operation is defined for all values of its fields.
 
-    Division, modulo and shifts are only if the right operand is a positive constant.
+    Division, modulo and shifts are defined only if the right operand is a positive constant.
     """
     if not isinstance(formula, tree.Op) or formula.symbol not in ("/", "//", "%", "<<", ">>"):
         return True
@@ -820,20 +842,23 @@ def _is_whole(formula: tree.Formula) -> bool:
     return isinstance(divisor, int | float) and divisor > 0
 
 
-def _no_offset() -> None:
-    """The offset of a place in an array, which differs from element to element."""
+def _return_no_offset() -> None:
+    """Return None, because the offset in an array differs between elements."""
     return
 
 
-def _offset_behind(
+def _find_offset_after(
     start: Callable[[], tree.Formula | None], members: Sequence[tree.Node], count: int
 ) -> tree.Formula | None:
-    """Return the offset behind the first members of a struct that begins at `start`."""
+    """Return the offset after the first `count` members of a struct."""
     return tree.combine("+", start(), tree.total(map(tree.size, members[:count])))
 
 
-def _is_near(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a computed value has one number of a field that is always there."""
+def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
+    """Return whether a computed value can read exactly one value of a field.
+
+    The field exists whenever the computed value does, and has one value in each of its elements.
+    """
     return (
         not ref.path.startswith("_.")
         and ref.info.kind in ("int", "float")
@@ -842,60 +867,67 @@ def _is_near(ref: tree.Ref, info: tree.FieldInfo) -> bool:
     )
 
 
-def _integer(info: tree.FieldInfo) -> tree.FieldInfo:
+def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
     """Return the description of a computed integer."""
     return replace(info, dtype=np.dtype(np.int64), kind="int", bits=64)
 
 
 def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
-    """Return a peeked value, or what only construct can read, if it may be cut off by the end of
-    the frame.
+    """Return a peeked value.
+
+    If the frame may end before the peeked bytes do, it is a node that only construct can read.
     """
     assert derived.node is not None
     needed = tree.size(derived.node)
-    if isinstance(needed, int) and sum(map(_least_size, behind)) >= needed:
+    if isinstance(needed, int) and sum(map(_find_min_size, behind)) >= needed:
         return derived
     reason = "Peek may read beyond the frame: declare the following bytes in the same Struct"
     return tree.Opaque(derived.name, derived.info, "Peek", reason)
 
 
-def _is_free(node: tree.Node) -> bool:
-    """Return whether a node reads any bytes without an error."""
+def _accepts_any_bytes(node: tree.Node) -> bool:
+    """Return whether a node accepts any bytes."""
     is_plain = isinstance(node, tree.Number | tree.Blob | tree.Block | tree.Struct | tree.Repeat)
     infos = tree.infos(node)
     return is_plain and all(info.const is None and info.allowed is None for info in infos)
 
 
-def _least_size(node: tree.Node) -> int:
-    """Return the least number of bytes that a node has, as far as it is known."""
+def _find_min_size(node: tree.Node) -> int:
+    """Return the minimum size of a node in bytes, 0 if it is not known."""
     match node:
         case tree.When():
-            return min(_least_size(node.then), _least_size(node.otherwise))
+            return min(_find_min_size(node.then), _find_min_size(node.otherwise))
         case tree.Select():
             options = [*(case for _, case in node.cases), node.default]
-            sizes = [_least_size(case) for case in options if not isinstance(case, tree.Never)]
+            sizes = [_find_min_size(case) for case in options if not isinstance(case, tree.Never)]
             return min(sizes, default=0)
         case tree.Struct() | tree.Sealed():
-            return sum(map(_least_size, tree.children(node)))
+            return sum(map(_find_min_size, tree.children(node)))
         case tree.Repeat():
-            return node.count * _least_size(node.element) if isinstance(node.count, int) else 0
+            return node.count * _find_min_size(node.element) if isinstance(node.count, int) else 0
     size = tree.size(node)
     return size if isinstance(size, int) else 0
 
 
-def _from(members: Sequence[tree.Node], first: str, last: str = "") -> tree.Formula | None:
-    """The bytes of some members of a struct, from one name to another, or to the end."""
+def _sum_member_sizes(
+    members: Sequence[tree.Node], first: str, last: str = ""
+) -> tree.Formula | None:
+    """Return the size of consecutive members of a struct.
+
+    Args:
+        first, last: the names of the first and the last member; "" for the last member.
+    """
     names = [member.name for member in members]
     return tree.total(
         map(tree.size, members[names.index(first) : names.index(last) + 1 if last else None])
     )
 
 
-def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
-    """The part that names lead to in a struct.
+def _find_below(node: tree.Node, names: Iterable[str]) -> tree.Node:
+    """Return the node that names lead to in a struct.
 
     Raises:
-        SpecError: where there is none.
+        SpecError: if it does not exist.
     """
     for name in names:
         body = node.struct if isinstance(node, tree.Sealed) else node
@@ -912,14 +944,17 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
     return node
 
 
-_TURNED = (
+_TRANSFORMED_REASON = (
     "{} transforms bytes: declare the bytes on the wire and transform them in `points` (f.x ^"
     " 0x55), or use a WireForm"
 )
 
-#: of what construct alone can read, what to write in its place.
-_INSTEAD = {
-    **{name: _TURNED.format(name) for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")},
+#: class that only construct can read -> the message with a replacement.
+_OPAQUE_REASONS = {
+    **{
+        name: _TRANSFORMED_REASON.format(name)
+        for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")
+    },
     **{
         name: f"{name} has no numbers: use the Array or Struct inside it"
         for name in ("NamedTuple",)
@@ -962,17 +997,17 @@ _INSTEAD = {
     "RepeatUntil": ("RepeatUntil has no fixed offset: use Array with a count, or Parts"),
 }
 
-#: what takes all bytes as they are.
-_BYTES = (type(construct.GreedyBytes),)
+#: constructs that read all available bytes unchanged.
+_GREEDY_BYTES = (type(construct.GreedyBytes),)
 
-#: of numbers, by those of their types.
-_KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
+#: kinds of numbers, by the kind of their dtype.
+_NUMBER_KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
 
 
-def _number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Number:
+def _make_number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Number:
     """Return the node of a number of whole bytes."""
     assert info.dtype is not None
-    return tree.Number(info, size, _KINDS[info.dtype.kind], "big" if is_big else "little")
+    return tree.Number(info, size, _NUMBER_KINDS[info.dtype.kind], "big" if is_big else "little")
 
 
 def axis_path(info: tree.FieldInfo) -> str:
@@ -987,7 +1022,7 @@ def axis_path(info: tree.FieldInfo) -> str:
 
 
 def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
-    """The smallest integer type of at least so many bits."""
+    """Return the smallest integer type of at least this number of bits."""
     size = next(size for size in (1, 2, 4, 8) if bits <= 8 * size)
     return np.dtype(f"{'i' if signed else 'u'}{size}")
 
@@ -1025,7 +1060,7 @@ def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
 
 
 def _is_text(con: Construct) -> bool:
-    """Whether it gives the bytes up to a terminator, or as many as are said in front of them."""
+    """Return whether a construct parses to bytes up to a terminator or of a declared size."""
     while isinstance(
         con,
         construct.NullTerminated
@@ -1037,7 +1072,7 @@ def _is_text(con: Construct) -> bool:
     return con is construct.GreedyBytes
 
 
-def _form(con: Construct) -> str:
+def _describe_form(con: Construct) -> str:
     """Return the form on the wire of a field without a size of its own."""
     below = con
     while isinstance(below, Subconstruct):
@@ -1047,8 +1082,8 @@ def _form(con: Construct) -> str:
     return type(con).__name__
 
 
-def _terminator(con: Construct) -> bytes:
-    """The byte that always stands behind a field of any bytes; b"" if there is none."""
+def _find_terminator(con: Construct) -> bytes:
+    """Return the terminator byte after a field of arbitrary bytes; b"" for other fields."""
     is_ended = (
         isinstance(con, construct.NullTerminated)
         and con.subcon is construct.GreedyBytes
@@ -1059,9 +1094,13 @@ def _terminator(con: Construct) -> bytes:
     return con.term if is_ended else b""
 
 
-def _constant(con: Const) -> Any:
-    """The raw value of a constant, also where it is given by the name that construct's Enum has for
-    it.
+def _find_constant(con: Const) -> Any:
+    """Return the raw value of a constant.
+
+    If it is given as a name of construct's Enum, the number of the name is returned.
+
+    Raises:
+        SpecError: if the Enum does not have the name.
     """
     below = con.subcon
     while isinstance(con.value, str) and isinstance(below, Subconstruct):
@@ -1076,40 +1115,48 @@ def _constant(con: Const) -> Any:
     return con.value
 
 
-def _is_odd(con: BytesInteger) -> bool:
-    """Whether its length or byte order is not plain."""
+def _is_variable_integer(con: BytesInteger) -> bool:
+    """Return whether the length or byte order of an integer is an expression."""
     is_wide = isinstance(con.length, int) and con.length > 8
     return not is_wide and not (isinstance(con.length, int) and isinstance(con.swapped, bool))
 
 
 @functools.lru_cache(maxsize=4096)
-def _probe(con: Construct, size: int) -> list[BitField] | None:
-    """The bit fields of a block; None where construct decides on its bits, or values are no plain
-    integers.
+def _probe_block(con: Construct, size: int) -> list[BitField] | None:
+    """Return the bit fields of a block.
+
+    Returns None if its fields depend on values, or if its values are not plain integers.
     """
-    if _is_even(con):
+    if _has_fixed_fields(con):
         return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
     return None
 
 
-def _is_even(con: Construct) -> bool:
+def _has_fixed_fields(con: Construct) -> bool:
     """Return whether a bit block has the same fields for all bit patterns.
 
     If a value decides which fields follow, probing with a few patterns could miss a variant.
     """
     if isinstance(con, Struct):
-        return all(map(_is_even, con.subcons))
+        return all(map(_has_fixed_fields, con.subcons))
     if isinstance(con, Subconstruct):
         return (
             isinstance(con, construct.Enum) or not isinstance(con, construct.Adapter)
-        ) and _is_even(con.subcon)
+        ) and _has_fixed_fields(con.subcon)
     return isinstance(con, BitsInteger | Bytes | BytesInteger | FormatField | type(construct.Flag))
 
 
 def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
-    """The offsets of the bytes of a block that hold any bit of one of its fields."""
+    """Return the offsets of the bytes of a block that contain bits of a field.
+
+    Args:
+        names: the names that lead to the field.
+
+    Raises:
+        KeyError: if the block does not have the field.
+    """
     keys = tuple(names)
-    for field in _probe(without_int_adapters(con), con.sizeof()) or ():
+    for field in _probe_block(without_int_adapters(con), con.sizeof()) or ():
         if field.keys == keys:
             return [segment.byte for segment in field.segments]
     raise KeyError(".".join(keys))

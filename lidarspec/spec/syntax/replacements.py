@@ -1,12 +1,12 @@
-"""The classes of a prepared struct that are not construct's: replacements, and parts of our own.
+"""The classes of a prepared struct: replacements of construct's, and additional classes.
 
-`prepare` puts a replacement in the place of a construct class that loses bytes, does not say where
-a fault is, or cannot be read unchecked. Frames with a layout are read without these classes. They
-matter for frames without a layout, which construct parses and builds one at a time, and for the
+`prepare` replaces a class of construct if it loses bytes, does not report the offset of a fault, or
+cannot parse without verification. Frames with a layout are read without these classes. They are
+used for frames without a layout, which construct parses and builds one at a time, and for the
 examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is missing.
 
-The other classes are parts that construct does not have: units, checksums, sizes, fillers and
-chains of parts. `lidarspec.spec.fields` gives the names and arguments that authors write.
+The additional classes are units, checksums, sizes, fillers and chains of parts, which construct
+does not have. `lidarspec.spec.fields` gives the names and arguments for plugins.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from lidarspec.spec.checksums import Checksum
 
 _MISSING = object()
 
-#: what construct raises where bytes or values do not fit a struct.
+#: the exception of construct for bytes or values that do not fit a struct.
 Fault = construct.ConstructError
 
 
 class MismatchError(construct.ConstructError):  # type: ignore[misc]
-    """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
+    """A value on the wire contradicts the spec; the engine converts it to a `WireError`."""
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
@@ -53,7 +53,7 @@ class MismatchError(construct.ConstructError):  # type: ignore[misc]
 
 
 class WireNaN(float):
-    """A NaN that keeps its bits, so that a signalling NaN is built as it was parsed."""
+    """A NaN that keeps its bits, so that a signalling NaN is built unchanged."""
 
     raw: bytes
 
@@ -67,19 +67,23 @@ class WireNaN(float):
 
 
 def is_verifying(context: Any) -> bool:
-    """Return whether constants, lengths, checksums and values are checked in this parse."""
+    """Return whether this parse checks constants, lengths, checksums and values."""
     return bool(context._params.get("_verify", True))
 
 
 def check_bound(number: int, limit: int, what: str, path: str) -> int:
-    """A count or a length that a frame can have; RangeError for another one."""
+    """Return a count or length if it is possible in a frame.
+
+    Raises:
+        construct.RangeError: if it is negative or larger than `limit`.
+    """
     if not 0 <= number <= limit:
         raise construct.RangeError(f"invalid {what} {number}", path=path)
     return number
 
 
 def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
-    """The member of a nested mapping under a dotted name."""
+    """Return the member of a nested mapping with this dotted name."""
     for part in dotted.split("."):
         if default is not _MISSING and (not isinstance(obj, Mapping) or part not in obj):
             return default
@@ -88,7 +92,7 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 
 
 class MarkedStruct(Struct):  # type: ignore[misc]
-    """A Struct whose parsed container holds the (start, end) of each member under ``_marks``.
+    """A Struct with the (start, end) of each member under ``_marks`` when parsed.
 
     construct's own does not keep them. `Checksummed` needs them to find its bytes, `SizeOf` and
     `PaddingField` to measure, and `explain` to list the fields of a frame without a layout. A
@@ -134,10 +138,10 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         return inner
 
     def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
-        """The context of the members' expressions.
+        """Return the context of the members' expressions.
 
         `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field
-        that states a length.
+        that declares a length.
         """
         inner = Container(
             _=context,
@@ -157,15 +161,15 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 
 
 class IndexedArray(Array):  # type: ignore[misc]
-    """An Array with the index in the path of an error, and with at most `limit` elements.
+    """An Array that limits its elements, and reports the index of an invalid element.
 
-    construct's own names no element, and a hostile count of elements without a byte keeps it busy
-    for minutes. All arrays of a frame together have at most `limit` elements without a byte, since
-    nested ones would multiply.
+    construct's own reports no index, and an invalid count of elements without bytes keeps it busy
+    for minutes. All arrays of a frame together have at most `limit` elements without bytes, because
+    the numbers of nested arrays multiply.
 
     Attributes:
-        limit: the longest frame, in bytes; within a bit block in bits.
-        in_bits: whether it stands within a bit block.
+        limit: the maximum size of a frame, in bytes; inside a bit block in bits.
+        in_bits: whether it is inside a bit block.
     """
 
     limit: int
@@ -229,10 +233,10 @@ def _built(con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any
 
 
 class CheckedConst(Const):  # type: ignore[misc]
-    """A Const that can be read unchecked, and reports its offset and the value found.
+    """A Const that can be parsed without verification, and reports a wrong value.
 
-    ``parse(verify=False)`` and `explain` read frames with wrong constants, and a `WireError` has
-    the offset, the expected value and the actual one. construct's own offers neither.
+    ``parse(verify=False)`` and `explain` parse frames with wrong constants, and a `WireError` has
+    the offset, the expected and the actual value. construct's own supports neither.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -272,7 +276,7 @@ class LimitedNumber(Subconstruct):  # type: ignore[misc]
 
 
 class HeldCheck(construct.Check):  # type: ignore[misc]
-    """A Check that can be read unchecked, for ``parse(verify=False)`` and `explain`."""
+    """A Check that can be parsed without verification, for ``parse(verify=False)``."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         if is_verifying(context):
@@ -281,10 +285,10 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
 
 
 class CountedBytes(Bytes):  # type: ignore[misc]
-    """Bytes that tell an invalid length from a frame that has not arrived completely.
+    """Bytes that distinguish an invalid length from an incomplete frame.
 
-    For a length that no frame has, construct's own reports the end of the stream. The candidate
-    would wait for more bytes, and block the output until the longest frame has arrived.
+    For a length that is impossible in a frame, construct's own reports the end of the stream. The
+    candidate would wait for more bytes, and block the output until the maximum size has arrived.
     """
 
     limit: int
@@ -297,7 +301,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
 
 
 class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
-    """A NullTerminated that searches for its terminator, and does not read byte by byte."""
+    """A NullTerminated that searches for its terminator instead of reading single bytes."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         if len(self.term) != 1 or not self.require or not isinstance(stream, io.BytesIO):
@@ -306,7 +310,7 @@ class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
         end = stream.getvalue().find(self.term, start)
         if end < 0:
             stream.seek(0, io.SEEK_END)
-            return super()._parse(stream, context, path)  # raises, since nothing follows
+            return super()._parse(stream, context, path)  # raises, because the stream has ended
         data = stream.read(end + self.include - start)
         stream.seek(end + self.consume)
         within = construct.core.BytesIOWithOffsets(data, stream, start)
@@ -334,10 +338,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions the name of a number, in building as in parsing.
+    """An Enum that gives expressions the name of a number, also while building.
 
-    With construct's own, a Switch on a name finds its case in parsing, but not in building from
-    the number, and builds other bytes.
+    With construct's own, a Switch on a name finds its case while parsing, but not while building
+    from the number, and builds other bytes.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -347,9 +351,9 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 
 
 class RawPart(Construct):  # type: ignore[misc]
-    """A part with its bytes and their place, as construct's RawCopy gives them.
+    """A part with its bytes and offsets, as construct's RawCopy.
 
-    It is built from its `value`. construct's own is built from `data`, so that edits of the value
+    It is built from its `value`. construct's own is built from `data`, so that changes of the value
     of a parsed frame are lost.
     """
 
@@ -391,7 +395,7 @@ class RawPart(Construct):  # type: ignore[misc]
 
 
 class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
-    """A Checksum that can be read unchecked, and reports its offset and both values."""
+    """A Checksum that can be parsed without verification, and reports a wrong value."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -405,7 +409,7 @@ class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
 
 
 class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
-    """A NamedTuple of the fields of a struct alone; construct's own expects no private entries."""
+    """A NamedTuple of a struct without its private entries, which construct's own rejects."""
 
     def _decode(self, obj: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, dict):
@@ -422,13 +426,16 @@ class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
             return super()._parse(stream, context, path)
         except construct.ConstructError:
             raise
-        except Exception as error:  # each library raises errors of its own
+        except Exception as error:  # each compression library has its own exceptions
             expected = f"bytes compressed by {self.encoding}"
             raise MismatchError(path, start, expected, "other bytes", "value") from error
 
 
 class Reserved(CountedBytes):
-    """Bytes without a meaning, which construct's Padding drops: those of a pattern unless given."""
+    """Bytes without a meaning, which construct's Padding drops.
+
+    If no value is given, they are built from a pattern.
+    """
 
     def __init__(self, length: Any, pattern: bytes = b"\0") -> None:
         super().__init__(length)
@@ -442,10 +449,10 @@ class Reserved(CountedBytes):
 
 
 class DescribedField(Subconstruct):  # type: ignore[misc]
-    """A part that only says something of the field below it: parses and builds what that does."""
+    """A wrapper that only describes its field, and parses and builds it unchanged."""
 
     def describe(self, info: tree.FieldInfo) -> tree.FieldInfo:
-        """Return the description of the field below, extended by this part."""
+        """Return the description of the wrapped field, extended by this wrapper."""
         raise NotImplementedError
 
 
@@ -454,8 +461,8 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
 
     Attributes:
         fields: names of the fields that hold it, low bits first.
-        algorithm: of the checksum, None where a hook has to supply it.
-        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of
+        algorithm: the algorithm of the checksum; None if a hook has to supply it.
+        over: names of the consecutive fields that it covers; None for all bytes without a bit of
             `fields`.
         absent: values that mean "not filled".
     """
@@ -465,18 +472,20 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     over: tuple[str, ...] | None
     absent: frozenset[int]
 
-    #: the class that authors write; makes the seals that construct's Checksum stands for.
+    #: the class for plugins, `Checksummed`; it replaces construct's Checksum of a RawCopy.
     author_class: Callable[..., SealedStruct]
 
 
 class SizeField(Subconstruct):  # type: ignore[misc]
-    """A number that says how many bytes a part has: made of it, and held to it.
+    """A number that declares the size of a part.
+
+    It is built from the size of the part, and a parsed frame is invalid if they differ.
 
     Attributes:
-        of: the names that lead to the part from the struct that it stands in, which is itself what
-            no names lead to; "_" leads one struct out.
-        plus: what is added.
-        since: a member before the part, from which on is measured; "" for the part alone.
+        of: the names that lead to the part from the struct that contains this field. It is empty
+            for the struct itself; "_" leads to the outer struct.
+        plus: is added to the size.
+        since: a member before the part at which the size begins; "" for only the part.
     """
 
     def __init__(
@@ -490,11 +499,11 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
     @property
     def out(self) -> int:
-        """The number of structs between this field and the one that has the part."""
+        """The number of struct levels from this field out to the struct with the part."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
-        """Return the size of the part, given the parsed or built struct that has it."""
+        """Return the size of the part in a parsed or built struct."""
         *parents, name = self.of[self.out :] or ("",)
         try:
             marks = (get_member(obj, ".".join(parents)) if parents else obj)["_marks"]
@@ -534,7 +543,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 class CountField(Subconstruct):  # type: ignore[misc]
     """The number of elements of a later array, `of`.
 
-    It is built from the length of the array; the value given is ignored.
+    It is built from the length of the array; a given value is ignored.
     """
 
     def __init__(self, subcon: Construct, of: str) -> None:
@@ -550,8 +559,9 @@ class CountField(Subconstruct):  # type: ignore[misc]
 
 
 class BoundedPart(Subconstruct):  # type: ignore[misc]
-    """A part that ends after `length` bytes of a frame that comes, and is as long as its values are
-    in one that is made.
+    """A part of `length` bytes when parsed.
+
+    When it is built, it has the size of its values.
     """
 
     def __init__(self, length: Any, subcon: Construct) -> None:
@@ -570,10 +580,14 @@ class BoundedPart(Subconstruct):  # type: ignore[misc]
 
 
 class PaddingField(CountedBytes):
-    """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple
-    of one (`modulus`).
+    """The bytes that fill a range of members up to a length or a multiple.
 
-    They are those of a pattern unless given.
+    If no value is given, they are built from a pattern.
+
+    Args:
+        of: the names of the first and the last member.
+        to: the length in bytes; None for a multiple.
+        modulus: the number to fill up to a multiple of; None for a length.
     """
 
     def __init__(
@@ -598,8 +612,10 @@ class PaddingField(CountedBytes):
 
 
 class ParsedParts(construct.ListContainer):  # type: ignore[misc]
-    """Parts that were parsed or built: kind, first byte and the one after the last of each as
-    `spans`; `size`: the bytes of all.
+    """Parts that were parsed or built.
+
+    Attributes:
+        spans: (kind, offset of the first byte, offset after the last byte) of each part.
     """
 
     def __init__(self) -> None:
@@ -618,13 +634,15 @@ class ParsedParts(construct.ListContainer):  # type: ignore[misc]
 
 
 class Partition(Construct):  # type: ignore[misc]
-    """Structs one after another, each of a size of its own.
+    """Consecutive structs, each with its own size.
 
     Attributes:
-        cases: what a part can be, by the name of its kind.
-        count, size, within: how many there are, the bytes of the first of a chain, or those of all.
-        following: of a part's own fields, the bytes of the next one.
-        limit: the longest frame, in bytes.
+        cases: the kinds of parts, by name.
+        count: the number of parts, or None.
+        size: the bytes of the first part of a chain, or None.
+        within: the bytes of all parts, or None.
+        following: the bytes of the next part, from fields of a part.
+        limit: the maximum size of a frame, in bytes.
     """
 
     cases: dict[str, Construct]

@@ -1,7 +1,7 @@
-"""Prepare an author's struct, ask a construct for its properties, and draw values for it.
+"""Prepare a struct of a plugin, query properties of constructs, and draw random values.
 
-`prepare` copies a struct with some of construct's classes replaced (`replacements` gives the
-reasons), and with the lengths, counts and padding that construct hides as members.
+`prepare` copies a struct with some of construct's classes replaced; `replacements` gives the
+reasons. The lengths, counts and padding that construct hides become members.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from lidarspec.spec.syntax.replacements import (
 if TYPE_CHECKING:
     import random  # imported here because finding a sensor does not need it
 
-    #: field path -> what draws its value in place of chance
+    #: field path -> function that draws its value
     Drawn = Mapping[str, Callable[[random.Random], Any]]
 
 #: construct's classes -> their replacements.
@@ -76,7 +76,7 @@ _REPLACEMENTS: dict[type, type] = {
     construct.Compressed: CheckedCompressed,
 }
 
-#: how a value is printed or when it is read; it is the value below.
+#: wrappers that only change how a value is printed or when it is read.
 _TRANSPARENT = (
     construct.Hex,
     construct.HexDump,
@@ -85,19 +85,19 @@ _TRANSPARENT = (
     construct.Rebuffered,
 )
 
-#: the LazyBound constructs that are being prepared.
+#: the LazyBound constructs in preparation, to detect recursion.
 _BINDING: list[Construct] = []
 
-#: attributes of constructs that hold others; "cases" does by key.
+#: attributes of constructs that hold other constructs. "cases" holds them by key.
 _INNER = ("subcon", "thensubcon", "elsesubcon", "default", "checksumfield")
 
 
 def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) -> Construct:
-    """Return a copy of an author's struct with the replacements for construct's classes.
+    """Return a copy of a struct in which construct's classes are replaced.
 
     Args:
-        limit: the longest frame, in bytes; within a bit block in bits.
-        in_bits: whether it stands within a bit block.
+        limit: the maximum size of a frame, in bytes; inside a bit block in bits.
+        in_bits: whether the construct is inside a bit block.
     """
     if isinstance(con, FormatField):
         if con.fmtstr[-1] in "efd":
@@ -138,7 +138,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         field = prepare(con.checksumfield, limit, in_bits=in_bits)
         return CheckedChecksum(field, con.hashfunc, con.bytesfunc)
     if isinstance(con, construct.Padded):
-        padded = _with_padding(con, in_bits=in_bits)
+        padded = _replace_padding(con, in_bits=in_bits)
         if padded is not None:
             return prepare(padded, limit, in_bits=in_bits)
     if isinstance(con, Bytes):
@@ -187,7 +187,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
 
 
 def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
-    """Return the construct that a LazyBound stands for; itself where it contains itself."""
+    """Return the construct of a LazyBound; the LazyBound itself in its own content."""
     if con in _BINDING:
         return con
     _BINDING.append(con)
@@ -198,7 +198,7 @@ def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
 
 
 def _name_padding(members: list[Construct]) -> list[Construct]:
-    """Return the members of a struct, with a name for each padding and condition without one."""
+    """Return the members of a struct, with names for unnamed paddings and checks."""
     taken = {member.name for member in members}
     named = list[Construct]()
     for member in members:
@@ -217,9 +217,12 @@ def _name_padding(members: list[Construct]) -> list[Construct]:
     return named
 
 
-def _with_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
-    """Return the bytes or bits of a padding, or a struct with its padding as the last member; None
-    for another padded part.
+def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
+    """Return a padded part with its padding as a field.
+
+    Returns:
+        The bytes or bits of a padding, or a struct with its padding as the last member. None for
+        another padded part.
     """
     if con.subcon is construct.Pass and in_bits:
         return construct.Default(BitsInteger(con.length), 0)
@@ -234,8 +237,10 @@ def _with_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
 
 
 def _expand_macro(con: Construct) -> list[Construct]:
-    """A member of a struct; of those that construct prefixes, pads or aligns, what it does not
-    show: the length or count, the padding.
+    """Return the members for a member that construct prefixes, pads or aligns.
+
+    They are the member itself, and fields for the length, count or padding that construct hides.
+    Another member is returned unchanged.
     """
     name = con.name
     inner = con
@@ -322,8 +327,8 @@ def _expand_macro(con: Construct) -> list[Construct]:
     return [con]
 
 
-class _Compared:
-    """A stand-in for the value of a validator that records what it is compared with."""
+class _ComparisonRecorder:
+    """Placeholder for the value of a validator that records comparisons with it."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -336,8 +341,10 @@ class _Compared:
 
 
 def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
-    """The raw values that a validator lets pass: those that it compares with, or of 16 bits all
-    that pass; None where neither is known.
+    """Return the raw values that a validator accepts; None if they are unknown.
+
+    They are found among the values that it compares with. If it makes no comparisons with integers,
+    all values of up to 16 bits are tried.
     """
     field = unwrap(con)
     subcon = con.subcon
@@ -356,15 +363,15 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
     with contextlib.suppress(
         Exception
-    ):  # the author's function may raise anything at what is no number
-        passes = con._validate(compared := _Compared(), None, "")
+    ):  # a function of a plugin may raise anything for the placeholder
+        passes = con._validate(compared := _ComparisonRecorder(), None, "")
         if compared.values and not passes and all(type(value) is int for value in compared.values):
             return tuple(
                 value
                 for value in sorted({*compared.values})
                 if low <= value <= high and con._validate(value, None, "")
             )
-    with contextlib.suppress(Exception):  # or at numbers that it does not expect
+    with contextlib.suppress(Exception):  # or for an unexpected number
         if width <= 16:
             seen = (
                 (lambda raw: subcon._decode(raw, None, None))
@@ -375,17 +382,21 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     return None
 
 
-#: what takes all bytes that there are.
+#: constructs that read all available bytes.
 GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
 
-#: what takes all bytes that there are, and makes others of them.
+#: constructs that read all available bytes and convert them to other bytes.
 RECODING = (construct.Tunnel, construct.ProcessXor, construct.ProcessRotateLeft)
 
 
 def is_greedy(
     con: Construct, kinds: tuple[type, ...] = (*GREEDY, *RECODING, construct.NullStripped)
 ) -> bool:
-    """Whether a part takes all bytes that it is given, by ending in one of some kinds that do."""
+    """Return whether a part reads all bytes that are available.
+
+    Args:
+        kinds: the greedy constructs. A part is greedy if it ends in one of them.
+    """
     if isinstance(con, kinds):
         return True
     if isinstance(
@@ -405,8 +416,10 @@ def is_greedy(
 
 
 def unwrap(con: Construct, *, bits: bool = True) -> Construct:
-    """The construct below names, units and checksums, and below bit transformations unless `bits`
-    is False.
+    """Return the construct inside names, units and checksums.
+
+    Args:
+        bits: True also removes bit transformations.
     """
     while isinstance(con, Subconstruct) and not isinstance(con, Array | Const):
         if isinstance(con, construct.Transformed | construct.Restreamed) and not bits:
@@ -416,12 +429,12 @@ def unwrap(con: Construct, *, bits: bool = True) -> Construct:
 
 
 def is_struct(con: Construct) -> bool:
-    """Whether it is a Struct, sealed or not."""
+    """Return whether a construct is a Struct, with or without a checksum."""
     return isinstance(unwrap(con, bits=False), Struct)
 
 
 def has_member(con: Construct, dotted: str) -> bool:
-    """Whether a struct has a member under a dotted name."""
+    """Return whether a struct has a member with this dotted name."""
     inner: Any = unwrap(con)
     for part in dotted.split("."):
         if not isinstance(inner, Struct) or part not in inner._subcons:
@@ -431,7 +444,7 @@ def has_member(con: Construct, dotted: str) -> bool:
 
 
 def bit_width(con: Construct) -> int:
-    """The number of bits of a field of fixed size."""
+    """Return the number of bits of a field of fixed size."""
     inner = unwrap(con)
     if isinstance(inner, BitsInteger):
         return int(inner.length)
@@ -441,15 +454,15 @@ def bit_width(con: Construct) -> int:
 
 
 def fixed_size(con: Construct) -> int:
-    """The number of bytes of a struct of fixed size; 0 where it depends on what is parsed."""
+    """Return the number of bytes of a struct; 0 if its size is not fixed."""
     try:
         return int(con.sizeof())
-    except Exception:  # construct lets a KeyError through where a condition asks for a field
+    except Exception:  # construct raises KeyError if a condition reads a field
         return 0
 
 
 def remove_private(parsed: Any) -> Any:
-    """The parsed object without construct's and our own private entries."""
+    """Return a parsed object without the private entries of construct and this package."""
     if isinstance(parsed, dict):
         return Container(
             {
@@ -464,22 +477,24 @@ def remove_private(parsed: Any) -> Any:
 
 
 def field_path(path: str | None) -> str:
-    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"; a text on a part
-    without name makes a "None".
+    """Return a path of construct as a field path.
+
+    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". Steps named "None", which
+    construct adds for docs on a part without a name, are removed.
     """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
 
 
 def author_class(con: Construct) -> str:
-    """Return the name of the class that the author wrote, which `prepare` may have replaced."""
+    """Return the name of the class in the plugin, which `prepare` may have replaced."""
     classes = type(con).__mro__
     own = [kind for kind in classes if not kind.__module__.startswith("lidarspec.spec.syntax")]
     return own[0].__name__
 
 
 def children(con: Construct) -> list[Construct]:
-    """The constructs directly below one, branches included."""
+    """Return the constructs directly inside another, including branches."""
     if isinstance(con, Struct | construct.Sequence | construct.FocusedSeq):
         return list(con.subcons)
     below = [getattr(con, name) for name in _INNER if name in vars(con)]
@@ -487,7 +502,7 @@ def children(con: Construct) -> list[Construct]:
 
 
 def seals(con: Construct) -> Iterator[SealedStruct]:
-    """The sealed structs of a struct, outer ones first."""
+    """Yield the structs with checksums in a struct, outer structs first."""
     if isinstance(con, SealedStruct):
         yield con
     for child in children(con):
@@ -497,7 +512,7 @@ def seals(con: Construct) -> Iterator[SealedStruct]:
 def leaves(
     parsed: Any, keys: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """The values of a parsed object with where they stand in it, private entries left out."""
+    """Yield the values of a parsed object with their paths, without private entries."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             if not name.startswith("_"):
@@ -510,16 +525,18 @@ def leaves(
 
 
 def is_expression(value: object) -> bool:
-    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    """Return whether a value is an expression or a construct instead of a number."""
     return isinstance(value, ExprMixin | Construct)
 
 
-#: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number
 #: of any size hardly ever fits.
-MANY = (1, 6, 40)
+#: upper limits of the small numbers that are drawn half of the time, because a large number is
+#: hardly ever a valid count or key.
+#: of any size hardly ever fits.
+SMALL_LIMITS = (1, 6, 40)
 
-#: how often a part is drawn that does not fit.
-DRAWS = 100
+#: maximum number of attempts to draw a valid part.
+MAX_DRAWS = 100
 
 
 def random_value(
@@ -527,26 +544,26 @@ def random_value(
 ) -> Any:
     """Return a random value that a construct can build.
 
-    Examples of frames with `Parts`, and of frames without a layout, are built from such values:
-    random bytes are hardly ever a valid chain of parts or a text with its terminator. Examples of
-    all other frames are random bytes in a layout.
+    Examples of frames with `Parts`, and of frames without a layout, are built from these values,
+    because random bytes are hardly ever a valid chain of parts or a text with its terminator.
+    Examples of all other frames are random bytes in a layout.
 
     Args:
         source: if it has the methods `draw_number` and `draw_elements`, they draw integers,
             floats and arrays.
-        drawn: field path -> what draws its value in place of chance.
-        scope: what its expressions see.
+        drawn: field path -> function that draws its value.
+        scope: the context for its expressions.
     """
     if path in drawn:
         return drawn[path](source)
     if isinstance(con, Const):
         return con.parse(
             con.build(con.value), _verify=False
-        )  # a name of an Enum with its number, as other expressions see it
+        )  # for an Enum: its name with the number, which expressions need
     if isinstance(con, construct.Rebuild):
         with contextlib.suppress(
             Exception
-        ):  # it may ask for what comes after it, and is evaluated again when the frame is built
+        ):  # it may depend on later fields; it is evaluated again when the frame is built
             return con.func(scope)
     if isinstance(con, Struct):
         values = Container(_=scope)
@@ -565,12 +582,12 @@ def random_value(
             for _ in range(source.randint(0, 4))
         ]
     if isinstance(con, construct.RepeatUntil):
-        return _random_until(con, source, drawn, scope, path)
+        return _draw_until(con, source, drawn, scope, path)
     if isinstance(con, Partition):
-        return _random_parts(con, source, drawn, scope, path)
+        return _draw_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
         count = check_bound(construct.evaluate(con.count, scope), con.limit, "count", path)
-        check_bound(count * _elements(con.subcon, scope), con.limit, "count", path)
+        check_bound(count * _count_elements(con.subcon, scope), con.limit, "count", path)
         draw_one = functools.partial(random_value, con.subcon, source, drawn, scope, path)
         if hasattr(source, "draw_elements"):
             return source.draw_elements(count, draw_one)
@@ -607,7 +624,7 @@ def random_value(
             None,
         )
     if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
-        return _random_leaf(con, source, scope, path)
+        return _draw_leaf(con, source, scope, path)
     if isinstance(con, construct.Adapter):
         return remove_private(
             con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
@@ -615,12 +632,12 @@ def random_value(
     return random_value(con.subcon, source, drawn, scope, path)
 
 
-def _random_until(
+def _draw_until(
     con: construct.RepeatUntil, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> list[Any]:
-    """Some elements up to the first that ends them."""
+    """Return random elements up to the first that ends the array."""
     found: list[Any] = construct.ListContainer()
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         element = random_value(con.subcon, source, drawn, scope, path)
         found.append(element)
         if con.predicate is True or con.predicate(element, found, scope):
@@ -628,23 +645,22 @@ def _random_until(
     return found
 
 
-def _elements(con: Construct, scope: Any) -> int:
-    """How many an element of an array has itself, where it is an array too; as far as that is known
-    before there is one.
+def _count_elements(con: Construct, scope: Any) -> int:
+    """Return the number of elements in an element that is itself an array.
+
+    It is 1 for other elements, and if the number is not known yet.
     """
-    with contextlib.suppress(
-        Exception
-    ):  # whatever an expression raises that asks for what is not there yet
+    with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
-            return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope)
+            return int(construct.evaluate(con.count, scope)) * _count_elements(con.subcon, scope)
         return 1
     return 1
 
 
-def _random_parts(
+def _draw_parts(
     con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> ParsedParts:
-    """Some parts, with how long each is, which what stands behind them may ask for."""
+    """Return random parts with their sizes, for expressions of the fields after them."""
     parts = ParsedParts()
     around = Container(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
@@ -652,23 +668,25 @@ def _random_parts(
     for _ in range(source.randint(0, 4)):
         name = source.choice(list(con.cases))
         stream = io.BytesIO()
-        parts.append(_random_part(con.cases[name], source, drawn, scope, path))
+        parts.append(_draw_part(con.cases[name], source, drawn, scope, path))
         con.cases[name]._build(parts[-1], stream, around, path)
         parts.spans.append((name, 0, stream.tell()))
     return parts
 
 
-def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
-    """One part; drawn again by itself where it is too long, since frames of many counts would else
-    have no part at all.
+def _draw_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
+    """Return a random part.
+
+    A part with an invalid count is drawn again. Otherwise frames with many counts would never have
+    a part.
     """
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         with contextlib.suppress(Fault):
             return random_value(con, source, drawn, scope, path)
     return random_value(con, source, drawn, scope, path)
 
 
-def _number_kind(con: Construct) -> str:
+def _find_number_kind(con: Construct) -> str:
     """Return "f" for a float, "i" for a signed and "u" for an unsigned integer."""
     if not isinstance(con, FormatField):
         return "i" if con.signed else "u"
@@ -678,9 +696,9 @@ def _number_kind(con: Construct) -> str:
     return "i" if code.islower() else "u"
 
 
-def _random_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> Any:
+def _draw_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> Any:
     if con is construct.Pass or isinstance(con, construct.Check | PaddingField | Reserved):
-        # whether a Check holds, and how much there is to fill, is seen when the frame is built
+        # checks and padding are computed when the frame is built
         return None
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
@@ -695,15 +713,17 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any, path: str) -
             check_bound(construct.evaluate(con.length, scope), con.limit, "length", "")
         )
     if hasattr(source, "draw_number") and isinstance(con, FormatField | BytesInteger | BitsInteger):
-        return source.draw_number(path, bit_width(con), _number_kind(con))
+        return source.draw_number(path, bit_width(con), _find_number_kind(con))
     if (
         isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
     ):  # it may be a count
         return con.parse(
-            con.build(source.randint(0, min(source.choice(MANY), (1 << (bit_width(con) - 1)) - 1)))
+            con.build(
+                source.randint(0, min(source.choice(SMALL_LIMITS), (1 << (bit_width(con) - 1)) - 1))
+            )
         )
     if con in (construct.VarInt, construct.ZigZag):
-        return source.randint(0, source.choice(MANY))
+        return source.randint(0, source.choice(SMALL_LIMITS))
     if isinstance(con, BitsInteger):
         value = source.getrandbits(con.length)
         if con.signed and value >> (con.length - 1):
