@@ -1,16 +1,16 @@
-"""Convert many files, large ones in pieces, in several processes or on a cluster.
+"""Convert many files, large files in pieces, in several processes or on a cluster.
 
-In: captures by path, pattern or URL. Out: a file of points for each, or several for one that is
-larger than a piece, and a manifest; or a Dask dataframe with a partition for each piece. Tasks are
-scheduled by `concurrent.futures`, or by the scheduler of a Dask cluster.
+In: captures by path, pattern or URL. Out: a file of points for each capture, or several files for
+a capture that is larger than a piece, and a manifest; or a Dask dataframe with a partition for each
+piece. Tasks are scheduled by `concurrent.futures`, or by the scheduler of a Dask cluster.
 
-`device.file_scans` cuts a large file. Its pieces are located one after another: the task that skips
-one gives the bookmark of the next, so that points of a piece are made while the following pieces
-are still being located.
+`device.file_scans` cuts a large file. Its pieces are located in sequence: the task that skips
+a piece returns the bookmark of the next. So points of a piece are computed while the following
+pieces are still being located.
 
 The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: the
-input, the sensor and versions, the output, or the error. A file is not read again if all its lines
-and results exist. A line is written only after its result.
+input, the sensor and versions, and the output or the error. A file is not read again if all its
+lines and results exist. A line is written only after its result.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
-#: Bytes of a piece that is written to a file, and of a piece that is a partition in memory.
+#: the size in bytes of a piece that is written to a file, and of a partition in memory.
 PIECE = 256_000_000
 PARTITION = 32_000_000
 MANIFEST = "manifest.jsonl"
-#: Number of tasks handed to an executor at a time, and seconds between two writes of a manifest
-#: that cannot be appended to.
+#: the number of tasks that an executor has at a time; and the seconds between two writes of
+#: a manifest that cannot be appended to.
 AHEAD = 1000
 PERIOD = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
@@ -88,13 +88,14 @@ class FilePiece:
     Attributes:
         source: path or URL of the file.
         sensor, options: id and options of the sensor; "" if it is to be detected.
-        target: the output file for all scans; a piece has its number in the name. "" for none.
+        target: the output file for all scans; a piece has its number in the name. "" without
+            output.
         every_point: whether to include points without a valid return.
-        size: bytes of a piece.
-        select: the selected scans; a file selected by times or numbers is not cut.
-        number, first: number of the piece, and of its first scan.
-        count: number of its scans; None for all that follow.
-        bookmark: start of the piece, None for the start of the file.
+        size: the size of a piece, bytes.
+        select: the selected scans; a file with scans selected by time or index is not cut.
+        number, first: the number of the piece, and of its first scan.
+        count: the number of its scans; None for all that follow.
+        bookmark: the start of the piece; None for the start of the file.
         is_last: whether it is the last piece.
     """
 
@@ -121,7 +122,7 @@ class FilePiece:
 
     @property
     def asked(self) -> Record:
-        """The settings that its result depends on, besides the file and the piece number."""
+        """The settings that its result depends on, apart from the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
             name: str(value)
@@ -179,14 +180,14 @@ class FilePiece:
 
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
-    """Return one sensor for all files, because its compiled code is cached with it."""
+    """Return the same sensor for all files, since its compiled code is cached with it."""
     named = named_sensor(name)
     configured: Sensor = named.configure(**dict(options)) if options else named
     return configured
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Return the piece with the number of its scans, and the piece after it, if any."""
+    """Return the piece with the number of its scans, followed by the next piece, if any."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -252,7 +253,7 @@ def make_pieces(
     """Return the files of some paths, patterns and URLs, each as one piece.
 
     Raises:
-        SourceError: if there is none.
+        SourceError: if no file matches.
         UsageError: if two results would have the same name.
     """
     if isinstance(sensor, Sensor):
@@ -278,9 +279,9 @@ def make_pieces(
     return list(by_output.values())
 
 
-#: Keys of each record of a manifest, with their types.
+#: the keys of each record of a manifest, with their types.
 _RECORD_KEYS: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
-#: Further keys of the record of a written piece.
+#: further keys of the record of a written piece.
 _WRITTEN_KEYS: Mapping[str, Any] = {
     "last": bool,
     "size": int,
@@ -331,7 +332,7 @@ class Manifest:
                     self._file.write("\n")
 
     def _read_lines(self) -> list[str]:
-        """Return the lines of an existing manifest, none if there is no manifest."""
+        """Return the lines of an existing manifest; an empty list without a manifest."""
         try:
             with contextlib.closing(open_stored(self.path)) as file:
                 return file.read().decode(errors="replace").splitlines()
@@ -362,7 +363,7 @@ class Manifest:
         return normalise_path(path) in self._outputs
 
     def done(self, piece: FilePiece) -> Record | None:
-        """Return the record of a piece that need not be made again, else None."""
+        """Return the record of a piece that does not have to be converted again, else None."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
             record is None
@@ -376,7 +377,7 @@ class Manifest:
         return None
 
     def _is_same(self, source: str, record: Record) -> bool:
-        """Return whether a file is the one of a record."""
+        """Return whether a file is the same as when a record was written."""
         now = read_stamp(source)
         return bool(
             now["size"] == record["size"]
@@ -395,7 +396,7 @@ class Manifest:
         return []
 
     def clear(self, piece: FilePiece) -> None:
-        """Remove the outputs of a file that has changed or is now converted differently."""
+        """Remove the outputs of a file that has changed or has other settings now."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if output and self.has(output) and self.done(replace(piece, number=number)) is None:
@@ -558,9 +559,9 @@ def convert(
 def _iter_results(
     executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
-    """Yield the record of each finished piece, and whether it is an old one.
+    """Yield the record of each finished piece, and whether it is an old record.
 
-    Pieces for which `done` returns a record are not made again.
+    Pieces for which `done` returns a record are not converted again.
     """
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)

@@ -86,7 +86,7 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
     """Return the checksum algorithm of a frame type; None keeps the declared one.
 
-    A hook replaces the algorithm, never field or span.
+    A hook replaces the algorithm, but never the field or the covered bytes.
     """
 
 
@@ -94,7 +94,7 @@ def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
     """Return the points of a batch of packets; None calls the sensor's own function.
 
-    A use is a calibration of a site.
+    For example, a hook can apply the calibration of a site.
     """
 
 
@@ -104,7 +104,7 @@ def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
 
     Args:
         url: the SOURCE.
-        sensor: the sensor that sends, if it is known.
+        sensor: the sensor that sends; None if unknown.
     """
 
 
@@ -117,7 +117,7 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
     Args:
         source: the SOURCE of the data.
         link: the declared link.
-        host: the address of the sensor, None if unknown.
+        host: the address of the sensor; None if unknown.
     """
 
 
@@ -139,29 +139,29 @@ def lidarspec_page(
     control: bool,
     report: Callable[[str], None],
 ) -> Any:
-    """Open a source and return the server of its page, a `lidarspec.view.page_server.PageServer`.
+    """Open a source, and return the `lidarspec.view.page_server.PageServer` of its page.
 
     `lidarspec view --web` calls it. The entry-point group `lidarspec.page` names the module.
 
     Args:
-        source: as the user typed it.
-        sensor: None to identify it.
+        source: the source as the user typed it.
+        sensor: the sensor; None to identify it.
         selection: the scans to show.
-        host: to listen at.
-        port: to listen at; 0 for any free port.
+        host: the address to listen at.
+        port: the port to listen at; 0 for any free port.
         control: whether pages may send commands to a real sensor.
-        report: called with each remark for the user.
+        report: called with each message for the user.
     """
 
 
 @hookspec
 def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
-    """Return the file formats by suffix that the plugin adds."""
+    """Return the file formats that the plugin adds."""
 
 
-#: seconds after which a plugin that is being loaded is reported.
+#: how long a plugin loads before this is reported, seconds.
 PATIENCE = 5.0
-#: seconds after which it counts as hanging.
+#: how long a plugin loads before it counts as hanging, seconds.
 LIMIT = 10.0
 #: the reason by module, for modules whose import hangs.
 _hanging: dict[str, str] = {}
@@ -194,8 +194,8 @@ class Plugin:
     Attributes:
         distribution, version, entry_point: its origin.
         sensors: the ids that it adds.
-        error: the reason why it, or one of its ids, is not available; "" if there is none.
-        traceback: of the error.
+        error: the reason why it, or one of its ids, is not available; "" without an error.
+        traceback: the traceback of the error.
         remark: side effects of loading it.
     """
 
@@ -222,11 +222,11 @@ class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
     Several plugins may claim one name, an id or an alias. An entry point with this name, or a
-    module that is always loaded, has priority over a sensor that merely has the name. Of several
-    distributions the owner gets the name: the distribution in the user's own settings, else
-    `lidarspec-VENDOR` for ids that begin with this vendor, and for the aliases of such a sensor. Of
-    two modules of one distribution, the first gets it. A request for a name without an owner is an
-    error. Everything else of a plugin that loses a name is kept.
+    module that is always loaded, has priority over a sensor that only declares the name.
+    Among several distributions the owner gets the name: the distribution in the user's own
+    settings, or `lidarspec-VENDOR` for ids that begin with this vendor and for the aliases of these
+    sensors. Among two modules of one distribution, the first gets it. A request for a name without
+    an owner is an error. A plugin that loses a name keeps its other names.
 
     Two threads may load the same sensor at the same time: it is then added twice, with the same
     result.
@@ -292,11 +292,11 @@ class Registry:
         return replace(plugin, sensors=tuple(own))
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
-        """Register a plugin, a module or object with hooks, and return the ids it adds.
+        """Register a module or object with hooks, and return the ids that it adds.
 
         Raises:
-            SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is left
-                registered.
+            SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is
+                registered then.
         """
         _check_hooks(plugin, name)
         try:
@@ -328,9 +328,9 @@ class Registry:
                 self._load(entry)
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
-        """Keep the sensor of an entry point.
+        """Store the sensor of an entry point, and return its id.
 
-        The names of all entry points of the sensor, except for its id, are added to its aliases.
+        The names of all other entry points of the sensor are added to its aliases.
         """
         self._check(sensor, [sensor])
         home = (entry.distribution, entry.module)
@@ -345,7 +345,7 @@ class Registry:
         return [sensor.id]
 
     def _load_module(self, entries: list[EntryPoint]) -> Plugin:
-        """Return the result of loading all sensors of a module."""
+        """Load all sensors of a module, and return the resulting plugin."""
         tried = [self._tried[entry] for entry in entries]
         failed = next((plugin for plugin in tried if plugin.error), tried[0])
         return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}")
@@ -367,7 +367,7 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _holder(self, name: str) -> Home | None:
-        """Return the plugin that owns a name, None if there is no claim or no owner."""
+        """Return the plugin that owns a name; None without a claim or an owner."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normalise_name(home[0]): home for home in reversed(homes)}
@@ -400,7 +400,7 @@ class Registry:
         )
 
     def _find(self, name: str) -> Sensor | None:
-        """Return the sensor with a name, None if there is none or it does not load.
+        """Return the sensor with a name; None if there is none or it does not load.
 
         Raises:
             UsageError: if several distributions claim it, and none owns it.
@@ -444,7 +444,7 @@ class Registry:
         return self.find(name) is not None
 
     def find(self, name: str) -> Sensor | None:
-        """Return the sensor with an id or alias, else None.
+        """Return the sensor with an id or alias; None if there is none.
 
         Only the plugin whose entry point has this name is loaded.
         """
@@ -505,11 +505,11 @@ class Registry:
     def sensor(self, name: str) -> Sensor:
         """Return a sensor by id or alias, with its hooks applied.
 
-        Capitals and other separators are accepted too.
+        Upper case and other separators are accepted too.
 
         Raises:
-            UnknownSensor: with a suggestion, or with the packages to install if there is no sensor
-                at all.
+            UnknownSensor: with a suggestion, or with the packages to install if no sensor is
+                installed.
             UsageError: if several distributions claim the name, and none owns it.
         """
         if name in self._ready:
@@ -536,11 +536,11 @@ class Registry:
         if name not in self._ready:
             self._ready.setdefault(
                 name, self.apply_hooks(plugin_sensor)
-            )  # another thread may have been first
+            )  # another thread may have stored it first
         return self._ready[name]
 
     def _load_error(self, name: str) -> UnknownSensor | None:
-        """Return the error for a sensor whose entry point failed to load, else None."""
+        """Return the error for a sensor with an entry point that failed to load, else None."""
         for entry, plugin in self._tried.items():
             if entry.name == name and plugin.error:
                 error = UnknownSensor(name, distribution=plugin.distribution, failure=plugin.error)
@@ -580,9 +580,9 @@ class Registry:
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
-        """Return a frame with the checksum of the first hook that returns one.
+        """Return a frame with the checksum of the first hook that returns a checksum.
 
-        The failure of a hook is recorded, and the next hook is called.
+        If a hook raises, the error is recorded and the next hook is called.
         """
         arguments = {"sensor": sensor, "frame": frame}
         for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
@@ -680,10 +680,10 @@ def named_owners() -> dict[str, str]:
 def _import_in_time(entry: EntryPoint) -> Any:
     """Import an entry point, and return its module or object.
 
-    An import that hangs is reported, and its thread keeps running.
+    If the import hangs, this is reported, and its thread keeps running.
 
     Raises:
-        SpecError: if it hangs.
+        SpecError: if the import hangs.
         BaseException: any exception of the import.
     """
     if entry.module in _hanging:
@@ -724,7 +724,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
 
 def _describe_place(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER" for the module that a thread imports, "" if none."""
+    """Return " at FILE, line NUMBER" for the module that a thread imports, or ""."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -797,7 +797,7 @@ def registry() -> Registry:
 
 
 def try_plugins() -> list[Plugin]:
-    """Return every installed plugin, after loading each in another process.
+    """Load each plugin in another process, then here, and return all plugins.
 
     Plugins that hang or end that process are not loaded in this one.
     """
@@ -827,7 +827,7 @@ def try_plugins() -> list[Plugin]:
 
 
 def _modules() -> list[EntryPoint]:
-    """Return the entry points of modules with hooks, the first one of each module."""
+    """Return the first entry point of each module with hooks."""
     entries: dict[Home, EntryPoint] = {}
     for entry in entry_points(GROUP) + entry_points(VERBS) + entry_points(PAGE):
         entries.setdefault((entry.distribution, entry.module), entry)
@@ -837,7 +837,7 @@ def _modules() -> list[EntryPoint]:
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
     """Return the result of `_trial` for each plugin.
 
-    One process loads all of them; if there is any problem, each gets its own process.
+    One process loads all plugins. If there is any problem, each plugin gets its own process.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -849,7 +849,7 @@ def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
 
 
 def _trial(*homes: Home) -> tuple[str, str]:
-    """Load plugins in another process; return the failure, and the side effects."""
+    """Load plugins in another process, and return the error and the side effects."""
     import subprocess
 
     mark = f"{os.urandom(8).hex()}:"
@@ -892,7 +892,7 @@ def _trial(*homes: Home) -> tuple[str, str]:
 def load_alone() -> None:
     """Load the plugins in the arguments, print their threads, and end the process.
 
-    The process is started for this purpose. A mark precedes the threads.
+    `_trial` starts a process for this. A mark precedes the threads in the output.
     """
     import faulthandler
 
@@ -978,7 +978,7 @@ def is_file_name(text: str) -> bool:
 
 
 def split_file_and_id(text: str) -> tuple[Path, str]:
-    """Split "FILE" or "FILE.py:id" into the file and the id, "" without one."""
+    """Split "FILE" or "FILE.py:id" into the file and the id; "" without an id."""
     from pathlib import Path
 
     path, colon, wanted = text.partition(".py:")

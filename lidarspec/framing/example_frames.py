@@ -1,8 +1,8 @@
-"""Valid frames with seeded random content, for tests, docs and the REPL.
+"""Make valid frames with seeded random content, for tests, docs and the REPL.
 
-A header is drawn by chance, and the rest of a frame of its layout is random bytes with constants
-and checksums in place; what is not plausible is drawn again, in the end around the values that the
-sensor's `sweep` declares. What does not compile is drawn field by field.
+A random header gives a layout. The rest of the frame is random bytes, with constants and checksums
+set. Frames that are not plausible are drawn again, and in the end near the values that the sensor's
+`sweep` declares. Frames that are not compiled are drawn field by field.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Fault, get_member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
-#: How often random frames are made, and how often where a sensor's own `sweep` helps if none is
-#: plausible.
+#: how often random frames are made, and how often if the sensor declares a `sweep` to use if none
+#: is plausible.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8
-#: Each try makes so many times the random frames of the one before, beginning with one frame, and
-#: at most so many.
+#: the first try makes one random frame. Each further try makes `GROWTH` times as many as the one
+#: before, at most `LARGEST_BATCH`.
 GROWTH = 4
 LARGEST_BATCH = 64
-#: Bytes of such a batch, beyond its first frame.
+#: the largest size of a batch, bytes, beyond its first frame.
 BATCH_BYTES = 1 << 22
-#: random headers of which one at least gives a frame.
+#: how many random headers are tried.
 HEADERS = 400
-#: field path -> what draws a raw value of it.
+#: field path -> function that draws a raw value.
 Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
@@ -62,7 +62,7 @@ def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
     """Return the bytes of a valid frame with seeded random content.
 
     Raises:
-        UnknownFrame: with the closest known name.
+        UnknownFrame: if there is no such frame; it suggests the closest name.
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -75,14 +75,14 @@ def random_frame(
     """Return a valid frame with a random header and random content.
 
     Args:
-        drawn: field path -> what draws its raw value, for what random values never make.
+        drawn: field path -> function that draws its raw value, for values that chance does not hit.
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
         return make_of_values(sensor, frame, source, drawn)
     _, row = random_row(sensor, frame, source, drawn)
     data = frame_coder(engine.frame).encode(row.tobytes())
-    assert data is not None  # as `random_row` has checked
+    assert data is not None  # `random_row` has checked it
     return data
 
 
@@ -93,11 +93,11 @@ def random_row(
     drawn: Drawn = NOTHING,
     tries: int = TRIES,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Return a random header's layout, and a valid struct of it, (size,).
+    """Return the layout of a random header, and a valid struct with it, (size,).
 
     Args:
         frame: a type with layouts and without parts.
-        drawn: field path -> what draws its raw value.
+        drawn: field path -> function that draws its raw value.
         tries: how often random frames are made, and then how often frames along the sweep.
 
     Raises:
@@ -109,9 +109,9 @@ def random_row(
     ):
         layout, chosen = make_random_header(engine, source, drawn)
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
-        rows = _random(engine, layout, number, source)
+        rows = _make_random_rows(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
-        rows = _set_headers(rows, layout, chosen)
+        rows = _fill_headers(rows, layout, chosen)
         rows = rows[valid_mask(sensor, frame, layout, rows)]
         row = _first_encodable(sensor, frame, rows)
         if row is not None:
@@ -122,22 +122,24 @@ def random_row(
 def make_random_header(
     engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
-    """A layout of a header chosen at random, with the values of the fields it depends on, by path.
+    """Return the layout of a random header, and the header fields that it depends on.
+
+    The fields are given as raw values by path.
 
     Args:
-        drawn: field path -> what draws its value in place of chance.
+        drawn: field path -> function that draws its value.
 
     Raises:
-        SpecError: where hundreds of headers give no frame.
+        SpecError: if hundreds of headers give no frame.
     """
     keys = sorted(switch_keys(engine.frame.tree))
     for _ in range(HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
-            return _header(engine.frame, source, drawn, keys)
+            return _draw_header(engine.frame, source, drawn, keys)
     raise SpecError("no header leads to a frame within max_length")
 
 
-def _header(
+def _draw_header(
     frame: Frame, source: random.Random, drawn: Drawn, keys: list[int]
 ) -> tuple[Layout, dict[str, int]]:
     values: dict[str, int] = {}
@@ -154,18 +156,18 @@ def _header(
             if own:
                 values[unknown.leaf.info.path] = own(source)
             else:
-                values[unknown.leaf.info.path] = _some_value(source, unknown.leaf, keys)
+                values[unknown.leaf.info.path] = _draw_value(source, unknown.leaf, keys)
 
 
 def switch_keys(root: Node) -> Iterator[int]:
-    """Yield the values of keys that have no name: fields are known to have those with one."""
+    """Yield the keys of switches that are not named values of their field."""
     for node in nodes(root):
         if isinstance(node, Select):
             labels = node.key.info.labels if isinstance(node.key, Ref) else ()
             yield from (key for key, _ in node.cases if isinstance(key, int) and key not in labels)
 
 
-def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
+def _draw_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     if leaf.info.const is not None or leaf.info.allowed:
         if leaf.info.const is not None:
             return int(leaf.info.const)
@@ -192,7 +194,9 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
 LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 
 
-def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
+def _make_random_rows(
+    engine: Codec, layout: Layout, number: int, source: random.Random
+) -> NDArray[np.uint8]:
     """Return `number` rows of random bytes with allowed values.
 
     The wire form can write every value.
@@ -228,15 +232,15 @@ def make_of_values(
     """Return a frame with parts, or without layouts: its values are drawn one by one.
 
     Raises:
-        SpecError: if none of so many tries gives a valid frame.
+        SpecError: if none of `tries` attempts gives a valid frame.
     """
     engine = get_codec(sensor.frames[frame])
     for _ in range(tries):
         try:
             values = random_value(engine.frame.prepared, source, drawn)
-            data = build(sensor, frame, _left_open(values, engine.frame.tree), {})
+            data = build(sensor, frame, _remove_lengths(values, engine.frame.tree), {})
         except (UsageError, Fault):
-            continue  # the values do not fit together; others may
+            continue  # these values do not fit together; other values may
         except LidarSpecError:
             raise
         except Exception as error:
@@ -248,7 +252,7 @@ def make_of_values(
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
 
 
-def _left_open(values: Any, root: Node) -> Any:
+def _remove_lengths(values: Any, root: Node) -> Any:
     """Return the values of a frame without the counts and lengths of parts.
 
     `build` fills them in.
@@ -261,23 +265,23 @@ def _left_open(values: Any, root: Node) -> Any:
         ):
             own = () if kind.following is None else refs(kind.following)[:1]
             for path in (ref.path for ref in own):
-                _blank(part, path)
-            _left_open(part, kind.root)
+                _remove_field(part, path)
+            _remove_lengths(part, kind.root)
         for path in asked:
-            _blank(values, path)
+            _remove_field(values, path)
     return values
 
 
-def _blank(values: Any, path: str) -> None:
-    """Take a field out of nested mappings, where it is."""
+def _remove_field(values: Any, path: str) -> None:
+    """Remove a field from nested mappings, if it is there."""
     *parents, name = path.split(".")
     get_member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
 
 
-def _set_headers(
+def _fill_headers(
     rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]
 ) -> NDArray[np.uint8]:
-    """Random frames with the header values of their layout, constants and checksums set."""
+    """Return frames with the header values of their layout, constants and checksums set."""
     for path, value in chosen.items():
         leaf = layout.column(path)
         assert isinstance(leaf, Leaf)
@@ -289,7 +293,10 @@ def _set_headers(
 def valid_mask(
     sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
-    """Return for each struct, with constants and checksums, whether its values are allowed, (n,).
+    """Return whether the values of each struct are allowed, (n,).
+
+    Args:
+        rows: structs with constants and checksums set, (n, size).
 
     Raises:
         SpecError: if `plausible` raises.
@@ -317,7 +324,7 @@ def valid_mask(
 def _first_encodable(
     sensor: SensorDescription, frame: str, rows: NDArray[np.uint8]
 ) -> NDArray[np.uint8] | None:
-    """Return the first struct that can be written in the form of its type, or None."""
+    """Return the first struct that the form of its type can encode, or None."""
     encode = frame_coder(sensor.frames[frame]).encode
     return next((row for row in rows if encode(row.tobytes()) is not None), None)
 
@@ -346,13 +353,13 @@ def _make_along_sweep(
         layout, chosen = make_random_header(
             engine, source, {**_draw_stated(engine, values), **drawn}
         )
-        rows = _random(engine, layout, 1, source)
+        rows = _make_random_rows(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
                 _store_swept(leaf, rows, value)
         _store_drawn(layout, rows, chosen, drawn, source)
-        rows = _set_headers(rows, layout, chosen)
+        rows = _fill_headers(rows, layout, chosen)
         rows = rows[valid_mask(sensor, frame, layout, rows)]
         row = _first_encodable(sensor, frame, rows)
         if row is not None:
@@ -381,7 +388,7 @@ def _store_drawn(
     drawn: Drawn,
     source: random.Random,
 ) -> None:
-    """Write drawn values into rows of frames, except those that have chosen the layout."""
+    """Write drawn values into rows of frames, except for fields that determine the layout."""
     for path, draw in drawn.items():
         if path in layout.leaves and path not in chosen:
             leaf = layout.leaves[path]
@@ -392,7 +399,7 @@ def _store_drawn(
 
 
 def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return a function that draws the raw numbers of a sweep for header fields."""
+    """Return functions that return the raw values of a sweep for header fields, by path."""
     fields = engine.schema.fields
     draws: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
@@ -402,5 +409,5 @@ def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
 
 
 def return_raw(raw: int, _: random.Random) -> int:
-    """Return the same raw value each time: for what is drawn from chance elsewhere."""
+    """Return the same raw value each time, instead of a random one."""
     return raw

@@ -1,6 +1,6 @@
-"""Write whole records to a file in a thread, so that a disk delays no capture.
+"""Write whole records to a file in a thread, so that a slow disk does not delay the capture.
 
-A file that is overwritten is kept until the new one has its first record.
+A file that is overwritten is kept until the new file has its first record.
 
 Records wait in memory. The thread writes them every 0.2 s or 64 KiB, and calls fsync every second.
 Incomplete writes are continued. If the disk is full, a partly written record is removed again.
@@ -23,16 +23,16 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: limits after which records are written to the file, and after which fsync is called.
+#: the limits after which records are written to the file, and after which fsync is called.
 FLUSH_BYTES = 1 << 16
 FLUSH_SECONDS = 0.2
 DISK_SECONDS = 1.0
-#: bytes that may wait for a slow disk; further records are dropped and counted.
+#: how many bytes may wait for a slow disk; further records are dropped and counted.
 BACKLOG = 1 << 26
-#: seconds that `sync` and `close` wait for the disk.
+#: how long `sync` and `close` wait for the disk, seconds.
 PATIENCE = 60.0
 
-#: (bytes, offset) -> the length of the record at this offset; 0 or less if there is none.
+#: (bytes, offset) -> length of the record at this offset; 0 or less without a complete record.
 Size = Callable[[bytes | bytearray, int], int]
 
 
@@ -40,14 +40,14 @@ class RecordFile:
     """A new file; a file that it replaces is kept until `settle`.
 
     Args:
-        path: of the file.
-        size_at: returns the length of a record, because a partial write is cut after the last whole
-            record; None if it may be cut anywhere.
+        path: the path of the file.
+        size_at: returns the length of a record, so that a partial write is cut after the last
+            complete record; None if it may be cut anywhere.
         overwrite: whether the file may exist.
 
     Raises:
         UsageError: if it exists and must not be overwritten.
-        SourceError: if it cannot be made.
+        SourceError: if it cannot be created.
     """
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
@@ -72,7 +72,8 @@ class RecordFile:
         """Write whole records.
 
         Raises:
-            OSError: if a record could not be written; the file then ends after the last whole one.
+            OSError: if a record could not be written; the file then ends after the last complete
+                record.
         """
         written = 0
         try:
@@ -107,7 +108,7 @@ class RecordFile:
         """Replace the old file, if there is one and it still exists.
 
         Raises:
-            OSError: if that fails.
+            OSError: if the replacement fails.
         """
         if not self.is_settled:
             os.replace(self._opened, self._place)

@@ -226,10 +226,10 @@ def pack_record(
 
 
 def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
-    """Return the length in the head of a record.
+    """Return the length of a record from its first bytes.
 
     Returns:
-        0 if the head is incomplete, -1 if it is not a record.
+        0 if these bytes are incomplete, -1 if they are not a record.
     """
     mark = bytes(buffer[start : start + len(MARK)])
     if mark != MARK[: len(mark)]:
@@ -295,14 +295,14 @@ class Recording(ClosingContext):
     def seek(self, at: int) -> bool:
         """Continue shortly before the first record received at a time or later.
 
-        At most a few blocks before it are read. Skipped damage is not counted.
+        At most a few blocks before it are read. Damage in skipped data is not counted.
 
         Args:
             at: ns since 1970.
 
         Returns:
-            False, without moving, if that record is before the current one, if arrival times are
-            unknown, or for a pipe.
+            False, without moving, if that record is before the current position, if arrival times
+            are unknown, or for a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -320,7 +320,7 @@ class Recording(ClosingContext):
         return low > here
 
     def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
-        """Return time and offset of the first received record between two offsets.
+        """Return the time and offset of the first received record between two offsets.
 
         Records without a time are ignored.
         """
@@ -421,7 +421,7 @@ class Recording(ClosingContext):
         self.offset += number
 
     def _next_mark(self) -> int:
-        """Go to the next mark or the end; return the number of skipped bytes."""
+        """Go to the next mark or the end, and return the number of skipped bytes."""
         before = self.offset
         self._skip(1)
         while (position := self._window.find(MARK, self._place)) < 0:
@@ -472,7 +472,7 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
     """Return the sender and receiver in a record.
 
     Returns:
-        None unless there are exactly two, which fill the bytes.
+        None unless the bytes contain exactly two addresses.
     """
     addresses: list[Address | None] = []
     place = 0
