@@ -58,7 +58,10 @@ def assert_same_packets(one: Packets, other: Packets, *, by_reason: bool = True)
 
 
 def _lengths(packets: Packets, array: str) -> NDArray[np.intp]:
-    """Return the lengths of an array in each packet; none if elements of one frame differ in it."""
+    """Return the lengths of an array in each packet.
+
+    The result is empty if the elements of a frame differ in length.
+    """
     try:
         return packets.count(array)
     except SpecError:

@@ -113,7 +113,7 @@ PAGE_MAY_IMPORT = {
 
 @dataclass(frozen=True)
 class Module:
-    """One source file: its dotted name, its text, and whether it is the __init__ of a package."""
+    """A source file: its dotted name, text, and whether it is a package's __init__."""
 
     name: str
     text: str
@@ -130,10 +130,10 @@ class Module:
 
     @cached_property
     def imports(self) -> list[tuple[int, str]]:
-        """Line and full dotted name of everything that the module imports, at any depth and for
-        types too.
+        """Return line and full dotted name of everything that the module imports.
 
-        Import statements are found in the text: parsing every module takes ten times as long.
+        Imports at any depth and for types are included. They are found in the text, because parsing
+        every module takes ten times as long.
         """
         found = []
         for match in _IMPORT.finditer(self.code):
@@ -159,7 +159,7 @@ class Module:
 
 
 def read(package: Path) -> dict[str, Module]:
-    """Every module of a package, by dotted name."""
+    """Return every module of a package, by dotted name."""
     modules = {}
     for path in sorted(package.rglob("*.py")):
         parts = path.relative_to(package.parent).with_suffix("").parts
@@ -178,7 +178,7 @@ def name_of(expression: ast.expr) -> str:
 
 
 def absolute(module: Module, node: ast.ImportFrom) -> str:
-    """The dotted name that `from ...x import` stands for."""
+    """Return the dotted name that `from ...x import` refers to."""
     if not node.level:
         return str(node.module)
     parts = module.name.split(".")
@@ -187,9 +187,7 @@ def absolute(module: Module, node: ast.ImportFrom) -> str:
 
 
 def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
-    """The module of the tree that an imported name is in, itself or as an attribute; None for what
-    is outside.
-    """
+    """Return the module that contains an imported name; None for a name outside the tree."""
     while name not in modules:
         name, dot, _ = name.rpartition(".")
         if not dot:
@@ -198,9 +196,7 @@ def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
 
 
 def floor(name: str) -> int | None:
-    """The floor of a module by dotted name: its own, else that of its package; None where neither
-    has one.
-    """
+    """Return the layer of a module: its own, otherwise its package's, otherwise None."""
     inside = name.partition(".")[2] or "__init__"
     if inside in PACKAGES:
         inside = f"{inside}.__init__" if f"{inside}.__init__" in FLOOR_OF else inside
@@ -210,8 +206,9 @@ def floor(name: str) -> int | None:
 
 
 def climbing(modules: Mapping[str, Module]) -> list[str]:
-    """Modules without a floor, imports that go up, and the first circle; imports for types count as
-    all others.
+    """Return modules without a layer, imports from a higher layer, and the first cycle.
+
+    Imports for types are included.
     """
     complaints = [
         f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None
@@ -237,7 +234,7 @@ def climbing(modules: Mapping[str, Module]) -> list[str]:
 
 
 def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
-    """I/O below its floor, and optional_libraries outside the modules that they are confined to."""
+    """Return imports for I/O below the I/O layer, and of optional libraries elsewhere."""
     complaints = []
     for module in modules.values():
         here = floor(module.name)
@@ -260,7 +257,7 @@ def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
 
 
 def construct_asked(modules: Mapping[str, Module]) -> list[str]:
-    """Places outside construct's layer that ask whether something is of a class of construct's."""
+    """Return type checks for construct's classes outside construct's layer."""
     complaints = []
     for module in modules.values():
         if f"{module.name}.".startswith(f"{SYNTAX}."):
@@ -289,11 +286,13 @@ def construct_asked(modules: Mapping[str, Module]) -> list[str]:
 def private_imports(
     modules: Mapping[str, Module], public: Mapping[str, Collection[str]]
 ) -> list[str]:
-    """What a plugin takes that is no public name of `lidarspec` or `lidarspec.spec`, and not numpy,
-    construct or the standard library.
+    """Return the imports of a plugin that are not permitted.
+
+    Permitted are public names of `lidarspec` and `lidarspec.spec`, numpy, construct and the
+    standard library.
 
     Args:
-        public: the names of each of these two.
+        public: the names of each of these two modules.
     """
     known = {*public, *(f"{face}.{name}" for face, names in public.items() for name in names)}
     complaints = []
@@ -317,7 +316,7 @@ def private_imports(
 def core_modules(
     modules: Mapping[str, Module], core: Mapping[str, Module], public: Mapping[str, Collection[str]]
 ) -> set[str]:
-    """Return the modules of the core that a program imports beside public names.
+    """Return the modules of the core that a program imports in addition to public names.
 
     Args:
         public: the names of `lidarspec` and of `lidarspec.spec`.
@@ -344,8 +343,11 @@ def attributes(module: Module) -> Iterator[tuple[int, str]]:
 
 
 def word(name: str) -> re.Pattern[str]:
-    """Matches a vendor, model or id as a word, however it is joined; one of one or two characters
-    only in its own case, and not as the end of another name."""
+    """Return a pattern for a vendor, model or id as a word, with any separator.
+
+    A word of one or two characters matches only in its own case, and not at the end of another
+    name.
+    """
     parts = [re.escape(part) for part in re.split(r"[\W_]+", name) if part]
     before, flags = (
         (r"(?<![^\W_])", re.IGNORECASE) if len(name) > 2 else (r"(?<![^\W_]|-)", re.NOFLAG)

@@ -56,7 +56,7 @@ def construct_frame(frame: Frame) -> Frame:
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """A sensor, and what makes points of its packets."""
+    """A sensor, and the function that computes points of its packets."""
 
     sensor: Sensor
     backend: str

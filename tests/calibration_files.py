@@ -20,10 +20,10 @@ _HEAD = (
 
 
 def write_velodyne_xml(path: Path, lasers: int = 64, **values: str) -> Path:
-    """Write the `db.xml` of a unit in which the corrections of a laser depend on its number.
+    """Write the `db.xml` of a unit with corrections that depend on the laser's number.
 
     Args:
-        values: corrections, by name, that all lasers have instead.
+        values: corrections, by name, that are the same for all lasers.
     """
     items = []
     for laser in range(lasers):

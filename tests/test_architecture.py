@@ -100,7 +100,7 @@ def test_the_extra_all_names_every_distribution() -> None:
 
 
 def projects() -> dict[str, dict[str, Any]]:
-    """What each distribution says of itself, by its folder."""
+    """Return the metadata of each distribution, by its folder."""
     distributions = sorted((ROOT / "plugins").glob("*/pyproject.toml"))
     folders = [".", *(path.parent.relative_to(ROOT).as_posix() for path in distributions)]
     return {

@@ -29,7 +29,7 @@ SIZE = 300_000
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three captures, one in a folder below, and one that is none."""
+    """Return a folder with a long capture, two in a subfolder, and an invalid file."""
     folder = tmp_path_factory.mktemp("drives")
     (folder / "north").mkdir()
     write_frames(ls.sensor(SENSOR), folder / "long.bin", most=1_200_000, longest=10**6)
@@ -41,7 +41,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(drives: Path) -> Any:
-    """The points of the long capture in one pass, as a table."""
+    """Return the points of the long capture in one pass, as a table."""
     return read_whole(drives / "long.bin", drives.parent / "whole.parquet")
 
 
@@ -57,7 +57,7 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
-    """Every file of points by its name."""
+    """Return every file of points by name."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*.parquet"))
@@ -65,12 +65,12 @@ def outputs(folder: Path) -> dict[str, bytes]:
 
 
 def read_pieces(folder: Path, name: str = "long") -> Any:
-    """The points of all pieces of a capture."""
+    """Return the points of all pieces of a capture."""
     return pq.read_table([str(path) for path in sorted(folder.glob(f"{name}*.parquet"))])
 
 
 def lives(group: int) -> bool:
-    """Whether any process of a group is there."""
+    """Return whether any process of a group is running."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:

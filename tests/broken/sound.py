@@ -49,8 +49,9 @@ FIELDS: dict[str, Any] = {
 
 
 def struct(**changes: Any) -> Struct:
-    """The fields of the data frame, some of them changed, or new in front of the sum; None takes
-    one away.
+    """Return the fields of the data frame with changes.
+
+    New fields come before the checksum; a value of None removes a field.
     """
     fields = {**FIELDS, **changes}
     fields["sum"] = fields.pop("sum")
@@ -58,12 +59,12 @@ def struct(**changes: Any) -> Struct:
 
 
 def make_frame(**changes: Any) -> Checksummed:
-    """The data frame with changes in its fields."""
+    """Return the struct of the data frame with changed fields."""
     return Checksummed(struct(**changes), field="sum", algorithm=Sum(16))
 
 
 def plausible(f: Fields) -> Any:
-    """A sample at least, angles below 360 degrees, a time below its wrap."""
+    """Require a sample, angles below 360 degrees, and a time below its wrap."""
     return (
         (f.count >= 1) & (f.count <= LONGEST) & (f.first < 360) & (f.last < 360) & (f.time < WRAP)
     )
@@ -98,7 +99,7 @@ SIZE = 15 + 3 * LONGEST
 
 
 def frame(con: Any = None, **changes: Any) -> Frame:
-    """The data frame."""
+    """Return the data frame."""
     return Frame(
         **(
             dict(struct=con or make_frame(), data=True, max_length=SIZE, plausible=plausible)
@@ -108,7 +109,7 @@ def frame(con: Any = None, **changes: Any) -> Frame:
 
 
 def sensor(data: Frame | None = None, kind: type[Sensor] = Sensor, **changes: Any) -> Sensor:
-    """The sensor with another data frame, or another declaration."""
+    """Return the sensor with another data frame, or another declaration."""
     given: dict[str, Any] = dict(
         vendor="Broken",
         model="One",
@@ -135,5 +136,5 @@ def sensor(data: Frame | None = None, kind: type[Sensor] = Sensor, **changes: An
 
 @hookimpl
 def lidarspec_sensors() -> list[Sensor]:
-    """The sound one."""
+    """Return the correct sensor."""
     return [sensor()]

@@ -65,7 +65,7 @@ def check(capture: bytes) -> Read:
 
 
 def frame(data: bytes, *, port: int = 2368, ident: int = 7, host: int = 201) -> bytes:
-    """A frame of a stream: identification and checksums differ between its packets."""
+    """Return a frame of a stream; its packets differ in identification and checksums."""
     body = struct.pack(">HHHH", port, 6699, 8 + len(data), ident * 31 & 0xFFFF) + data
     head = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(data), ident, 0, 64, 17, 0xFFFF - ident)
     return made.ethernet(head + bytes([192, 168, 1, host, 192, 168, 1, 10]) + body)
@@ -91,7 +91,7 @@ def fragments(data: bytes, ident: int) -> list[bytes]:
 
 
 def interleave(*streams: list[bytes], seed: int = 1) -> list[bytes]:
-    """The streams mixed, each in its own order."""
+    """Return the streams interleaved, each in its own order."""
     draw = random.Random(seed)
     order = [index for index, each in enumerate(streams) for _ in each]
     draw.shuffle(order)

@@ -31,7 +31,7 @@ ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
 
 
 def zstd(data: bytes) -> bytes:
-    """As its command line packs it, with a checksum."""
+    """Compress data as the command line of zstd does, with a checksum."""
     library = importlib.import_module(ZSTD)
     packed: bytes = library.compress(data, options={library.CompressionParameter.checksum_flag: 1})
     return packed

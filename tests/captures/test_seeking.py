@@ -60,7 +60,7 @@ def open_capture(path: Path) -> CaptureTransport:
 
 
 def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
-    """When what follows the first few packets came, once all up to a time was passed over."""
+    """Return the times of the remaining packets after a few packets and a seek."""
     if not in_batches:
         chunks = source.chunks()
         assert not next(chunks).gap
@@ -140,7 +140,7 @@ def test_seeking_never_goes_back(tmp_path: Path) -> None:
 
 
 def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
-    """In a second section, whose interface has another clock than the first."""
+    """The interface of the second section has another clock than the first."""
     path = written(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
     ticks = made.interface(options=made.option(9, bytes([6])))
     packet = datagram_frame(SENT)
@@ -230,7 +230,7 @@ def test_no_scan_continues_across_a_seek(captured: Path) -> None:
 
 
 def test_no_frame_continues_across_a_seek(tmp_path: Path) -> None:
-    """Of a byte stream, whose pieces end anywhere."""
+    """The pieces of a byte stream can end within a frame."""
     sensor, path = ls.sensor("ldrobot-stl27l"), tmp_path / "stream.pcap"
     data = b"".join(ls.simulate(sensor, 40_000))
     with path.open("wb") as file:

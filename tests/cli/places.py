@@ -19,13 +19,13 @@ from tests.lines import working
 
 @contextlib.contextmanager
 def nothing() -> Iterator[str]:
-    """A source that is not there."""
+    """Yield a source that does not exist."""
     yield "/dev/ttyUSB99"
 
 
 @contextlib.contextmanager
 def silent() -> Iterator[str]:
-    """A port behind which nobody says anything."""
+    """Yield a port without data."""
     master, slave = os.openpty()
     try:
         yield os.ttyname(slave)
@@ -36,7 +36,7 @@ def silent() -> Iterator[str]:
 
 @contextlib.contextmanager
 def babbling() -> Iterator[str]:
-    """A port that sends bytes which are no frames."""
+    """Yield a port that sends bytes without valid frames."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as server:
         server.bind(("127.0.0.1", 0))
         server.listen()
@@ -57,7 +57,7 @@ def _babble(server: socket.socket, stop: threading.Event) -> None:
 
 @contextlib.contextmanager
 def busy() -> Iterator[str]:
-    """A port that somebody else has open."""
+    """Yield a port that another process has open."""
     import serial
 
     with silent() as path, serial.Serial(path, exclusive=True):
@@ -66,7 +66,7 @@ def busy() -> Iterator[str]:
 
 @contextlib.contextmanager
 def taken() -> Iterator[str]:
-    """An address that somebody else has bound."""
+    """Yield an address that another socket is bound to."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         yield f"udp://127.0.0.1:{other.getsockname()[1]}"
@@ -74,7 +74,7 @@ def taken() -> Iterator[str]:
 
 @contextlib.contextmanager
 def find_unused_address() -> Iterator[str]:
-    """An address where nobody listens."""
+    """Return an address without a listener."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
         other.bind(("127.0.0.1", 0))
         yield f"tcp://127.0.0.1:{other.getsockname()[1]}"
@@ -82,8 +82,9 @@ def find_unused_address() -> Iterator[str]:
 
 @contextlib.contextmanager
 def nobody() -> Iterator[None]:
-    """Without the rights of root, who may read everything; the verbs are loaded before, from
-    folders that may be root's alone.
+    """Drop root permissions, which allow reading every file.
+
+    The verbs are imported before, because only root may be able to read their folders.
     """
     for verb in VERBS:
         main.get_command(click.Context(main), verb)
@@ -98,7 +99,7 @@ def nobody() -> Iterator[None]:
 
 @contextlib.contextmanager
 def forbidden() -> Iterator[str]:
-    """A port that this user may not open."""
+    """Yield a port that this user may not open."""
     with silent() as path:
         os.chmod(path, 0)
         with nobody():

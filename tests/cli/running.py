@@ -43,7 +43,7 @@ def process(
 
 
 def ran(*words: object, code: int = 0, given: bytes | None = None) -> Result:
-    """The same in this process; it has to end with `code`."""
+    """Run the command in this process; it must exit with `code`."""
     result = CliRunner(**APART).invoke(main, [str(word) for word in words], input=given)
     assert result.exit_code == code, result.stdout + result.stderr
     assert "Traceback" not in result.stdout + result.stderr
@@ -58,5 +58,5 @@ def ran_with_any_code(*words: object) -> int:
 
 
 def run_json(*words: object) -> Any:
-    """What ``--json`` prints."""
+    """Return the parsed output of ``--json``."""
     return json.loads(ran(*words, "--json").stdout)

@@ -25,7 +25,7 @@ M1 = "robosense-m1"
 
 
 def records(number: int, *sources: tuple[str, int]) -> list[bytes]:
-    """The records of a sensor's packets, from these senders in turn."""
+    """Return the records of a sensor's packets, from these senders in turn."""
     packets = simulate(ls.sensor(M1), number)
     ends = sources or (made.SOURCE,)
     return [
@@ -204,7 +204,7 @@ def test_a_sensor_that_sends_from_several_ports_to_several_is_one_sender(tmp_pat
 
 
 def container(name: str, path: Path) -> Path:
-    """A file of a kind that others write, with what lidarspec could read in it."""
+    """Write a log file of another program with readable content."""
     held = path.with_name("held.pcap")
     packets = capture(held, *records(3)).read_bytes()
     if name == "SQLite":

@@ -31,7 +31,7 @@ COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", 
 
 
 def read(path: Path) -> Mapping[str, np.ndarray]:
-    """The columns of a .csv file."""
+    """Return the columns of a .csv file."""
     with path.open(encoding="ascii", newline="") as file:
         rows = list(csv.DictReader(file))
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}

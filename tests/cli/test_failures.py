@@ -107,8 +107,9 @@ def test_an_interrupt_ends_with_130() -> None:
 
 
 def _reads_standard_input(pid: int) -> bool:
-    """Whether a process has loaded what `parse` needs and now sleeps; where that cannot be seen,
-    time has to do.
+    """Return whether a process has imported `parse` and sleeps.
+
+    On systems without this information, wait for a fixed time.
     """
     try:
         maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
@@ -146,8 +147,9 @@ RAISES = Path(points_fail.__file__)
 def test_every_verb_names_a_failing_plugin_in_the_same_way(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its id, what raised, the file and line, the number of packets where some were read; exit code
-    1.
+    """Messages name its id, exception, file and line; the exit code is 1.
+
+    They include the number of packets if some were read.
     """
     monkeypatch.chdir(tmp_path)
     Path("frames.bin").write_bytes(b"".join(ls.simulate(sound.sensor(), 12)))

@@ -143,7 +143,7 @@ WORKING: tuple[tuple[str, ...], ...] = (
 
 @pytest.fixture
 def worked(tmp_path: Path) -> Iterator[list[tuple[str, Terminal]]]:
-    """All of them at work at the same time, each in a terminal of its own."""
+    """Yield all commands, running at the same time, each in a separate terminal."""
     ran("record", SIM, *STL, *BRIEF, "-o", tmp_path / "kept.lsr")
     with contextlib.ExitStack() as stack:
         found = []
@@ -155,8 +155,9 @@ def worked(tmp_path: Path) -> Iterator[list[tuple[str, Terminal]]]:
 
 
 def seen_by_a_shell(code: int) -> int:
-    """The exit code in a shell's `$?`: 128 and the signal, where a program was ended by one while
-    it was still being loaded.
+    """Return the exit code as a shell's `$?`: 128 plus the number of a fatal signal.
+
+    A signal is fatal if it arrives during the imports.
     """
     return code if code >= 0 else 128 - code
 

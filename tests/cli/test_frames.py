@@ -337,9 +337,7 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
 def test_an_input_is_held_in_pieces(
     words: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a file, of hexadecimal text in one line, and of what comes through a pipe, no more is held
-    than a piece.
-    """
+    """Only one piece of a file, of a long line of text, or of a pipe is in memory."""
     monkeypatch.chdir(tmp_path)
     for data in (bytes(2000), bytes(MEGABYTE)):  # first what is imported and remembered
         text = data.hex().encode()

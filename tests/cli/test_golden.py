@@ -110,7 +110,7 @@ def run_command(line: str, folder: Path) -> str:
 
 
 def replace_variable_texts(text: str, folder: Path) -> list[str]:
-    """Return the lines of an output without what differs between machines and runs."""
+    """Return the lines of an output without texts that differ between machines and runs."""
     text = text.replace(str(folder), "FOLDER")
     for pattern, replacement in VARIABLE_TEXTS:
         text = pattern.sub(replacement, text)

@@ -31,7 +31,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds of a sensor, of which one frame in fifty is damaged."""
+    """Return a capture of two seconds of a sensor, with one frame in fifty damaged."""
     path = tmp_path_factory.mktemp("live") / "two.bin"
     frames = simulate(ls.sensor(ID), 3600)
     path.write_bytes(

@@ -97,7 +97,7 @@ def test_show_works_for_every_sensor() -> None:
 
 
 def check_shown_sensor(sensor: str) -> None:
-    """Compare what `show` prints with the frames of the sensor."""
+    """Compare the output of `show` with the frames of the sensor."""
     assert set(run_json("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
     plans = run_json("show", sensor, "--plan")
     assert set(plans) == {name for name, frame in ls.sensor(sensor).frames.items() if frame.data}

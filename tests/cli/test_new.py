@@ -25,9 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def make_environment(folder: Path) -> dict[str, str]:
-    """The environment of a process in which the distribution in this folder is installed, as pip
-    leaves it behind.
-    """
+    """Return the environment of a process with the distribution of this folder installed."""
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     about = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     about.mkdir(exist_ok=True)
@@ -44,7 +42,7 @@ def make_environment(folder: Path) -> dict[str, str]:
 
 
 def run(folder: Path, *words: object, code: int = 0) -> str:
-    """What ``python -m WORDS`` prints in the folder of an installed distribution."""
+    """Return the output of ``python -m WORDS`` in the folder of an installed distribution."""
     command = [sys.executable, "-m", *map(str, words)]
     done = subprocess.run(
         command,
@@ -108,7 +106,7 @@ def test_the_readme_holds_in_a_clean_environment(tmp_path: Path, *, drafted: boo
 
 @pytest.fixture(scope="module", params=["serial", "udp"])
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The distribution of an invented sensor with either link."""
+    """Return the distribution of an invented sensor with either link."""
     place = tmp_path_factory.mktemp("new")
     told = ran("new", "acme-x1", "--into", place, "--link", request.param)
     folder = place / "lidarspec-acme-x1"
@@ -278,7 +276,7 @@ def test_a_second_model_joins_a_distribution(tmp_path: Path) -> None:
 
 
 def _other(folder: Path) -> Path:
-    """A folder with one of the name lidarspec-other that is no distribution of sensors."""
+    """Return a folder with a subfolder lidarspec-other that is not a distribution."""
     (place := folder / "elsewhere" / "lidarspec-other").mkdir(parents=True)
     for name in ("pyproject.toml", "README.md"):
         (place / name).write_text("[project]\n", encoding="utf-8")

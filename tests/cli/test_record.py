@@ -35,7 +35,7 @@ def frames(sensor: str, number: int) -> list[bytes]:
 
 @pytest.fixture
 def stream(tmp_path: Path) -> Path:
-    """A recording of 40 frames in 0.2 s."""
+    """Return a recording of 40 frames in 0.2 s."""
     path = tmp_path / "stream.lsr"
     with Recorder(path, STREAM, "serial:///dev/ttyUSB0", baud=921600) as kept:
         for number, frame in enumerate(frames(STREAM, 40)):
@@ -45,7 +45,7 @@ def stream(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def datagrams(tmp_path: Path) -> Path:
-    """A recording of 30 datagrams in 0.15 s."""
+    """Return a recording of 30 datagrams in 0.15 s."""
     path = tmp_path / "datagrams.lsr"
     some = frames(DATAGRAMS, 3)
     with Recorder(path, DATAGRAMS, "udp://") as kept:
@@ -81,7 +81,7 @@ class Running:
                 self._lines.notify_all()
 
     def hears(self, pattern: str) -> re.Match[str]:
-        """What it says about something, once it does."""
+        """Wait for a line with this text; return it."""
         with self._lines:
             assert self._lines.wait_for(lambda: re.search(pattern, self._said), 60), self._said
             found = re.search(pattern, self._said)
@@ -89,7 +89,7 @@ class Running:
         return found
 
     def wait_until_end(self, code: int) -> str:
-        """What it said until its end; it has to end with this code."""
+        """Return the output until the end; the process must exit with this code."""
         self.child.wait(60)
         self._listener.join()
         assert self.child.stdout is not None
@@ -104,7 +104,7 @@ class Running:
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[Callable[..., Running]]:
-    """Starts verbs; those that are still at work at the end of the test are ended."""
+    """Yield a function that starts verbs; end the running ones after the test."""
     made: list[Running] = []
 
     def start(*words: object) -> Running:
@@ -124,7 +124,7 @@ def read_received(path: Path) -> bytes:
 
 
 def test_a_simulated_sensor_is_known_and_started(tmp_path: Path) -> None:
-    """One that sends nothing before it is asked to."""
+    """The sensor sends no data before it is started."""
     target = tmp_path / "a.lsr"
     result = run_json("record", "sim:slamtec-rplidar-a1?rate=4", "-o", target, "-n", 20)
     assert result["sensor"] == "slamtec-rplidar-a1"

@@ -96,7 +96,7 @@ def test_nothing_is_printed_past_the_one_place() -> None:
 
 
 def shell(command: str, stderr: int = subprocess.PIPE) -> subprocess.CompletedProcess[bytes]:
-    """A command line of the shell, with `lidarspec` in it."""
+    """Return a shell command line that runs `lidarspec`."""
     command = command.replace("lidarspec", f"{shlex.quote(sys.executable)} -m lidarspec")
     return subprocess.run(
         ["sh", "-c", command], stdout=subprocess.PIPE, stderr=stderr, check=False, timeout=120

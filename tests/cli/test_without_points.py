@@ -31,7 +31,7 @@ FIX_COUNT = 50
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of five seconds, whose frames arrive one by one."""
+    """Return a recording of five seconds, with one frame per record."""
     path = tmp_path_factory.mktemp("receiver") / "receiver.lsr"
     with Recorder(path, SENSOR, "made") as recorder:
         for number, frame in enumerate(FRAMES):

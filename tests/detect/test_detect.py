@@ -164,8 +164,9 @@ def test_clocks_tell_twins_apart(name: str) -> None:
 def old_firmware(
     number: int, *, period: float = 12 * 110.592e-6, mode: int = 0x37, product: int = 0x21
 ) -> list[bytes]:
-    """Packets of the Velodyne form with the product byte that both an HDL-32E and a VLP-16 with old
-    firmware send.
+    """Return Velodyne packets with a product byte that two models share.
+
+    Both an HDL-32E and a VLP-16 with old firmware send it.
     """
     data = simulate(ls.sensor("velodyne-vlp16"), number)
     tails = (
@@ -307,7 +308,7 @@ def test_scores_and_fitting_sensors_agree() -> None:
 
 
 def firmware_bug(number: int) -> list[bytes]:
-    """Frames of an STL-27L whose checksum leaves out their first byte."""
+    """Return frames of an STL-27L with a checksum that omits the first byte."""
     crc = Crc(width=8, poly=0x4D)
     return [
         frame[:46] + bytes([crc(frame[1:46])])
@@ -517,7 +518,7 @@ def make_bodies(size: int, number: int) -> list[bytes]:
 
 
 class TestStructure:
-    """What unknown bytes are made of."""
+    """Tests of the structure of unknown bytes."""
 
     def test_accidental_similarity_is_no_structure(self) -> None:
         assert find_structure([random.Random(1).randbytes(10_000)], datagrams=False) is None

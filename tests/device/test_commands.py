@@ -354,8 +354,9 @@ def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) ->
 
 @contextlib.contextmanager
 def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[None]:
-    """A device that sends datagrams to a port, the first one after some seconds, and answers
-    whoever sends it an order.
+    """Simulate a device that replies to orders and sends its first datagram late.
+
+    The datagrams go to a port.
     """
 
     def work(stop: threading.Event) -> None:

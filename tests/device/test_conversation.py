@@ -67,12 +67,12 @@ SET = Command(
 
 
 def make_linked_sensor(control: Link, **more: Any) -> Sensor:
-    """The shape with its commands over another link, and free ports."""
+    """Return the shape with its commands over another link, on free ports."""
     return dataclasses.replace(SENSOR, links={"data": Udp(free_port()), "control": control}, **more)
 
 
 def with_pages(answers: dict[str, Any], link: Http | None = None) -> Sensor:
-    """The shape with a web server."""
+    """Return the shape with a web server."""
     links = {
         "data": Udp(free_port()),
         "control": Udp(free_port()),
@@ -115,12 +115,12 @@ ANGLES = [0.5, 1.0, 1.5, 2.0]
 
 
 def teaching(**more: Any) -> Sensor:
-    """The shape, which is asked for its table on opening."""
+    """Return the shape with a request for its table on opening."""
     return dataclasses.replace(make_linked_sensor(Udp(free_port())), on_open=("get_table",), **more)
 
 
 def angles(device: ls.Device) -> list[float]:
-    """The angles of the samples of a packet, degrees, from that of the first one of the model."""
+    """Return the angles of a packet's samples relative to the model's first, in degrees."""
     packets = next(batch for batch in device.packets(wait=0.3) if len(batch))
     found = np.rad2deg(packets.points().azimuth[:4]) - packets["angle"][0]
     return [round(float(angle), 3) % 360 for angle in found]
@@ -233,7 +233,7 @@ def test_a_sensor_that_returns_with_another_table_is_a_warning() -> None:
 
 
 def silent(device: ls.Device) -> bool:
-    """Whether it is said that the heartbeat is not answered."""
+    """Return whether an unanswered heartbeat is reported."""
     return any(
         "beat: no ack frame received" in said and "sending it again" in said
         for said in device.warnings
@@ -277,7 +277,7 @@ class Loop(Link):
 
 
 class Looped(LiveTransport):
-    """A line whose other end acknowledges what it is told."""
+    """A link whose other end acknowledges every message."""
 
     def __init__(self) -> None:
         self.label, self._left = "loop", queue.SimpleQueue[bytes]()
@@ -298,7 +298,7 @@ class Looped(LiveTransport):
 
 
 class Plugin:
-    """What opens such a link."""
+    """A plugin that opens this link."""
 
     opened: Any = None
 

@@ -55,7 +55,7 @@ def line(tmp_path: Path) -> Iterator[Port]:
 
 
 def packets(device: ls.Device, number: int) -> list[ls.Packets]:
-    """Batches until there are so many packets; fails where they do not come."""
+    """Read batches until there are `number` packets; fail if they do not arrive."""
     found: list[ls.Packets] = []
     deadline = time.monotonic() + TIMEOUT_S
     for batch in device.packets(wait=0.05):
@@ -135,9 +135,7 @@ def test_datagrams_and_their_gaps(line: Port) -> None:
 
 
 def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
-    """A false header in front claims more bytes than ever come: only silence gives the frame behind
-    it up.
-    """
+    """A false header claims more bytes than arrive, so only silence releases the frame."""
     sensor = SHAPES["shape-count"]
     frame = sensor.example("data", seed=3)
     prefix = b"\xaa\x55\x20"
@@ -152,8 +150,9 @@ def test_a_frame_is_out_when_the_line_falls_silent(line: Port) -> None:
 def test_a_pause_inside_a_frame_costs_it_on_a_line_and_not_over_tcp(
     line: Port, tmp_path: Path
 ) -> None:
-    """TCP brings every byte, a lost segment 0.2 s later or more; what a serial line has lost never
-    comes.
+    """TCP delivers every byte, if only after a retransmission of 0.2 s or more.
+
+    Bytes lost by a serial port never arrive.
     """
     first, second = turning(TURNING, 2)
     recorded = tmp_path / "turn.lsr"
@@ -698,9 +697,7 @@ def test_a_failed_open_releases_everything(tmp_path: Path, line: Port) -> None:
 
 @pytest.mark.parametrize("given", ["scans", "packets"])
 def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given: str) -> None:
-    """No scan ends where the rotor is blocked, and frames of another type are no packets of the
-    data.
-    """
+    """No scan ends while the rotor is blocked, and other frame types are not packets."""
     with ls.open("sim:slamtec-rplidar-a1?rotor=blocked") as device:
         came = (
             device.scans if given == "scans" else lambda wait: device.packets("health", wait=wait)

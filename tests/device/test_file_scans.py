@@ -57,8 +57,9 @@ CAPTURED = {"ydlidar-g4"}
 
 
 def write_frames(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
-    """A file of frames, some lost, doubled, late or damaged, with frames of all other types and
-    noise between them.
+    """Write a file with lost, duplicate, late and damaged frames.
+
+    Frames of all other types and noise are between them.
     """
     chance, frames = random.Random(3), list[bytes]()
     others = [sensor.example(name) for name, frame in sensor.incoming.items() if not frame.data]
@@ -98,7 +99,7 @@ def write_frames(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest:
 
 
 def pickle_scan(scan: ls.Scan) -> list[object]:
-    """All that a scan says, as bytes."""
+    """Return all values of a scan as bytes."""
     columns = [
         (name, np.ascontiguousarray(column).tobytes())
         for name, column in scan.points.columns.items()

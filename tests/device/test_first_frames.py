@@ -53,7 +53,7 @@ def test_packets_before_the_first_position_have_its_date(tmp_path: Path, before:
 
 
 def test_a_reference_more_than_half_a_turn_later_is_placed_by_arrival(tmp_path: Path) -> None:
-    """The clock turns once a minute, and the position comes 50 s after the first packet."""
+    """The clock wraps once a minute; the position comes 50 s after the first packet."""
     early = [
         (number * FAST_S, frame) for number, frame in enumerate(simulate(PACED, 60, start=FIRST))
     ]

@@ -32,8 +32,9 @@ source = "udp://:6699"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a settings file and a capture, which is the working directory; the user has
-    none of his own.
+    """Return the working directory, with a settings file and a capture.
+
+    The user has no settings file.
     """
     home, here = tmp_path / "home", tmp_path / "project" / "deep"
     here.mkdir(parents=True)
@@ -103,7 +104,7 @@ def test_hexadecimal_digits_are_no_name(folder: Path) -> None:
 
 
 def settings_of_the_user(folder: Path, text: str) -> Path:
-    """The user's own settings file, with this text."""
+    """Write the user's own settings file."""
     file = folder.parent / "home" / "lidarspec" / "lidarspec.toml"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text, encoding="utf-8")

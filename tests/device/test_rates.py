@@ -33,7 +33,7 @@ BURST = 630
 
 
 def skip_without_buffer(device: ls.Device) -> None:
-    """Skip the test if the system grants less than the receive buffer that was asked for."""
+    """Skip the test if the system grants less than the requested receive buffer."""
     short = [
         warning for warning in device.warnings if f"of {REQUESTED_BUFFER_BYTES >> 10}" in warning
     ]
@@ -63,7 +63,7 @@ def test_bursts_of_datagrams_are_all_read_and_recorded_while_the_consumer_stalls
 
 
 def read_some(device: ls.Device) -> int:
-    """Read what has arrived; return the number of data frames so far."""
+    """Read the available data; return the number of data frames so far."""
     device.newest(0.01)
     return device.stats.frames.get("data", 0)
 
@@ -108,8 +108,9 @@ def sending(
 
 
 def drain(device: ls.Device, process: subprocess.Popen[bytes], stall: float) -> int:
-    """Decode until the sender is done and the line silent, with a pause each second; return the
-    number sent.
+    """Decode until the sender is done and no data arrives; return the number sent.
+
+    There is a pause each second.
     """
     due = time.monotonic() + 1
     for batch in device.packets(wait=0.3):

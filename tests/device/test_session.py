@@ -28,7 +28,7 @@ def ack(code: int, result: int = 0) -> Found:
 
 
 def sent(session: Session) -> list[str]:
-    """What is sent now, each by its hexadecimal bytes."""
+    """Return the messages that are sent now, as hexadecimal bytes."""
     return [one.data.hex() for one in session.outgoing()]
 
 
@@ -376,9 +376,7 @@ def test_an_argument_cannot_be_called_like_the_time_to_wait() -> None:
     "seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))]
 )
 def test_late_and_lost_replies_never_match_another_request(seed: int) -> None:
-    """The device numbers the requests that it has seen in its answers, so that a wrong pairing
-    shows.
-    """
+    """The device numbers the requests in its replies, so a wrong match is visible."""
     source = random.Random(seed)
     values = SENSOR.commands["start"].values
     sensor = with_commands(
@@ -416,7 +414,7 @@ def test_late_and_lost_replies_never_match_another_request(seed: int) -> None:
 def _next_event(
     session: Session, coming: list[tuple[int, int, int]], now: int
 ) -> tuple[int, Sequence[tuple[int, int, int]]]:
-    """The time of the next answer or deadline, and the answers of that time."""
+    """Return the time of the next reply or deadline, and the replies at that time."""
     times = [
         time for time in (session.deadline, coming[0][0] if coming else None) if time is not None
     ]
@@ -441,7 +439,7 @@ def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
 
 
 def read_request(session: Session) -> list[tuple[int, list[int]]]:
-    """The running number and the address in what is sent now."""
+    """Return the sequence number and the address of the request that is sent now."""
     sent = [CONVERSATION.parse(one.data, "order") for one in session.outgoing()]
     return [(one.head.number, list(one.host)) for one in sent]
 

@@ -157,7 +157,7 @@ def test_a_clock_change_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
 
 
 def test_arrival_times_count_a_suspend() -> None:
-    """In a namespace in which the computer seems to have slept for 100 s."""
+    """The test uses a namespace in which the computer appears to have slept for 100 s."""
     slept = ["unshare", "--fork", "--user", "--map-root-user", "--time", "--boottime", "100"]
     if (
         shutil.which("unshare") is None

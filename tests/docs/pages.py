@@ -38,9 +38,7 @@ _FENCE = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block: its language, its title ("" without), its text, and where on the page it
-    begins.
-    """
+    """A fenced block of a page. The title is "" if it has none."""
 
     language: str
     title: str
@@ -50,7 +48,7 @@ class Block:
 
 
 def blocks(page: str) -> list[Block]:
-    """The fenced blocks of a page under docs/, in order."""
+    """Return the fenced blocks of a page under docs/, in order."""
     text = (DOCS / page).read_text(encoding="utf-8")
     return [
         Block(
@@ -67,10 +65,13 @@ def blocks(page: str) -> list[Block]:
 def follow(
     page: str, place: Path, environment: Mapping[str, str] | None = None
 ) -> tuple[int, list[str]]:
-    """The number of blocks that ran, of a page followed in an empty folder, and why others did not.
+    """Run the blocks of a page in an empty folder.
+
+    Returns:
+        The number of blocks that ran, and the reasons why others were skipped.
 
     Raises:
-        AssertionError: where a block fails, or prints something else than the page says.
+        AssertionError: if a block fails, or its output differs from the page.
     """
     session: dict[str, Any] = {"__name__": "__main__"}
     written: set[str] = set()
@@ -99,7 +100,7 @@ def follow(
 
 
 def lacking(block: Block) -> list[str]:
-    """The libraries that a Python block imports and that are not installed, or do not load."""
+    """Return the libraries that a Python block imports and that cannot be imported."""
     imports = [
         node
         for node in ast.walk(ast.parse(block.text))
@@ -126,7 +127,7 @@ def _loads(name: str) -> bool:
 
 
 def shell(block: Block, place: Path, environment: Mapping[str, str] | None = None) -> str:
-    """What a shell block prints, errors included."""
+    """Return the output of a shell block, including errors."""
     command = ["bash", "-euo", "pipefail", "-c", block.text]
     given = {**os.environ, **OFFLINE, "COLUMNS": "140", "NO_COLOR": "1", **(environment or {})}
     done = subprocess.run(
@@ -146,8 +147,9 @@ def shell(block: Block, place: Path, environment: Mapping[str, str] | None = Non
 
 
 def python(block: Block, place: Path, session: dict[str, Any]) -> str:
-    """What a Python block prints, run in the names of those before it; a fault says which line of
-    the page it is in.
+    """Return the output of a Python block, run in the names of the blocks before it.
+
+    An exception names the line of the page.
     """
     code = compile(
         "\n" * (block.line - 1) + block.text, str(DOCS / block.place), "exec", dont_inherit=True
@@ -159,7 +161,7 @@ def python(block: Block, place: Path, session: dict[str, Any]) -> str:
 
 
 def assert_printed(block: Block, printed: str) -> None:
-    """Hold what was printed against the page, where trailing blanks do not count."""
+    """Compare an output with the page, without trailing blanks."""
     expected, got = (
         "".join(f"{line.rstrip()}\n" for line in text.splitlines())
         for text in (block.text, printed)
@@ -169,8 +171,9 @@ def assert_printed(block: Block, printed: str) -> None:
 
 
 def clean_environment(place: Path) -> dict[str, str]:
-    """The variables of an environment of its own, which sees what is installed here and keeps what
-    is installed into it.
+    """Create a separate environment for installations; return its variables.
+
+    It has access to the packages that are installed here.
     """
     venv.create(place, with_pip=False, symlinks=os.name != "nt")
     scripts = place / ("Scripts" if os.name == "nt" else "bin")

@@ -205,8 +205,9 @@ CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 
 def list_opened_names(section: str) -> list[tuple[str, str]]:
-    """Module and name of everything that a table of CONTRIBUTING says to open; a name belongs to
-    the module that was named last.
+    """Return module and name of everything that CONTRIBUTING's tables refer to.
+
+    A name belongs to the last module before it.
     """
     text = CONTRIBUTING.partition(f"## {section}\n")[2].partition("\n## ")[0]
     named = []

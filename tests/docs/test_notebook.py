@@ -23,7 +23,7 @@ PAGE = DOCS / "how-to" / "notebook.ipynb"
 
 
 def list_outputs(cell: Any) -> dict[str, str]:
-    """What a cell shows, by kind."""
+    """Return the outputs of a cell, by kind."""
     outputs = {
         "text": "".join(output.text for output in cell.outputs if output.output_type == "stream")
     }

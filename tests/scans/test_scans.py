@@ -38,7 +38,7 @@ PACKET_NS = 1_327_104
 
 
 class Reading:
-    """A sensor read in pieces: its scans as they come."""
+    """A sensor's frames read in pieces, and the scans that they complete."""
 
     def __init__(self, name: str) -> None:
         self.sensor = ls.sensor(name)
@@ -52,7 +52,7 @@ class Reading:
             decoder.frames(make_opening_frame(self.sensor))
 
     def scans(self, frames: list[bytes]) -> list[Scan]:
-        """The scans that some more frames complete."""
+        """Return the scans that some more frames complete."""
         decoder = self.decoder
         return self.scans_of(
             *(
@@ -63,7 +63,7 @@ class Reading:
         )
 
     def scans_of(self, *found: Frames) -> list[Scan]:
-        """The scans that frames of the decoder complete."""
+        """Return the scans that frames of the decoder complete."""
         return self._scans.add(self._packets.add(found))
 
 
@@ -153,7 +153,7 @@ def simulate_packets(name: str, number: int) -> list[bytes]:
 
 
 def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[Scan]:
-    """The scans of simulated frames some of which are missing."""
+    """Return the scans of simulated frames without some of them."""
     sensor = ls.sensor(name)
     frames = [
         frame for place, frame in enumerate(simulate_packets(name, number)) if place not in lost
@@ -231,7 +231,7 @@ def test_a_frame_with_its_first_packet_is_complete_though_the_one_before_has_no_
 
 
 def scans_of_pieces(name: str, frames: list[bytes], size: int) -> list[Scan]:
-    """The scans of the frames of a shape, whose packets come in batches of a size."""
+    """Return the scans of a shape's frames, with packets in batches of a size."""
     sensor = SHAPES[name]
     packets, stream = (
         sensor.decode(frames if sensor.datagrams else b"".join(frames)),

@@ -28,8 +28,9 @@ END = r"(9\.9|10)"
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same seconds as a recording and a capture, in which times are found, and as a packed
-    capture, which is read through.
+    """Return a recording, a capture and a compressed capture of the same seconds.
+
+    Times are found without reading in the first two; the compressed one is read through.
     """
     folder = tmp_path_factory.mktemp("selection")
     ran("sim", ID, "--to", folder / "drive.lsr", "-t", f"{SECONDS}s")
@@ -39,19 +40,19 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def scans(path: Path, select: Selection | None = None) -> Iterator[Scan]:
-    """The scans of a file that are wanted, and that no byte is read behind the last of them."""
+    """Return the selected scans of a file; fail if bytes after the last one are read."""
     with ls.open(path, ID) as device:
         yield from device.scans(select=select)
 
 
 @pytest.fixture(scope="module")
 def every(recordings: dict[str, Path]) -> list[Scan]:
-    """All scans."""
+    """Return all scans."""
     return list(scans(recordings["pcap"]))
 
 
 def assert_same(some: list[Scan], others: list[Scan]) -> None:
-    """Scans have the same points at the same times."""
+    """Fail unless the scans have the same points at the same times."""
     assert [scan.stamp_ns for scan in some] == [scan.stamp_ns for scan in others]
     for one, other in zip(some, others, strict=True):
         assert list(one.points.columns) == list(other.points.columns)

@@ -27,7 +27,7 @@ BEGIN, END = "<!-- written by make soak -->", "<!-- to here -->"
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="make soak", description=__doc__)
     parser.add_argument(
         "--only",
@@ -51,7 +51,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """1 where a promise is not kept, else 0."""
+    """Run the soak; return 1 if a promise is not kept, otherwise 0."""
     given = arguments()
     chosen = [promise for promise in EVERY if not given.only or promise.name in given.only]
     figures, began = {}, time.monotonic()
@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
-    """What is to be said of a promise, by its tests and what is measured."""
+    """Run the tests and measurements of a promise; return the result as text."""
     parts = [ran(promise, long=share == 1)] if promise.tests and tests else []
     if promise.measured is not None:
         try:
@@ -85,7 +85,7 @@ def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
 
 
 def ran(promise: Promise, *, long: bool) -> Figure:
-    """What the tests of a promise say: their number, and what they show where all of them pass."""
+    """Run the tests of a promise; return their number and the result as text."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.xml")
         words = [
@@ -121,9 +121,7 @@ def ran(promise: Promise, *, long: bool) -> Figure:
 
 
 def table(figures: dict[Promise, Figure], seconds: float, effort: str = "") -> str:
-    """The table, with the day, the version, the kind of machine, and the effort where it was not
-    the full one.
-    """
+    """Return the table with the date, version, machine and, if reduced, the effort."""
     day, machine = (
         datetime.date.today().isoformat(),
         f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}",
@@ -148,12 +146,12 @@ def table(figures: dict[Promise, Figure], seconds: float, effort: str = "") -> s
 
 
 def verdict(figure: Figure) -> str:
-    """Whether a promise is kept, as the table says it."""
+    """Return the table's text for whether a promise is kept."""
     return "" if figure.words == "not run" else "yes" if figure.kept else "**no**"
 
 
 def written(text: str) -> None:
-    """Put the table into the page, between its marks."""
+    """Write the table into the page, between its marks."""
     page = PAGE.read_text(encoding="utf-8")
     found = re.sub(
         f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n\n{text}\n\n{END}", page, flags=re.DOTALL

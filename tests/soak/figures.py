@@ -47,7 +47,7 @@ RATES, BURSTS = (0.0, 1e-5, 1e-4, 1e-3, 5e-3), (1, 8, 16, 64)
 
 @dataclass(frozen=True)
 class Figure:
-    """What was measured, in words, and whether the promise is kept."""
+    """A measured figure as text, and whether the promise is kept."""
 
     words: str
     kept: bool
@@ -59,12 +59,12 @@ def streams() -> dict[str, Sensor]:
 
 
 def exclude_shapes(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
-    """Those that are no invented shapes."""
+    """Return the sensors without the invented shapes."""
     return {name: sensor for name, sensor in sensors.items() if name in ls.sensors()}
 
 
 def splits(share: float) -> Figure:
-    """P1: two-way splits at every byte, and random ones, against the whole."""
+    """P1: compare splits at every byte, and random ones, with the whole stream."""
     tried = differing = 0
     for sensor in streams().values():
         subject = SensorUnderTest(sensor)
@@ -85,7 +85,7 @@ def splits(share: float) -> Figure:
 
 
 def measure_recovery(share: float) -> Figure:
-    """P2: the frames of the engine against those of the oracle, whatever is damaged."""
+    """P2: compare the engine's frames of damaged streams with the oracle's."""
     frames = missed = extra = 0
     for sensor, seed in itertools.product(streams().values(), range(max(int(3 * share), 1))):
         data = clean(SensorUnderTest(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
@@ -104,7 +104,7 @@ def measure_recovery(share: float) -> Figure:
 
 
 def measure_errors(share: float) -> Figure:
-    """P3: hostile inputs to everything that reads."""
+    """P3: read hostile inputs with everything that reads."""
     number = int(400_000 * share) + 300
     only = [] if share >= 0.1 else ["--only", "hex", "--only", "recording"]
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +141,7 @@ def measure_errors(share: float) -> Figure:
 
 
 def measure_memory(share: float) -> Figure:
-    """P4: what a decoder holds while garbage goes through it, beyond the input."""
+    """P4: measure the memory of a decoder that reads garbage, beyond the input."""
     size = int(50 * share) + 1
     data, held = garbage(1 << 20), {}
     for name, sensor in few(exclude_shapes(streams()), share):
@@ -155,7 +155,7 @@ def measure_memory(share: float) -> Figure:
 
 
 def linear(share: float) -> Figure:
-    """P5: twice the input, how many times the seconds."""
+    """P5: compare the time of twice the input with that of the input."""
     length, ratios = int(400_000 * share) + 20_000, {}
     for name, sensor in few(exclude_shapes(streams()), share):
         for what, data in (("garbage", garbage(length)), ("worst stream", worst(sensor, length))):
@@ -172,7 +172,7 @@ def linear(share: float) -> Figure:
 
 
 def delay(share: float) -> Figure:
-    """P6: bytes that come after a frame's last one before it is out, by the longest frame."""
+    """P6: count the bytes after a frame until it is returned, for the longest frame."""
     worst_share = 0.0
     for _, sensor in few(streams(), share):
         data = SensorUnderTest(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
@@ -192,7 +192,7 @@ def delay(share: float) -> Figure:
 
 
 def round_trips(share: float) -> Figure:
-    """P7: frames that are parsed and built again."""
+    """P7: parse frames and build them again."""
     tried = lost = 0
     frames = distinct_frames(every_sensor().values())
     for sensor, kind in frames:
@@ -211,7 +211,7 @@ def round_trips(share: float) -> Figure:
 
 
 def in_any_order(share: float) -> Figure:
-    """P17: packets doubled and displaced, compared with the same packets in order."""
+    """P17: compare duplicate and reordered packets with the same packets in order."""
     differing = []
     sensors = {name: sensor for name, sensor in ls.sensors().items() if sensor.datagrams}
     for name, sensor in few(sensors, share):
@@ -236,7 +236,7 @@ def in_any_order(share: float) -> Figure:
 
 
 def whole(sensor: Sensor, frames: Sequence[bytes]) -> list[Scan]:
-    """The complete scans of some frames."""
+    """Return the complete scans of some frames."""
     with warnings.catch_warnings(action="ignore"):
         return [
             scan
@@ -246,7 +246,7 @@ def whole(sensor: Sensor, frames: Sequence[bytes]) -> list[Scan]:
 
 
 def measure_blocked_rotors(share: float) -> Figure:
-    """P19: sensors whose angle stands still."""
+    """P19: decode sensors with a constant angle."""
     told, kept = [], True
     cases: list[tuple[str, Callable[[Any], object]]] = [
         ("ldrobot-ld06", lambda frame: frame.update({"start_angle": 9000, "end_angle": 9000})),
@@ -283,8 +283,9 @@ OTHER_LINE_RATE = 1e6
 
 
 def slowest(share: float) -> Figure:
-    """P20: the worst of many hostile streams, against the line's rate; and the memory kept for each
-    byte of frames in turn.
+    """P20: compare the worst of many hostile streams with the rate of the connection.
+
+    Also measure the memory per byte of frames.
     """
     rates = {}
     held = {}
@@ -339,9 +340,7 @@ def _frames_key(sensor: Sensor) -> Hashable:
 
 
 def strangers(share: float) -> Figure:
-    """P21: valid frames and calibration frames of another address among those of the sensor, while
-    it is recorded.
-    """
+    """P21: send valid frames from another address during a recording."""
     sensor, number = ls.sensor("robosense-helios16p"), int(300 * share) + 50
     frames, port = simulate(sensor, number), free_port()
     others = [frames[0], sensor.example("difop", seed=9)]
@@ -374,8 +373,10 @@ def strangers(share: float) -> Figure:
 
 
 def nothing_runs(share: float) -> Figure:
-    """P22: a settings file in a parent folder that names Python, and recordings whose header names
-    a descriptor or a file.
+    """P22: read a settings file that names Python code, and hostile recordings.
+
+    The settings file is in a parent folder. The headers of the recordings name a descriptor or a
+    file.
     """
     with tempfile.TemporaryDirectory() as place:
         folder, home = Path(place, "project", "below"), Path(place, "home")
@@ -433,7 +434,7 @@ print(json.dumps({"left": sys.stdin.read()}))
 
 
 def complete(share: float) -> Figure:
-    """P23: packets missing within a scan, and one damaged counter."""
+    """P23: remove packets within a scan, and damage one counter."""
     told, kept = [], True
     for name, number in (("velodyne-vlp16", 50), ("robosense-m1", 315)):
         sensor = ls.sensor(name)
@@ -452,7 +453,7 @@ def complete(share: float) -> Figure:
 
 
 def not_in_silence(share: float) -> Figure:
-    """P24: what is said, and the exit code, where data are damaged, guessed or cut off."""
+    """P24: check messages and exit code for damaged, guessed or truncated data."""
     velodyne = [ls.sensor("velodyne-vlp16").example("data", seed=seed) for seed in range(3)]
     blocks = [made.packet(made.frame(data)) for data in velodyne]
     cases = {
@@ -499,5 +500,5 @@ def not_in_silence(share: float) -> Figure:
 
 
 def few(sensors: dict[str, Sensor], share: float) -> list[tuple[str, Sensor]]:
-    """All of them, or in a very short run one."""
+    """Return all of them, or one of them in a very short run."""
     return list(sensors.items())[: None if share >= 0.1 else 1]

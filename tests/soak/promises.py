@@ -16,7 +16,7 @@ class Promise:
     Attributes:
         name: "P1" and so on.
         words: the promise.
-        tests: test files, or tests in them, that hold it.
+        tests: test files, or tests in them, of this promise.
         told: the result of these tests, printed if all of them pass.
         measured: returns a figure, given the share of the full effort, from 0 to 1.
     """

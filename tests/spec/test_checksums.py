@@ -97,7 +97,7 @@ def slow_unless(values: Iterable[Any], quick: Collection[Any]) -> list[Any]:
 
 
 def bitwise_crc(crc: Crc, data: bytes) -> int:
-    """The CRC by its definition: one bit after the other through a shift register."""
+    """Return the CRC by its definition: one bit at a time through a shift register."""
     register = crc.init
     for byte in data:
         for bit in range(8) if crc.refin else range(7, -1, -1):
@@ -202,7 +202,7 @@ def test_agrees_with_crccheck() -> None:
 
 @pytest.mark.parametrize("algorithm", slow_unless(ALGORITHMS, QUICK_ALGORITHMS), ids=name_of)
 class TestBatch:
-    """A batch gives what its rows give one by one, whichever way it is computed."""
+    """Tests that a batch gives the same results as its rows, however it is computed."""
 
     def test_every_short_length(self, algorithm: Checksum) -> None:
         for length in range(71):
@@ -496,7 +496,7 @@ def test_long_rows_of_zlibs_polynomial_have_its_values_wherever_they_stand(
 
 @dataclasses.dataclass(frozen=True)
 class Attentive(Checksum):
-    """The sum of all bytes, and what it was asked for."""
+    """The sum of all bytes; it records its arguments."""
 
     asked: list[bytes] = dataclasses.field(default_factory=list, compare=False)
     width = 8

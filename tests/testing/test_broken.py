@@ -138,7 +138,7 @@ LINES = {
 
 
 def check_module(name: str) -> list[Finding]:
-    """What `check` says of one of the modules."""
+    """Return the findings of `check` for one of the modules."""
     file = HERE / f"{name}.py"
     return [
         finding

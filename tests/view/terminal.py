@@ -22,11 +22,10 @@ _PIECES = re.compile(r"\x1b\[(\d+);(\d+)H|\x1b\[\??([0-9;]*)([A-Za-z])|([\r\n])|
 
 
 class Terminal:
-    """A program, by default ``lidarspec``, with these words in a window of so many columns and
-    lines; a context manager.
+    """A program, by default ``lidarspec``, in a terminal window; a context manager.
 
     Attributes:
-        modes: private modes that are set: 1049 (alternate screen), 25 (cursor) and so on.
+        modes: private modes that are set: 1049 (alternate screen), 25 (cursor) and others.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class Terminal:
         self._rest = b""
 
     def resize(self, columns: int, lines: int, *, notify: bool = True) -> None:
-        """Give the window another size; what it shows is forgotten."""
+        """Change the size of the window and clear its text."""
         fcntl.ioctl(self._master, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
         self.grid = [[" "] * columns for _ in range(lines)]
         self._place, self._kept = (0, 0), (0, 0)
@@ -81,13 +80,13 @@ class Terminal:
         os.write(self._master, keys.encode())
 
     def text(self) -> str:
-        """What the screen shows now."""
+        """Return the text on the screen."""
         while self._read(0.0):
             pass
         return "\n".join("".join(row).rstrip() for row in self.grid)
 
     def wait_for(self, text: str) -> str:
-        """The screen, as soon as it shows a text."""
+        """Wait until the screen shows a text; return the screen."""
         end = time.monotonic() + DEADLINE
         while text not in (shown := self.text()):
             assert time.monotonic() < end, f"{text!r} is not shown:\n{shown}"
@@ -95,7 +94,7 @@ class Terminal:
         return shown
 
     def wait_until_end(self) -> int:
-        """The exit code, as soon as there is one."""
+        """Wait until the program exits; return the exit code."""
         end = time.monotonic() + DEADLINE
         while self.process.poll() is None:
             assert time.monotonic() < end, "it does not end"
@@ -104,8 +103,9 @@ class Terminal:
         return self.process.returncode
 
     def wait_until_loaded(self) -> None:
-        """Wait until the program has imported what it works with and sleeps now and then; where
-        that cannot be seen, time has to do.
+        """Wait until the program has imported its modules and sleeps.
+
+        On systems without this information, wait for a fixed time.
         """
         end, asleep = time.monotonic() + DEADLINE, 0
         while asleep < 5 and self.process.poll() is None and time.monotonic() < end:
@@ -125,13 +125,14 @@ class Terminal:
             self._read(0.02)
 
     def is_as_before(self) -> bool:
-        """Whether the terminal's modes are as they were before the program began."""
+        """Return whether the terminal's modes are as before the program began."""
         self.text()
         return self.modes == {"25", "7"} and termios.tcgetattr(self._slave) == self.before
 
     def is_clean(self) -> bool:
-        """Whether the terminal is as it was: main screen, cursor, wrapping, colours, and lines that
-        are echoed.
+        """Return whether the terminal is restored.
+
+        Restored are the main screen, cursor, wrapping, colours and the echo of lines.
         """
         self.text()
         now = termios.tcgetattr(self._slave)

@@ -58,7 +58,7 @@ QUADRANTS = bytes.fromhex("aa55 0004 010f 0196 ca9b 92a10f 92411f 92813e 92017d"
 
 
 def packet(angles: tuple[float, float], distances: list[int], **more: Any) -> bytes:
-    """A point packet with raw angles in degrees and distances in millimetres."""
+    """Return a point packet with raw angles in degrees and distances in millimetres."""
     samples = [{"distance": distance, "intensity": 100, "exposure": 1} for distance in distances]
     raw = [{"angle": round(angle * 64)} for angle in angles]
     return SENSOR.build(
@@ -145,9 +145,7 @@ def test_an_answer_of_the_older_generation_is_no_point_packet(name: str) -> None
 
 
 def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
-    """The answer, what it is, and a packet with the manual's sample: 30, 120, 210 and 300 degrees,
-    1, 2, 7.161 and 8 m.
-    """
+    """The packet has the manual's sample: 30, 120, 210, 300 degrees and 1, 2, 7.161, 8 m."""
     si = vector_bytes(FILE, "cspc_v11_si2")
     data = bytes.fromhex("aa55 0004 010f 0196 aeca a00f 401f") + si + bytes.fromhex("007d")
     packets = decode(
@@ -174,8 +172,9 @@ def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
 
 
 def test_an_older_model_is_distinguished_from_a_ydlidar() -> None:
-    """Its packets are those of a YDLIDAR with two bytes a sample; started, it says its name, and a
-    YDLIDAR tells how fast it turns.
+    """Both send packets with two bytes a sample.
+
+    When started, the older model sends its name. A YDLIDAR sends its rotation rate.
     """
     own, other = (b"".join(simulate(ls.sensor(name), 60)) for name in (V11.id, "ydlidar-x4"))
     assert identify_sample(SampleBytes("", (INFO + own,))).sensor is V11

@@ -30,7 +30,7 @@ EVENTS = {"ack": "ack_50", "info": "info_01", "scan_start": "info_81"}
 
 
 def turn(*, start: int = 0, number: int = 17) -> bytes:
-    """Packets along the sensor's sweep, all at 1 m."""
+    """Return packets along the sensor's sweep, all at 1 m."""
     frames = []
     for i in range(start, start + number):
         values = SENSOR.simulation.sweep(i) if SENSOR.simulation.sweep else {}
@@ -45,7 +45,7 @@ def turn(*, start: int = 0, number: int = 17) -> bytes:
 
 
 def event(found: ls.Found) -> str:
-    """The name that the vectors give a frame."""
+    """Return the name of a frame in the vectors."""
     if found.frame != "data":
         return EVENTS[found.frame]
     parsed = SENSOR.parse(found.data)
@@ -170,8 +170,9 @@ def test_a_command_seen_on_the_line_is_no_frame_of_the_sensor() -> None:
 
 
 def changed_struct() -> Checksummed:
-    """The point packet with fields renamed and in another order, and the distance beside the
-    intensity by bytes.
+    """Return the point packet with renamed and reordered fields.
+
+    The distance and the intensity are separate bytes.
     """
     angle = ByteSwapped(
         BitStruct(
@@ -196,7 +197,7 @@ def changed_struct() -> Checksummed:
 
 
 def changed_points(f: Fields) -> Polar:
-    """The points of `changed_struct`, without the correction."""
+    """Return the points of `changed_struct`, without the correction."""
     angles = spread(f.first.value, f.last.value, f.number, full=360.0)
     return Polar(range=f.returns.far, azimuth=-np.deg2rad(angles), intensity=f.returns.strength)
 

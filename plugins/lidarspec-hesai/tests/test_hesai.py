@@ -112,8 +112,13 @@ def packet(
     raw: dict[tuple[int, int], int] | None = None,
     **more: Any,
 ) -> bytes:
-    """A packet of a model with these azimuths by block and distances by block and channel, all else
-    as in the simulation.
+    """Return a packet of a model with these azimuths and distances.
+
+    All other fields are as in the simulation.
+
+    Args:
+        azimuths: raw azimuth by block, otherwise 0.
+        raw: raw distance by (block, channel).
     """
     sensor, (blocks, channels) = SENSORS[name], FORM[name]
     parsed = sensor.parse(simulate(sensor, 1)[0], "data")
@@ -525,7 +530,7 @@ def test_commands_are_those_of_the_protocol() -> None:
 
 
 def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
-    """The sensor with a unit's own words for its angles."""
+    """Return the sensor on free ports, with this reply to `get_calibration`."""
     answers = {"get_calibration": [("answer", {"payload": said})]}
     links = {"data": Udp(free_port()), "control": Tcp(free_port())}
     patient = {
@@ -674,10 +679,8 @@ def test_reported_angles_survive_a_bad_network() -> None:
 AT128 = ls.sensor("hesai-at128")
 
 
-def of_mirror(azimuth: float, raw: dict[tuple[int, int], int], **more: Any) -> bytes:
-    """A packet of an AT128 whose mirror stands at this azimuth, with distances by block and
-    channel.
-    """
+def make_at128_packet(azimuth: float, raw: dict[tuple[int, int], int], **more: Any) -> bytes:
+    """Return a packet of an AT128 with this azimuth of the mirror."""
     parsed = AT128.parse(simulate(AT128, 1)[0], "data")
     for number, block in enumerate(parsed.body.blocks):
         block.azimuth, block.fine_azimuth = int(azimuth * 100), round(azimuth * 25600) % 256
@@ -690,9 +693,9 @@ def test_points_and_times_of_an_at128_by_hand() -> None:
     # 10 m. The face behind begins at 143.44 degrees: 173.445 is 30.005 after it, the beam 60.01 +
     # 2.4 = 62.41 clockwise from the left, with E 12.883 (cos 0.974827, sin 0.222964); sin 62.41 =
     # 0.886285, cos 62.41 = 0.463141
-    first = of_mirror(173.445, {(0, 0): 2500, (1, 0): 2500})
+    first = make_at128_packet(173.445, {(0, 0): 2500, (1, 0): 2500})
     # across 0: 20 is 116.867 after the face at 263.133, the beam 233.734 + 0.65 = 234.384
-    across = of_mirror(20.0, {(1, 17): 2500})
+    across = make_at128_packet(20.0, {(1, 17): 2500})
     cloud = decode(AT128, [first, across]).points()
     assert_points(
         cloud,
@@ -706,15 +709,15 @@ def test_points_and_times_of_an_at128_by_hand() -> None:
     assert (cloud.time[[0, 2, 128]] * 1e6).tolist() == pytest.approx(
         [-92.581, -84.341, -50.915], abs=1e-3
     )
-    dual = decode(AT128, [of_mirror(173.445, {}, return_mode=0x39)]).points()
+    dual = decode(AT128, [make_at128_packet(173.445, {}, return_mode=0x39)]).points()
     assert (dual.time[[0, 128]] * 1e6).tolist() == pytest.approx([-50.915, -50.915], abs=1e-3)
     assert dual.return_index is not None
     assert dual.return_index[[0, 128]].tolist() == [0, 1]
     assert len(first) == 1086
 
 
-def of_a_mirror(**values: Any) -> bytes:
-    """What a unit says of its mirror, with these values in the file and their hash."""
+def make_mirror_file(**values: Any) -> bytes:
+    """Return the mirror file of a unit with these values and their hash."""
     data = at128.FILE.build({**at128.FILE.parse(AT128_FILE), **values})[:-32]
     return data + hashlib.sha256(data).digest()
 
@@ -723,18 +726,19 @@ AT128_FILE = at128.TABLE.to_file()
 
 
 def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
-    """Two steps of the file are 0.04 degrees; corrections go evenly from the entry at 172 degrees
-    to the one at 174.
+    """Two steps of the file are 0.04 degrees.
+
+    Corrections are interpolated between the entries at 172 and 174 degrees.
     """
     adjust = bytearray(128 * 180)
     adjust[0 * 180 + 86], adjust[0 * 180 + 87] = 10, 0xFC  # 0.2 and -0.08 degrees of channel 0
     start = [295_360, 1_836_032, 3_368_102]  # 23.075, 143.44 and 263.133 degrees
-    told = of_a_mirror(
+    told = make_mirror_file(
         resolution=2, start=start, azimuth_adjust=bytes(adjust), elevation_adjust=bytes(adjust)
     )
     file = tmp_path / "unit.dat"
     file.write_bytes(told)
-    data = [of_mirror(173.5, {(0, 0): 2500})]
+    data = [make_at128_packet(173.5, {(0, 0): 2500})]
     for source in (file, Learned(told)):
         cloud = decode(AT128.configure(calibration=source), data).points()
         # 30.06 degrees after the face, 60.12 + 4.8 of the channel; a quarter of 0.2 and three of

@@ -48,8 +48,9 @@ def read_published_points(name: str) -> Points:
 
 
 def nearest(points: Points, queries: Points) -> NDArray[np.float64]:
-    """The distance from each query to the nearest point; inf beyond REACH. Points are sorted into
-    cells of that size.
+    """Return the distance from each query to the nearest point; inf beyond REACH.
+
+    Points are sorted into cells of that size.
     """
 
     def codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -70,14 +71,14 @@ def nearest(points: Points, queries: Points) -> NDArray[np.float64]:
 
 
 def turns(cloud: PointCloud) -> NDArray[np.intp]:
-    """How often each point's own azimuth has passed 0 since the beginning."""
+    """Return how often each point's own azimuth has passed 0 since the first point."""
     assert cloud.shape is not None
     clockwise = np.rad2deg(-cloud.azimuth.astype(np.float64)).reshape(cloud.shape)
     return np.asarray(np.unwrap(clockwise, axis=0, period=360) // 360, np.intp).ravel()
 
 
 def places(cloud: PointCloud, which: NDArray[np.bool_]) -> Points:
-    """The places of some of the points, each once, in the vendor's axes."""
+    """Return the distinct positions of some of the points, in the vendor's axes."""
     return np.unique(
         np.stack([-cloud.y, cloud.x, cloud.z], axis=1)[which & cloud.valid], axis=0
     ).astype(np.float64)

@@ -52,7 +52,7 @@ QUADRANTS = bytes.fromhex(
 def frame(
     start: float = 10.0, end: float = 12.0, seconds: float = 1.0, distance: float = 1.0, **more: Any
 ) -> bytes:
-    """A frame with all points at one distance."""
+    """Return a frame with all points at one distance."""
     values: dict[str, Any] = dict(speed=3600, start_angle=start, end_angle=end, timestamp=seconds)
     return SENSOR.build(
         "data", units=True, points=[dict(distance=distance, intensity=7)] * 12, **values, **more

@@ -86,7 +86,7 @@ def test_published_points_of_the_first_generation_and_their_date() -> None:
 
 
 def header(kind: int, time_type: int, stamp: bytes) -> bytes:
-    """The header of a packet of the first generation."""
+    """Return the header of a packet of the first generation."""
     return struct.pack("<BBBBIBB", 5, 1, 1, 0, 0, time_type, kind) + stamp
 
 

@@ -56,7 +56,7 @@ def payloads(path: Path) -> list[bytes]:
 
 
 def unit(name: str) -> tuple[ls.Sensor, list[bytes]]:
-    """The sensor of a capture with its metadata, and the datagrams."""
+    """Return the sensor of a capture with its metadata, and the datagrams."""
     metadata = capture(f"ouster/{CAPTURES[name][0]}.json")
     return ls.sensor(f"ouster-os{name[3]}").configure(metadata=metadata), payloads(
         capture(f"ouster/{name}.pcap")
@@ -68,7 +68,7 @@ def digest(values: Any) -> str:
 
 
 def pixels(packets: ls.Packets, name: str) -> Any:
-    """A field of the pixels in the vendor's type and full width: (packets, rows, columns)."""
+    """Return a field of the pixels in the vendor's type: (packets, rows, columns)."""
     return packets.raw["columns"]["pixels"][name].transpose(0, 2, 1).astype(TYPES[name.rstrip("2")])
 
 
@@ -158,7 +158,7 @@ def test_published_packets(name: str) -> None:
 
 
 def metadata_of(params: dict[str, Any]) -> dict[str, Any]:
-    """What a vector's parameters say, in the form of a file."""
+    """Return the parameters of a vector as a metadata file."""
     beam = [1, 0, 0, params["n"], 0, 1, 0, 0, 0, 0, 1, params["nz"], 0, 0, 0, 1]
     layout = {
         "columns_per_frame": params["W"],
@@ -317,7 +317,7 @@ def test_keys_are_read_from_whichever_section_has_them(tmp_path: Path) -> None:
 def test_missing_offsets_are_those_of_the_model_and_nominal(
     tmp_path: Path, product: str, distance_mm: float
 ) -> None:
-    """The values that ouster-sdk takes (sensor_info.cpp, metadata.cpp)."""
+    """The expected values are the defaults of ouster-sdk (sensor_info.cpp, metadata.cpp)."""
     data = json.loads(make_nominal_unit("OS1", 16, 512, "LEGACY").to_metadata())
     data["sensor_info"]["prod_line"] = product
     del data["beam_intrinsics"]["beam_to_lidar_transform"]

@@ -32,7 +32,7 @@ Channels = Mapping[tuple[int, int], tuple[int, int]]
 
 
 def patch(data: bytes, offset: int, new: bytes | str) -> bytes:
-    """The packet with other bytes from an offset on."""
+    """Return the packet with other bytes from an offset on."""
     new = bytes.fromhex(new) if isinstance(new, str) else new
     return data[:offset] + new + data[offset + len(new) :]
 
@@ -45,8 +45,11 @@ def msop(
     resolution: int = 1,
     time: float = 0.0,
 ) -> bytes:
-    """A packet by the offsets of the manual's Table 9: raw azimuths, {(block, slot): (raw distance,
-    intensity)}.
+    """Return a packet by the offsets of the manual's Table 9.
+
+    Args:
+        azimuths: raw values by block.
+        channels: {(block, slot): (raw distance, intensity)}.
     """
     seconds = divmod(int(time), 1 << 32)
     header = struct.pack(
@@ -68,7 +71,7 @@ def msop(
 
 
 def difop(angles: Mapping[int, str] | None = None, *, mode: int = 4, rpm: int = 600) -> bytes:
-    """A DIFOP packet with all angles 0 but those given by the offset of their three bytes."""
+    """Return a DIFOP packet with angles by the offset of their three bytes, otherwise 0."""
     data = bytes.fromhex("a5ff005a11115555") + bytes(SIZE - 10) + b"\x0f\xf0"
     data = patch(patch(data, 8, struct.pack(">H", rpm)), 300, bytes([mode]))
     for offset, text in (angles or {}).items():
@@ -77,17 +80,17 @@ def difop(angles: Mapping[int, str] | None = None, *, mode: int = 4, rpm: int = 
 
 
 def steady(first: int, step: int) -> list[int]:
-    """Twelve raw azimuths an equal step apart."""
+    """Return twelve raw azimuths at equal steps."""
     return [(first + step * block) % 36000 for block in range(12)]
 
 
 def at(block: int, slot: int) -> int:
-    """The index of a point in the cloud of one packet."""
+    """Return the index of a point in the cloud of one packet."""
     return 32 * block + slot
 
 
 def datagrams() -> list[bytes]:
-    """The payloads of the capture."""
+    """Return the payloads of the capture."""
     with open(capture(f"{FOLDER}/packets.derived.pcap"), "rb") as file:
         return [datagram.data for datagram in CaptureReader(file)]
 
@@ -131,11 +134,11 @@ def test_calibration_angles(name: str) -> None:
 
 
 def test_points_by_hand() -> None:
-    """One in each quadrant; x = d cos V cos H + C cos R, y = -(d cos V sin H + C sin R), z = d sin
-    V, H = R + calibration.
+    """The points lie in all quadrants.
 
-    The first is the manual's: distance 0x0140 and azimuth 0x88db of Figure 14, angles of appendix
-    B.9 and B.10.
+    x = d cos V cos H + C cos R, y = -(d cos V sin H + C sin R), z = d sin V, H = R + calibration.
+    The first point is the manual's: distance 0x0140 and azimuth 0x88db of Figure 14, angles of
+    appendix B.9 and B.10.
     """
     angles = {
         468: "0005d6",
@@ -189,8 +192,9 @@ def test_firing_times_of_single_return() -> None:
 
 
 def test_dual_return_has_one_firing_a_block() -> None:
-    """Laser 9 fires 26.53 us after the block's first, of 55.56 us until the next block: 0.2 * 26.53
-    / 55.56 degrees on.
+    """Laser 9 fires 26.53 us after the block's first; a block takes 55.56 us.
+
+    So its azimuth is 0.2 * 26.53 / 55.56 degrees further.
     """
     channels = {(3, 8): (400, 5), (3, 24): (800, 6)}
     cloud = decode(SENSOR, [difop(mode=0), msop(steady(9000, 20), channels)]).points()
@@ -325,8 +329,10 @@ def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_published_point_clouds(number: int) -> None:
-    """nebula's: its azimuths are cut off at 0.01 degrees, and the last block of each packet takes
-    the step of the speed.
+    """The clouds are nebula's.
+
+    It truncates azimuths to 0.01 degrees, and computes the step of each packet's last block from
+    the rotation rate.
     """
     scan = list(SENSOR.scans(datagrams()))[number].points
     published = np.loadtxt(sorted(capture(FOLDER).glob("*.pcd"))[number], skiprows=11)
@@ -339,8 +345,9 @@ def test_published_point_clouds(number: int) -> None:
 
 
 def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
-    """How far the nearest of our points of the same laser is from each published one, and its
-    azimuth, clockwise.
+    """Return the distance from each published point to our nearest one of its laser.
+
+    Also return its azimuth, clockwise.
     """
     distance, degrees = np.empty(len(published)), np.empty(len(published))
     for laser in range(16):
@@ -357,7 +364,7 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
 
 @pytest.mark.slow
 def test_a_packet_of_another_model_is_a_warning(tmp_path: Path) -> None:
-    """Lidar type 6 is a Helios-5515: what is read as a 16P all the same is told of."""
+    """Lidar type 6 is a Helios-5515; it is still decoded as a 16P."""
     path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)
     path.write_bytes(
         b"".join(SENSOR.build("data", {**SENSOR.parse(frame), "lidar_type": 6}) for frame in frames)

@@ -31,13 +31,14 @@ OTHER_LAYOUTS = {
 
 
 def beginning(data: bytes) -> bytes:
-    """A whole packet that begins with these bytes."""
+    """Return a whole packet that begins with these bytes."""
     return data + bytes(SIZE - len(data))
 
 
 def with_channel(data: bytes, block: int, channel: int, values: str) -> bytes:
-    """The packet with other bytes in one channel: 32 + 47 * block + 2 + 9 * channel, by the tables
-    of the manual.
+    """Return the packet with other bytes in one channel.
+
+    By the manual's tables, its offset is 32 + 47 * block + 2 + 9 * channel.
     """
     start, new = 32 + 47 * block + 2 + 9 * channel, bytes.fromhex(values)
     return data[:start] + new + data[start + len(new) :]

@@ -23,9 +23,9 @@ TEMPLATE = SENSOR.build(
 
 
 def packet(number: int, frame: int = 0, *, last: int = 630) -> bytes:
-    """Packet `number` of a frame of 0.1 s; the first channel's radius tells which one it is.
+    """Return packet `number` of a frame of 0.1 s; its first radius identifies it.
 
-    The places are those of the manual's tables: number at 4, mode at 8, microseconds at 16, first
+    The offsets are from the manual's tables: number at 4, mode at 8, microseconds at 16, first
     radius at 34.
     """
     microseconds = round((frame + (number - 1) / last) * 100_000)
@@ -46,14 +46,14 @@ def packet(number: int, frame: int = 0, *, last: int = 630) -> bytes:
 
 
 def frames(count: int, *, last: int = 630) -> list[bytes]:
-    """So many whole frames, packet by packet."""
+    """Return the packets of `count` whole frames."""
     return [
         packet(number, frame, last=last) for frame in range(count) for number in range(1, last + 1)
     ]
 
 
 def numbers(scan: ls.Scan) -> list[int]:
-    """The packets of a scan, by the radius of their first point."""
+    """Return the packet numbers of a scan, from the radius of their first point."""
     return [round(float(distance) / 0.005) for distance in scan.points.range[::125]]
 
 
@@ -100,7 +100,7 @@ def test_frames_of_single_and_dual_return(last: int) -> None:
 
 
 def shuffle(data: list[bytes], seed: int) -> list[bytes]:
-    """Some packets up to five places late."""
+    """Return the packets with some of them up to five positions late."""
     source = random.Random(seed)
     return [
         item
@@ -111,7 +111,7 @@ def shuffle(data: list[bytes], seed: int) -> list[bytes]:
 
 
 def duplicate(data: list[bytes], seed: int) -> list[bytes]:
-    """Some packets twice, at once or a few places later."""
+    """Return the packets with some of them twice, at once or a few positions later."""
     source = random.Random(seed)
     again = [
         (place + source.choice([0.5, 3.5]), item)

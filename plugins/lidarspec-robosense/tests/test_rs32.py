@@ -29,8 +29,11 @@ def msop(
     *,
     lidar_type: int = 2,
 ) -> bytes:
-    """A packet by the offsets of rs_driver: raw azimuths, {(block, slot): (raw distance,
-    intensity)}.
+    """Return a packet by the offsets of rs_driver.
+
+    Args:
+        azimuths: raw values by block.
+        channels: {(block, slot): (raw distance, intensity)}.
     """
     time = struct.pack(">6BHHB", 21, 10, 1, 1, 2, 3, 273, 546, lidar_type)
     body = b"".join(
@@ -51,7 +54,7 @@ def msop(
 
 
 def difop(*, mode: int = 1, vertical: bytes = b"", horizontal: bytes = b"") -> bytes:
-    """Device information with all angles 0 but those given from the first laser on."""
+    """Return device information with angles from the first laser on, otherwise 0."""
     data = bytearray(bytes.fromhex("a5ff005a11115555") + bytes(1238) + b"\x0f\xf0")
     data[8:10], data[300] = struct.pack(">H", 600), mode
     data[468 : 468 + len(vertical)], data[564 : 564 + len(horizontal)] = vertical, horizontal
@@ -178,8 +181,9 @@ def test_every_model_is_identified(sensor_id: str) -> None:
 
 @pytest.mark.slow
 def test_helios_16_and_32_are_distinguished_also_in_dual_return() -> None:
-    """They have one type byte, and 16 lasers with two returns are as quick as 32 with one: what is
-    there twice tells.
+    """Both models have the same type byte.
+
+    16 lasers with two returns have the same rate as 32 with one, but each value occurs twice.
     """
     small, large = ls.sensor("robosense-helios16p"), ls.sensor("robosense-helios32")
     twice, pairs = [], []
@@ -196,7 +200,7 @@ def test_helios_16_and_32_are_distinguished_also_in_dual_return() -> None:
 
 
 def ruby(azimuths: Sequence[int], distances: Sequence[int], *, returns: int) -> bytes:
-    """A packet of three blocks by Table 5-2, with an echo of the first laser in each."""
+    """Return a packet of three blocks by Table 5-2, with an echo of the first laser."""
     head = (
         bytes.fromhex("55aa055a010200") + bytes([returns]) + bytes(23) + bytes([5, 1]) + bytes(47)
     )

@@ -24,7 +24,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 class Client:
-    """What somebody else sees of a node called lidar."""
+    """A client of a node called lidar."""
 
     def __init__(self) -> None:
         self._node = rclpy.create_node("client")
@@ -41,8 +41,9 @@ class Client:
         take: Callable[[bytes], None] | None = None,
         qos: QoSProfile | None = None,
     ) -> list[bytes]:
-        """The messages of a topic, as bytes, as they come, or what takes them; with `qos` in place
-        of `reliable`, if given.
+        """Subscribe to a topic; return the list of received messages, as bytes.
+
+        A callback receives them instead if given. `qos` replaces `reliable`.
         """
         received = self.received[topic] = list[bytes]()
         if qos is None:
@@ -52,14 +53,14 @@ class Client:
         return received
 
     def until(self, condition: Callable[[], object], *, patience: float = PATIENCE) -> None:
-        """Serve what comes until something holds."""
+        """Receive messages until the condition holds."""
         end = time.monotonic() + patience
         while not condition():
             assert time.monotonic() < end, f"it did not come about within {patience} s"
             rclpy.spin_once(self._node, timeout_sec=0.05)
 
     def reliable(self, topic: str) -> list[bool]:
-        """Whether what is published on a topic is reliable, for each who does."""
+        """Return whether each publisher of a topic is reliable."""
         reliable = ReliabilityPolicy.RELIABLE
         return [
             one.qos_profile.reliability == reliable
@@ -67,7 +68,7 @@ class Client:
         ]
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
-        """The response of a service of the node."""
+        """Call a service of the node; return its response."""
         client = self._node.create_client(kind, f"/lidar/{service}")
         self.until(client.service_is_ready)
         future = client.call_async(kind.Request(**fields))
@@ -76,36 +77,36 @@ class Client:
         return future.result()
 
     def change(self, label: str) -> bool:
-        """Whether a transition succeeds."""
+        """Request a transition; return whether it succeeded."""
         request = ChangeState.Request()
         request.transition.label = label
         return bool(self.call(ChangeState, "change_state", transition=request.transition).success)
 
     @property
     def state(self) -> str:
-        """The state of the lifecycle."""
+        """Return the lifecycle state."""
         return str(self.call(GetState, "get_state").current_state.label)
 
     def set(self, name: str, value: Any) -> str:
-        """Why a parameter cannot be set, "" where it is."""
+        """Set a parameter; return the reason if it was refused, otherwise ""."""
         parameter: Parameter = Value(name, value=value).to_parameter_msg()
         (result,) = self.call(SetParameters, "set_parameters", parameters=[parameter]).results
         assert result.successful == (not result.reason)
         return str(result.reason)
 
     def value(self, name: str) -> Any:
-        """The value of a parameter."""
+        """Return the value of a parameter."""
         (value,) = self.call(GetParameters, "get_parameters", names=[name]).values
         return Value.from_parameter_msg(Parameter(name=name, value=value)).value
 
     def describe_parameters(self, *names: str) -> list[Any]:
-        """The descriptors of parameters."""
+        """Return the descriptors of parameters."""
         return list(
             self.call(DescribeParameters, "describe_parameters", names=list(names)).descriptors
         )
 
     def trigger(self, name: str) -> Any:
-        """The response of a command's service."""
+        """Call a command's service; return its response."""
         return self.call(Trigger, f"send/{name}")
 
     def close(self) -> None:
@@ -117,17 +118,17 @@ GRID: dict[str, Any] = {"beams": 720, "angle_min": -3.0, "angle_max": 3.0}
 
 
 def format_parameters(**parameters: Any) -> list[str]:
-    """Parameters in ROS's words."""
+    """Return parameters as ROS arguments."""
     return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
 
 
 def message(data: bytes, kind: str) -> Any:
-    """A message as rosbags reads it."""
+    """Return a message as rosbags reads it."""
     return STORE.deserialize_cdr(data, kind)
 
 
 def end_node(process: subprocess.Popen[str], by: int = signal.SIGINT) -> tuple[int, str]:
-    """The exit code and the complaints of a node that is told to end."""
+    """End a node; return its exit code and error lines."""
     process.send_signal(by)
     _, complaints = process.communicate(timeout=PATIENCE)
     return process.returncode, complaints

@@ -37,10 +37,12 @@ class Run:
     """One simulated run.
 
     Attributes:
-        times: when it was measured, s.
-        device, host, stamps: of each scan, ns.
-        clock: what made the stamps.
-        said: what it said of jumps, each once.
+        times: time of measurement, s.
+        device: device time of each scan, ns.
+        host: arrival time of each scan, ns.
+        stamps: stamp of each scan, ns.
+        clock: the object that made the stamps.
+        said: its messages about jumps, without repetitions.
     """
 
     times: Floats
@@ -52,14 +54,12 @@ class Run:
 
     @property
     def errors(self) -> Floats:
-        """What each stamp is after the truth, s."""
+        """Return the error of each stamp, s."""
         return (self.stamps - BEGAN) * 1e-9 - self.times
 
     @property
     def is_settled(self) -> NDArray[np.bool_]:
-        """Which scans came some time after the beginning, and after the clock was set or started
-        again.
-        """
+        """Return which scans came some time after the last start or change of the clock."""
         return np.array(self.times % SET >= SETTLING)
 
 
@@ -74,13 +74,13 @@ def simulate_stamps(
     each: int = 1,
     stalls: float = 0.01,
 ) -> Run:
-    """The stamps of scans whose clock drifts, is set once, and starts again.
+    """Simulate stamps of scans with a clock that drifts, is set once, and restarts.
 
     Args:
-        step: seconds by which it is set.
+        step: seconds by which the clock is set.
         rate: scans a second.
-        each: packets that are observed for each scan, with its own.
-        stalls: the share of packets that a machine that stands still delays by up to 100 ms more.
+        each: number of observed packets for each scan, including its own.
+        stalls: share of packets that a stalled machine delays by up to 100 ms more.
     """
     random = np.random.default_rng(seed)
     times = np.arange(0, END, 1 / (rate * each)) + random.uniform(0, 0.1)
@@ -106,7 +106,7 @@ CASES = ((10, 1, 50), (10, 1, -1000), (5, 1, 50), (10, 40, 50))
 
 
 def main(runs: int) -> None:
-    """Print the table: of each case the error that 99 of 100 stamps keep, and the worst."""
+    """Print the table: for each case the 99th percentile of the errors, and the worst."""
     heads = [
         f"{rate} scans{f', {rate * each} packets' * (each > 1)} a second, {drift} ppm"
         for rate, each, drift in CASES

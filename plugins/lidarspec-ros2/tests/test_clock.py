@@ -52,8 +52,9 @@ def test_packets_improve_stamps_over_scans(jitter: str) -> None:
 
 
 def make_stamps(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
-    """The stamps of ten seconds of scans that arrived 3 ms after they were measured, less the times
-    of these.
+    """Return the errors of the stamps of ten seconds of scans.
+
+    Each scan arrived 3 ms after its measurement.
     """
     stamps, values = (
         MessageStamps(wall),

@@ -35,7 +35,7 @@ STL = ("sim:ldrobot-stl27l", "-s", "ldrobot-stl27l")
 
 
 def values(status: Any) -> dict[str, str]:
-    """What a diagnostic says, by name."""
+    """Return the values of a diagnostic by name."""
     return {entry.key: entry.value for entry in status.values}
 
 
@@ -362,7 +362,7 @@ def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client
 
 @pytest.fixture
 def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
-    """Starts a simulated sensor on a pty: gives the path of that, and the process."""
+    """Yield a function that simulates a sensor on a pty; it returns path and process."""
     begun = list[subprocess.Popen[str]]()
 
     def started(*words: str) -> tuple[Path, int]:
@@ -465,14 +465,14 @@ def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int)
 
 
 def list_shared_memory(pid: int) -> set[str]:
-    """The files of shared memory that a process has."""
+    """Return the shared memory files of a process."""
     return set(
         re.findall(r"/dev/shm/fast\w+", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8"))
     )
 
 
 def holders(port: Path) -> list[str]:
-    """The processes that have a port open."""
+    """Return the processes that have a port open."""
     found = []
     for pid in filter(str.isdecimal, os.listdir("/proc")):
         with contextlib.suppress(OSError):

@@ -36,7 +36,7 @@ def test_a_node_decodes_packets_of_another_node(run: Any, client: Client) -> Non
     )
 
     def shared() -> set[tuple[float, ...]]:
-        """The scans that both published; on a busy computer packets may be lost between them."""
+        """Return the scans that both nodes published; a busy computer may lose packets."""
         one, other = (
             {tuple(message(data, SCAN).ranges) for data in scans} for scans in (first, again)
         )

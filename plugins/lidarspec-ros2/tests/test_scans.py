@@ -36,7 +36,7 @@ SOAK = float(os.environ.get("LIDARSPEC_SOAK", "600"))
 
 
 def record(packets: list[bytes], path: Path, sensor: str) -> Path:
-    """A recording of what the topic of packets had."""
+    """Write the messages of the topic of packets to a recording; return its path."""
     with Recorder(path, sensor) as recorder:
         for packet in packets:
             recorder.write(raw_chunk(message(packet, RAW)))
@@ -44,7 +44,7 @@ def record(packets: list[bytes], path: Path, sensor: str) -> Path:
 
 
 def make_expected_messages(path: Path, sensor: str, kind: str) -> list[Any]:
-    """The messages that the library makes of the whole scans of a recording."""
+    """Return the library's messages of the complete scans of a recording."""
     planes, found = PlanarScans(GRID["beams"], (GRID["angle_min"], GRID["angle_max"])), []
     with ls.open(path, sensor) as device:
         for scan in device.scans():
@@ -58,7 +58,7 @@ def make_expected_messages(path: Path, sensor: str, kind: str) -> list[Any]:
 
 
 def without_stamp(content: Any) -> dict[str, Any]:
-    """The values of a message, but for its stamp."""
+    """Return the values of a message without its stamp."""
     return {**dataclasses.asdict(content), "header": content.header.frame_id}
 
 
@@ -159,9 +159,7 @@ def test_imu_messages_equal_those_of_the_library(
     [("robosense-m1", True), ("robosense-m1", False), ("ldrobot-stl27l", False)],
 )
 def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
-    """What rclpy makes of a message that it has read, or that its own classes hold, is the same
-    byte for byte.
-    """
+    """Compare with rclpy's bytes of a message that it read, or that its classes hold."""
     spec, planes = ls.sensor(sensor), PlanarScans()
     scan = next(scan for scan in spec.scans(simulate(spec, 2000)) if scan.whole)
     made = [(MESSAGES.cloud(scan, STAMP, every_point=every_point), PointCloud2)]
@@ -199,8 +197,9 @@ def test_imu_messages_follow_rep_145() -> None:
 
 
 def alike(ours: bytes, theirs: bytes) -> bool:
-    """Whether bytes are the same, but for those between the fields, which ROS leaves as they are in
-    memory, and ours are 0.
+    """Return whether messages have equal bytes, ignoring padding.
+
+    ROS does not initialise the padding between fields; ours is 0.
     """
     one, other = (np.frombuffer(data, np.uint8) for data in (ours, theirs))
     return (
@@ -221,14 +220,14 @@ def header(frame_id: str) -> Header:
 def test_no_scan_is_lost_in_ten_minutes(
     run: Callable[..., Any], client: Client, sensor: str, topic: str, message_class: Any, qos: str
 ) -> None:
-    """Of reliable topics; of the others it is printed how many are."""
+    """Only reliable topics must be complete; losses of the others are printed."""
     received = [0]
 
     def note(data: bytes) -> None:
         received[0] += 1
 
     def counted(seconds: float) -> tuple[int, int]:
-        """How many were sent and received after so many seconds, when no more come."""
+        """Return the numbers of sent and received scans, when no more arrive."""
         assert client.change("activate")
         end = time.monotonic() + seconds
         client.until(lambda: time.monotonic() > end, patience=2 * seconds)

@@ -30,7 +30,7 @@ DRIVERS, HOW_TO, NODES = (
 
 @pytest.fixture(autouse=True)
 def _prefix(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This environment is a place of packages, as the page has its reader say."""
+    """Add this environment to the package prefixes, as the page instructs."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", sys.prefix)
 
 
@@ -39,7 +39,7 @@ def share(*parts: str) -> Path:
 
 
 def files() -> dict[str, Any]:
-    """The files of parameters, by name, as YAML."""
+    """Return the parameter files by name, parsed from YAML."""
     (mine,) = [block.text for block in pages.blocks(HOW_TO) if block.title == "mine.yaml"]
     return {
         "mine": yaml.safe_load(mine),
@@ -127,7 +127,7 @@ def test_the_page_of_vendors_parameters_names_topics_parameters_and_services_of_
 
 
 def commands() -> list[list[str]]:
-    """What is typed on the page to start a node, in words."""
+    """Return the arguments of the page's commands that start a node."""
     text = "\n".join(block.text for block in pages.blocks(HOW_TO) if block.language == "console")
     return [line.split() for line in re.findall(r"^\$ lidarspec ros2 (.+)$", text, re.MULTILINE)]
 

@@ -138,7 +138,7 @@ def test_an_uninstalled_sensor_is_reported_by_the_node() -> None:
 def test_the_calculated_size_is_that_of_a_message(
     sensor: str, packets: int, slowest_share: float
 ) -> None:
-    """The VLP-16 is simulated at 10 scans a second and calculated for 5."""
+    """The VLP-16 is simulated at 10 scans a second, and the size is for 5."""
     spec = ls.sensor(sensor)
     data = simulate(spec, packets)
     scans = spec.scans(data if spec.datagrams else b"".join(data))

@@ -33,11 +33,12 @@ SENSORS = {
 
 
 def record(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
-    """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what
-    its clock is behind.
+    """Write a recording of a simulated sensor; return it and the delay of its clock.
+
+    Each packet arrived up to 5 ms late.
 
     Args:
-        jumps: by how many packets its clock is set in the middle.
+        jumps: number of packets by which the clock is set in the middle.
     """
     spec, random, at, number = ls.sensor(sensor), np.random.default_rng(0), 0, SENSORS[sensor][0]
     times = spec.decode(b"".join(simulate(spec, number))).time_ns
@@ -132,7 +133,7 @@ def test_imu_samples_and_points_have_consistent_stamps(
 
 
 def list_diagnostics(client: Client) -> list[str]:
-    """What all diagnostics have said."""
+    """Return the messages of all diagnostics."""
     return [
         entry.value
         for array in client.diagnostics

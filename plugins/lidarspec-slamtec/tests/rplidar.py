@@ -15,13 +15,13 @@ ANSWERS = ("express", "ultra", "dense", "ultra_dense", "hq")
 
 
 def node(degrees: float, metres: float, *, quality: int = 40, start: bool = False) -> bytes:
-    """A node of a scan."""
+    """Return a node of a scan."""
     head = {"quality": quality, "start": int(start), "inverse": int(not start)}
     return A1.build("node", head=head, beam={"angle": degrees}, distance=metres, units=True)
 
 
 def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
-    """A capsule with random content that starts at this angle."""
+    """Return a capsule with random content that starts at this angle."""
     parsed = A1.parse(A1.example(answer, seed=source.randrange(1 << 30)), frame=answer)
     if answer != "hq":
         parsed.start.angle, parsed.start.sync = round(degrees * 64) % (360 * 64), 0
@@ -29,7 +29,7 @@ def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
 
 
 def capsules(answer: str, number: int, *, step: float = 17.0, seed: int = 1) -> bytes:
-    """A stream of such capsules behind their descriptor."""
+    """Return a stream of random capsules after their descriptor."""
     source = random.Random(seed)
     return A1.example(f"{answer}_descriptor") + b"".join(
         capsule(answer, source, index * step) for index in range(number)
@@ -37,7 +37,10 @@ def capsules(answer: str, number: int, *, step: float = 17.0, seed: int = 1) -> 
 
 
 def turns(number: int, *, seed: int = 1) -> bytes:
-    """Nodes of turns of 500, with a few millimetres of noise and one in ten without a return."""
+    """Return nodes of revolutions of 500, with noise and 10 % missing returns.
+
+    The noise is a few millimetres.
+    """
     source, found = random.Random(seed), bytearray()
     for index in range(number):
         distance = (
@@ -52,12 +55,12 @@ def turns(number: int, *, seed: int = 1) -> bytes:
     return bytes(found)
 
 
-def believing(runs: int) -> ls.Sensor:
-    """An A1 that believes nodes in runs of so many, and looks for them from the start."""
+def make_node_sensor(runs: int) -> ls.Sensor:
+    """Return an A1 in node mode that requires `runs` consecutive nodes."""
     frames = {**A1.frames, "node": dataclasses.replace(A1.frames["node"], confirm=runs)}
     return dataclasses.replace(A1, frames=frames).configure(answer="node")
 
 
-def nodes_in(sensor: ls.Sensor, data: bytes) -> list[int]:
-    """The offsets of the nodes that are found."""
+def find_nodes(sensor: ls.Sensor, data: bytes) -> list[int]:
+    """Return the offsets of the nodes that the decoder finds."""
     return [found.offset for found in sensor.split(data) if found.frame == "node"]

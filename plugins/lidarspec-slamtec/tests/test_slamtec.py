@@ -17,7 +17,7 @@ from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.framing.frame_engine import get_codec
 from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
 
-from .rplidar import believing
+from .rplidar import make_node_sensor
 
 FILE = "vectors_serial2d.json"
 A1, A3, S2, C1 = (ls.sensor(f"slamtec-rplidar-{name}") for name in ("a1", "a3", "s2", "c1"))
@@ -78,7 +78,7 @@ def test_a_vector_parses_and_builds(name: str, frame: str) -> None:
 
 
 def physical(frame: str, parsed: Any, path: str) -> Any:
-    """A field of a parsed frame in its unit."""
+    """Return a field of a parsed frame in its unit."""
     info = get_codec(A1.frames[frame]).schema.fields[path]
     for name in path.split("."):
         parsed = parsed[name]
@@ -123,7 +123,7 @@ def test_the_scale_of_ultra_capsules() -> None:
 def test_a_node_by_hand() -> None:
     # bd: quality bd >> 2 = 47, !S 0, S 1.   1681: >> 1 = 2880, / 64 = 45 degrees clockwise.   0fa0
     # = 4000 quarters of a millimetre.
-    cloud = decode(believing(1), bytes.fromhex("bd8116a00f")).points()
+    cloud = decode(make_node_sensor(1), bytes.fromhex("bd8116a00f")).points()
     assert_points(cloud, [(0, (math.sqrt(0.5), -math.sqrt(0.5), 0))])
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == [47]
@@ -175,7 +175,7 @@ def test_ultra_dense_capsules_by_hand() -> None:
 
 
 def cabin(first: int, first_scale: int, second: int, second_scale: int) -> dict[str, int]:
-    """A cabin of an ultra-dense capsule out of two codes of 18 bits and their scales."""
+    """Return a cabin of an ultra-dense capsule from two 18-bit codes and their scales."""
     return {
         "first_low": first & 0x3FFF,
         "first_high": first >> 14,

@@ -14,7 +14,7 @@ from tests.engine.oracle import Oracle
 from tests.engine.streams import damage
 from tests.evidence import clockwise, decode
 
-from .rplidar import A1, ANSWERS, believing, capsule, capsules, nodes_in, turns
+from .rplidar import A1, ANSWERS, capsule, capsules, find_nodes, make_node_sensor, turns
 
 CONFIRM = A1.frames["node"].confirm
 
@@ -82,22 +82,22 @@ def test_a_conversation_with_several_answers_equals_the_oracle() -> None:
 @pytest.mark.slow
 def test_false_nodes_are_as_rare_as_documented() -> None:
     noise = random.Random(8).randbytes(1 << 17)
-    alone = nodes_in(believing(1), noise)
+    alone = find_nodes(make_node_sensor(1), noise)
     assert 0.95 < len(alone) / 13_525 < 1.05  # 865 530 in 8 MiB
-    assert not nodes_in(A1.configure(answer="node"), noise)
+    assert not find_nodes(A1.configure(answer="node"), noise)
     for answer in ANSWERS:
         frames = capsules(answer, 100)[7:]
-        assert not nodes_in(A1.configure(answer="node"), frames)
-        assert len(nodes_in(believing(1), frames)) > 100
+        assert not find_nodes(A1.configure(answer="node"), frames)
+        assert len(find_nodes(make_node_sensor(1), frames)) > 100
 
 
 def test_joining_in_the_middle_of_a_node_finds_the_true_ones() -> None:
     data, wrong = turns(3000), {1: 0, CONFIRM: 0}
     for runs in wrong:
-        sensor = believing(runs)
+        sensor = make_node_sensor(runs)
         for spot in range(1, len(data) - 400, 211):
             wrong[runs] += sum(
-                (offset + spot) % 5 != 0 for offset in nodes_in(sensor, data[spot : spot + 400])
+                (offset + spot) % 5 != 0 for offset in find_nodes(sensor, data[spot : spot + 400])
             )
     assert wrong[1] > 10
     assert wrong[CONFIRM] == 0
@@ -105,8 +105,8 @@ def test_joining_in_the_middle_of_a_node_finds_the_true_ones() -> None:
 
 def test_a_short_run_of_nodes_is_rejected() -> None:
     sensor, data = A1.configure(answer="node"), turns(CONFIRM)
-    assert len(nodes_in(sensor, data)) == CONFIRM
-    assert not nodes_in(sensor, data[5:])
+    assert len(find_nodes(sensor, data)) == CONFIRM
+    assert not find_nodes(sensor, data[5:])
 
 
 @pytest.mark.parametrize("answer", ["node", "express", "dense", "hq"])
@@ -125,9 +125,9 @@ def test_scans_begin_where_the_azimuth_passes_zero(answer: str) -> None:
 
 
 def test_the_start_bit_marks_scan_starts() -> None:
-    packets = believing(1).decode(turns(1600))
+    packets = make_node_sensor(1).decode(turns(1600))
     flags = np.flatnonzero(packets["head.start"])
-    lengths = [len(scan) for scan in believing(1).scans(turns(1600))]
+    lengths = [len(scan) for scan in make_node_sensor(1).scans(turns(1600))]
     assert np.cumsum(lengths)[:-1].tolist() == flags[1:].tolist()
 
 

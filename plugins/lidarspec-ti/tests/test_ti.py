@@ -24,7 +24,7 @@ def points(*those: tuple[float, ...]) -> tuple[int, bytes]:
 
 
 def frame(number: int, *parts: tuple[int, bytes], platform: int = 0xA6843) -> bytes:
-    """A frame as TI's table of the header has it, its filling not of zeros."""
+    """Return a frame according to TI's header table, with padding that is not 0."""
     body = b"".join(struct.pack("<II", kind, len(content)) + content for kind, content in parts)
     size = -(-(40 + len(body)) // 32) * 32
     header = struct.pack(

@@ -34,7 +34,7 @@ def test_both_protocols_on_one_line_are_frames() -> None:
 
 
 def test_a_binary_message_within_a_sentence_is_found() -> None:
-    """A receiver that is switched to UBX may stop a sentence; the next one starts anew."""
+    """A receiver that is switched to UBX may interrupt a sentence."""
     pvt, rmc = simulate(GNSS, 6)[1], OTHER_SENTENCES[0]
     found = GNSS.split(rmc[:20] + pvt + rmc)
     assert [item.frame for item in found] == ["nav_pvt", "nmea"]

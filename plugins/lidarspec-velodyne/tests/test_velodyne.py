@@ -42,8 +42,11 @@ def packet(
     product: int = 0x22,
     flags: Sequence[bytes] = ONE_BANK,
 ) -> bytes:
-    """A data packet: azimuths in hundredths of a degree, and (distance in steps, intensity) by
-    block and slot.
+    """Return a data packet.
+
+    Args:
+        azimuths: hundredths of a degree, by block.
+        cells: {(block, slot): (distance in steps, intensity)}.
     """
     found = b""
     for block, (flag, azimuth) in enumerate(zip(flags, azimuths, strict=True)):
@@ -55,14 +58,18 @@ def packet(
 
 
 def steps(start: int, step: int = 40, *, each: int = 1) -> list[int]:
-    """The azimuths of twelve blocks, in hundredths of a degree; `each`: how many share one."""
+    """Return the azimuths of twelve blocks in hundredths of a degree.
+
+    Args:
+        each: number of consecutive blocks with the same azimuth.
+    """
     return [(start + step * (block // each)) % 36000 for block in range(12)]
 
 
 def make_packet(
     start: int, step: int = 40, *, each: int = 1, mode: int = STRONGEST, time_us: int = 0
 ) -> bytes:
-    """A packet in which every distance is 10 m."""
+    """Return a packet in which every distance is 10 m."""
     cells = {(block, slot): (5000, 7) for block in range(12) for slot in range(32)}
     return packet(steps(start, step, each=each), cells, mode=mode, time_us=time_us)
 
@@ -319,7 +326,7 @@ def test_points_are_not_interpolated_across_a_masked_sector() -> None:
 
 @pytest.mark.parametrize("jump_deg", [20, 116, 200, 350])
 def test_a_single_block_after_a_masked_sector_uses_the_rotor_speed(jump_deg: int) -> None:
-    """The last block of the packet is alone: the step to it is no turn, and none follows it."""
+    """The last block of the packet follows a gap, and no block follows it."""
     starts = steps(10_000)
     starts[-1] = (starts[-2] + 100 * jump_deg) % 36_000
     cells = {(block, slot): (500, 1) for block in range(12) for slot in range(32)}
@@ -363,7 +370,7 @@ def test_azimuths_up_to_a_whole_turn_are_valid() -> None:
 
 
 def position(nmea: bytes, *, pps: int = 2, time_us: int = 123_456_789) -> bytes:
-    """A position packet with a reading of its own in each field."""
+    """Return a position packet with a different value in each field."""
     inertial = struct.pack("<12H", *range(0x101, 0x10D))
     state = struct.pack("<BBBhIBBIBBBB", 41, 38, 35, -3, 600, 4, 2, time_us, pps, 1, 99, 22)
     return bytes(14) + inertial + bytes(149) + state + nmea.ljust(306, b"\0")
@@ -441,9 +448,7 @@ def test_the_simulated_sensor_turns_ten_times_a_second(
 
 
 def test_the_hour_is_that_of_the_position_packets() -> None:
-    """13:59:59 on 2023-07-05, told half a second into the next hour, and before the end of that
-    one.
-    """
+    """Data at 13:59:59 on 2023-07-05; the hour arrives 0.5 s later or earlier."""
     sentence = b"$GPRMC,135959,A,4807.038,N,01131.000,E,022.4,084.4,050723,003.1,W*00\r\n"
     ten = 1_688_558_400  # 12:00:00
     for told, read, seconds in (
@@ -504,8 +509,9 @@ def test_the_hour_runs_on_over_its_end_and_between_batches() -> None:
 
 
 def test_hdl64e_points_by_hand() -> None:
-    """Laser 1 of the example unit: E -8.769, 7.156 degrees to the left, 0.195 m up, 26 mm aside,
-    1.52 m farther.
+    """Laser 1 of the example unit has these corrections.
+
+    Elevation -8.769 degrees, 7.156 degrees to the left, 0.195 m up, 26 mm aside, 1.52 m further.
     """
     sensor = ls.sensor("velodyne-hdl64e-s2")
     flags = [b"\xff\xee", b"\xff\xdd"] * 6
@@ -537,8 +543,10 @@ def test_dual_return_of_an_hdl64e_has_four_blocks_of_one_azimuth() -> None:
 
 
 def test_an_hdl64e_has_the_corrections_of_its_file(tmp_path: Path) -> None:
-    """Laser 34 (id 33): 3.3 degrees to the left, -6.6 up, 0.66 m farther, 9.9 cm up and 1.65 cm to
-    the left across its beam.
+    """Laser 34 (id 33) has these corrections.
+
+    3.3 degrees to the left, elevation -6.6 degrees, 0.66 m further, 9.9 cm up and 1.65 cm to the
+    left across its beam.
     """
     sensor = ls.sensor("velodyne-hdl64e-s2").configure(
         calibration=write_velodyne_xml(tmp_path / "db.xml")

@@ -35,7 +35,7 @@ def _payloads(path: Path) -> tuple[bytes, ...]:
 
 
 def payloads(name: str) -> tuple[bytes, ...]:
-    """The datagrams of a capture; the test is skipped where it is absent."""
+    """Return the datagrams of a capture; skip the test if it is missing."""
     return _payloads(capture(name))
 
 
@@ -141,7 +141,7 @@ def test_a_lost_packet_moves_no_point_of_the_others() -> None:
 
 
 def read_published_points() -> NDArray[Any]:
-    """The points that nebula published for one turn of the dual return capture."""
+    """Return the points that nebula published for one scan of the dual return capture."""
     _, _, body = (
         capture("velodyne/vlp16_dual/1673400472138016708.pcd")
         .read_bytes()
