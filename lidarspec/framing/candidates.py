@@ -246,7 +246,7 @@ class ConstantFilter:
 
 @dataclass(frozen=True, eq=False)
 class LiveCandidates:
-    """The candidates of a piece that may be accepted while the active types do not change.
+    """The candidates of a piece that may be accepted under the same active types.
 
     Attributes:
         frames: valid and incomplete candidates by offset, at most one per offset, of the first type

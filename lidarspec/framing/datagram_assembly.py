@@ -119,7 +119,7 @@ class FragmentAssembler:
         at: NDArray[np.int64],
         base: int,
     ) -> JoinedMessages:
-        """Return the messages that datagrams complete, and the datagrams that are not fragments.
+        """Return completed messages, and the datagrams that are not fragments.
 
         Args:
             buffer, starts, sizes: the datagrams.

@@ -281,7 +281,7 @@ def _remove_field(values: Any, path: str) -> None:
 def _fill_headers(
     rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]
 ) -> NDArray[np.uint8]:
-    """Return frames with the header values of their layout, constants and checksums set."""
+    """Return frames with header values, constants and checksums set."""
     for path, value in chosen.items():
         leaf = layout.column(path)
         assert isinstance(leaf, Leaf)
@@ -388,7 +388,7 @@ def _store_drawn(
     drawn: Drawn,
     source: random.Random,
 ) -> None:
-    """Write drawn values into rows of frames, except for fields that determine the layout."""
+    """Write drawn values into rows, except for fields that determine the layout."""
     for path, draw in drawn.items():
         if path in layout.leaves and path not in chosen:
             leaf = layout.leaves[path]
@@ -399,7 +399,7 @@ def _store_drawn(
 
 
 def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return functions that return the raw values of a sweep for header fields, by path."""
+    """Return functions that return a sweep's raw values for header fields, by path."""
     fields = engine.schema.fields
     draws: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():

@@ -55,14 +55,15 @@ from lidarspec.spec.tree import FieldInfo
 #: the largest number of allowed values of a few bits that are compared one after another.
 ALLOWED = 2
 
-#: by what became of the parts of a frame: `parts.FOUND`, `CUT_OFF`, `LENGTH`, `CONSTANT`, `FAILED`.
+#: the status of a frame by the result for its parts: `parts.FOUND`, `CUT_OFF`, `LENGTH`,
+#: `CONSTANT`, `FAILED`.
 OF_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
 class CandidateChecker:
-    """The checks of candidates of one layout, with first constants (`prefix`) that match.
+    """The checks of candidates of one layout; their `prefix` is known to match.
 
     Args:
         met: the conditions of the struct on values.
@@ -232,7 +233,7 @@ def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) ->
 
 
 class StructConditions:
-    """The conditions of one frame type: of its plausibility function and of its struct.
+    """The conditions of a frame type, from its plausibility function and its struct.
 
     Args:
         plausible: as in `Frame`.
@@ -397,7 +398,7 @@ class LookupCondition:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether the condition holds in each frame, (n,), for arrays of own lengths.
+        """Return whether the condition holds in each frame of its own length, (n,).
 
         Args:
             lengths: the length of the outermost array in each frame, (n,), at most its room in the

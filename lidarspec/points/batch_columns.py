@@ -233,7 +233,7 @@ class BatchColumns(ColumnSource):
         return column
 
     def _times(self, share: GroupPoints, first: int, last: int | None) -> NDArray[np.float64]:
-        """Return the times of the points of some packets, (packets, *shape), s from `base`."""
+        """Return the times of the points of some packets, (packets, *shape), from `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(

@@ -203,7 +203,7 @@ def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -
         for name, column in alone.columns.items():
             np.testing.assert_array_equal(cloud.columns[name], column)
     monkeypatch.setenv("LIDARSPEC_THREADS", "many")
-    with pytest.raises(UsageError, match="LIDARSPEC_THREADS is a number"):
+    with pytest.raises(UsageError, match="LIDARSPEC_THREADS must be a number"):
         len(sensor.decode(rows, backend="jit").points().x)
 
 

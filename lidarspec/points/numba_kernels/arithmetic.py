@@ -137,7 +137,7 @@ def multiply_add(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """Return two intrinsics that load a float as float64, little-endian and big-endian.
+    """Return intrinsics that load a float as float64: little-endian, big-endian.
 
     They load from an index of bytes.
 

@@ -39,7 +39,7 @@ _SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 class StoredKernel:
-    """The compiled code of one kernel on disk, in the form that a Numba dispatcher expects.
+    """The stored code of one kernel, in the form that a Numba dispatcher expects.
 
     Args:
         name: the name of the kernel, derived from all that its code depends on, except for the
@@ -96,7 +96,7 @@ def is_stored(name: str) -> bool:
 
 
 def cache_folder() -> Path:
-    """Return the folder of kernels: LIDARSPEC_CACHE, or the system's cache folder of the user."""
+    """Return the folder of kernels: LIDARSPEC_CACHE, or the user's cache folder."""
     named = os.environ.get(CACHE)
     if named:
         return Path(named)

@@ -705,5 +705,5 @@ def _write_loops(writer: KernelWriter, width: str) -> list[str]:
 
 
 def _write_indices(writer: KernelWriter, width: str) -> list[str]:
-    """Return the lines that compute the index of a point in scratch arrays and in columns."""
+    """Return the lines that compute a point's index in scratch arrays and columns."""
     return [f"k = (p - begin) * {width} + {writer.index_text(writer.shape)}", "o = start + k"]

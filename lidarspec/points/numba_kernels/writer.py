@@ -334,7 +334,7 @@ class KernelWriter:
         )
 
     def format_index(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
-        """Return the text of the index of the current element in an array with these strides."""
+        """Return the text of the current element's index in an array with these strides."""
         parts = [
             f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
             for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))
