@@ -37,7 +37,7 @@ from lidarspec.framing.results import (
 from lidarspec.spec import tree
 from lidarspec.spec.description import Frame
 from lidarspec.spec.syntax import MismatchError
-from lidarspec.spec.wire_forms import next_places
+from lidarspec.spec.wire_forms import find_next_offsets
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class _Text:
             ends: the offset at which the bytes of each candidate end.
         """
         terminators = np.flatnonzero(buffer == self.terminator)
-        places = next_places(terminators, offsets + self.begin, len(buffer))
+        places = find_next_offsets(terminators, offsets + self.begin, len(buffer))
         status = np.where(places < ends, VALID, SHORT).astype(np.uint8)
         for distance, byte in self.following.items():
             has_byte = np.flatnonzero(places + distance < ends)

@@ -1,12 +1,12 @@
-"""Wire forms: frames whose fields have no fixed places on the wire, as text or escaped bytes.
+"""Wire forms: frames without fixed field offsets, as text or with escaped bytes.
 
-A form works on one frame at a time: `find_end` finds where a frame ends, `decode` turns its bytes
-into those of the struct, and `encode` turns these into the bytes that are sent. Everything else
-works on the bytes of the struct, as it does for binary frames.
+A form works on one frame at a time. `find_end` finds the end of a frame, `decode` converts its
+bytes to the bytes of the struct, and `encode` converts these to the bytes to send. All other
+packages use the bytes of the struct, as for binary frames.
 
-Which field comes next in a text often depends on fields before it, such as counts. So `decode` asks
-for the runs of fields that follow the bytes decoded so far, until there are none left. A run is one
-text, or consecutive numbers, whose digits NumPy converts at once.
+In a text, the next field often depends on earlier fields, for example counts. So `decode`
+repeatedly requests the runs of fields that follow the bytes decoded so far, until none are left. A
+run is one text, or consecutive numbers, whose digits NumPy converts at once.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from lidarspec.spec.checksums import Checksum, Xor
 
 Offsets = NDArray[np.intp]
 Values = NDArray[np.uint64]
-#: The bytes of a text, None for each that varies.
+#: The bytes of a text; None for each byte that varies.
 Characters = Sequence[int | None]
 
-#: Results of `WireForm.find_end`: the end is not among the bytes; the bytes are no frame.
+#: Results of `WireForm.find_end`: the end has not arrived; the bytes do not begin a frame.
 NO_END = 0
 NO_FRAME = -1
-#: Most digits of a number in a token.
+#: Maximum digits of a number in a token.
 MAX_DIGITS = 16
-#: Most characters of a decimal fraction, and its form.
+#: Maximum characters of a decimal fraction, and its pattern.
 MAX_DECIMAL_CHARACTERS = 40
 _DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)")
-#: Bytes of a float -> the number of decimal digits that it always keeps.
+#: Size of a float in bytes -> the number of decimal digits that it always keeps.
 EXACT_DIGITS = {2: 3, 4: 6, 8: 15}
-#: The largest value of each number of bytes.
+#: The largest unsigned value by size in bytes.
 LARGEST_OF_BYTES = np.array([256**size - 1 for size in range(9)], np.uint64)
 #: Bits of a character of `SixBits`.
 CHARACTER_BITS = 6
@@ -74,8 +74,8 @@ class NumberRun:
     Attributes:
         sizes: the bytes of each number in the struct, (n,).
         kinds: "u", "i" or "f" for each, as in `numpy.dtype.kind`, (n,).
-        is_little: whether the bytes of each are in little-endian order, (n,).
-        paths: the path of the field of each, n.
+        is_little: whether each number is little-endian, (n,).
+        paths: the path of the field of each number, n.
     """
 
     sizes: Offsets
@@ -99,7 +99,7 @@ class NumberRun:
 
     @cached_property
     def owners(self) -> Offsets:
-        """The index of the number that each byte of the run belongs to, (bytes,)."""
+        """The index of the number that contains each byte of the run, (bytes,)."""
         return np.arange(len(self)).repeat(self.sizes)
 
     @cached_property
@@ -109,12 +109,12 @@ class NumberRun:
 
     @cached_property
     def largest(self) -> Values:
-        """The largest value of each as an unsigned number, which is all of its bits, (n,)."""
+        """The largest value of each as an unsigned number, with all its bits set, (n,)."""
         return LARGEST_OF_BYTES[self.sizes]
 
     @cached_property
     def highest(self) -> Values:
-        """The largest value of each with a sign; 0 for floats, (n,)."""
+        """The largest value of each as a signed number; 0 for floats, (n,)."""
         highest = np.where(self.kinds == "i", self.largest >> np.uint64(1), self.largest)
         return np.where(self.kinds == "f", np.uint64(0), highest)
 
@@ -135,7 +135,10 @@ class NumberRun:
         return 8 * self.owners + 7 - significance
 
     def to_bytes(self, values: Values) -> bytes:
-        """Return the first numbers of the run as bytes of the struct; higher bits are lost."""
+        """Return the first numbers of the run as bytes of the struct.
+
+        Bits that do not fit are lost.
+        """
         size = self.ends.item(len(values) - 1) if len(values) else 0
         words = values.astype(">u8").view(np.uint8)
         return words[self._word_offsets[:size]].tobytes()
@@ -148,20 +151,22 @@ class NumberRun:
 
 
 Run = TextRun | NumberRun
-#: Returns the runs of fields that follow the first bytes of a struct, as far as these determine
+#: them; none where the struct is complete, or no frame can begin so.
+#: Returns the runs of fields that follow the first bytes of a struct, as far as these bytes
+#: determine them. It is empty if the struct is complete, or if no frame begins with these bytes.
 #: them; none where the struct is complete, or no frame can begin so.
 NextRuns = Callable[[bytes], Sequence[Run]]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The first reason why bytes are no frame of a form.
+    """The first fault of bytes that are not a frame of a form.
 
     Attributes:
         offset: in the frame.
-        reason: "" for a field that cannot be read.
+        reason: the fault as text; "" for a field that cannot be decoded.
         is_checksum: whether a checksum of the form itself is wrong.
-        path: of the field.
+        path: the path of the field.
         expected, got: values for the error.
     """
 
@@ -175,12 +180,12 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """The bytes of a struct that a frame stands for, as far as it could be decoded.
+    """The bytes of the struct of a frame, as far as it could be decoded.
 
     Attributes:
         struct: the bytes.
-        spans: for successive fields the offset of each in the frame, and its bytes in the struct.
-        end: offset of the first byte of the frame that belongs to no field.
+        spans: for successive fields, the offset of each in the frame, and its size in the struct.
+        end: offset of the first byte of the frame after the last field.
         problem: None if the whole frame was decoded.
     """
 
@@ -191,12 +196,12 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the frame of the field of each byte of the struct, and finally `end`."""
+        """The offset in the frame of the field of each byte of the struct, then `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return where in the frame the field of a byte of the struct begins."""
+        """Return the offset in the frame of the field that contains a byte of the struct."""
         return self.offsets[min(place, len(self.struct))]
 
 
@@ -210,27 +215,30 @@ class WireForm(Protocol):
     is_text: ClassVar[bool]
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of frames whose structs begin with these texts, as far as they are
-        always at the same offsets.
+        """Return the first bytes of frames with structs that begin with these texts.
+
+        They end before the first byte without a fixed offset; bytes that vary are None.
         """
 
     def find_end(self, data: bytes) -> int:
-        """Return the size of the frame that begins with the first byte, `NO_END` if its end is not
-        among these bytes, and `NO_FRAME` if no frame begins here, whatever follows.
+        """Return the size of the frame that begins with the first byte.
+
+        Returns `NO_END` if more bytes are needed to find its end, and `NO_FRAME` if no frame begins
+        with these bytes.
         """
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
-        """Decode one frame, or what there is of it; see `decode_runs`."""
+        """Decode one frame, or as much of it as is available; see `decode_runs`."""
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
         """Return the frame for the bytes of a struct, which consists of these runs.
 
-        Values that the form cannot express may become any bytes: frames are decoded again before
-        they are sent.
+        Values that the form cannot express may become any bytes, because the caller decodes the
+        frame again to verify it.
         """
 
     def largest(self, size: int) -> int:
-        """Return the largest number that can be written for a field of so many bytes."""
+        """Return the largest number that can be encoded for a field of this size in bytes."""
 
 
 @runtime_checkable
@@ -238,30 +246,30 @@ class BulkEnds(Protocol):
     """A wire form that finds the ends of many candidates at once, for speed."""
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the size of the frame at each of many offsets, `NO_END` or `NO_FRAME`, (n,).
+        """Return the frame size at each offset, `NO_END` or `NO_FRAME`, (n,).
 
-        This is `find_end` in bulk, and may be `NO_FRAME` for bytes with an end, too.
+        The results equal those of `find_end`, but `NO_FRAME` is allowed for any invalid frame.
 
         Args:
             offsets: ascending.
-            stops: where the bytes of each end that may belong to it.
+            stops: the offset after the last available byte of each candidate.
         """
 
 
 @runtime_checkable
 class DrawsValues(Protocol):
-    """A wire form that cannot write every value of a number, even if it is small enough."""
+    """A wire form that cannot encode some values of a number that are small enough."""
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be written, (n,), for random bits, (n,)."""
+        """Return values that can be encoded, (n,), from random bits, (n,)."""
 
 
 def find_ends(
     form: WireForm, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets
 ) -> Offsets:
-    """Return the size of the frame at each of many offsets, as `BulkEnds.find_ends` does.
+    """Return the frame size at each offset, as `BulkEnds.find_ends` does.
 
-    Forms that cannot do this in bulk are asked for one candidate at a time.
+    For a form without `find_ends`, `find_end` is called for each candidate.
     """
     if isinstance(form, BulkEnds):
         return form.find_ends(buffer, offsets, stops)
@@ -275,11 +283,13 @@ class RunReader(Protocol):
 
     @property
     def position(self) -> int:
-        """Offset of the next field in the frame; that of its end if there is none."""
+        """The offset of the next field in the frame; after the last field, of its end."""
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
-        """Return the bytes in the struct and the offsets of the fields of a run, up to the first
-        that cannot be read.
+        """Read the fields of a run, up to the first invalid field.
+
+        Returns:
+            The bytes of the struct, and the offset of each field in the frame.
         """
 
 
@@ -287,7 +297,8 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: of the frame, the last byte of which marks its end; None if it has no end.
+        size: the size of the frame, which ends with an end mark of one byte; None if the end is
+            missing.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -307,14 +318,19 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     return Decoded(struct, spans, end, Problem(position))
 
 
-def next_places(places: Offsets, offsets: Offsets, none: int) -> Offsets:
-    """Return the first of some ascending places at or behind each offset, or `none`, (n,)."""
+def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
+    """Return the first value that is not below each offset, (n,).
+
+    Args:
+        places: ascending.
+        none: the result if all values are below the offset.
+    """
     return np.append(places, none)[places.searchsorted(offsets)]
 
 
 @lru_cache(maxsize=64)
-def _digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit of a base, and whether it is one, (256,)."""
+def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
+    """Return the value of each character as a digit, and whether it is a digit, (256,)."""
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
@@ -325,23 +341,26 @@ def _digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 
 
 @lru_cache(maxsize=64)
-def _digit_weights(base: int) -> Values:
-    """Return the weight of a digit by its distance from the end of its token, 0 beyond a number."""
+def _make_digit_weights(base: int) -> Values:
+    """Return the weight of a digit by its distance from the end of its token.
+
+    It is 0 outside the digits of a number.
+    """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
 
 @dataclass(frozen=True)
 class HexCheck:
-    """A checksum in hexadecimal digits behind a mark, as ``*5B`` of NMEA 0183.
+    """A checksum in hexadecimal digits after a mark, such as ``*5B`` of NMEA 0183.
 
     It covers the bytes between the first byte of the frame and the mark.
 
     Args:
-        algorithm: whose width gives the number of digits.
+        algorithm: the checksum algorithm; its width gives the number of digits.
         mark: one byte.
 
     Raises:
-        SpecError: for a mark that is not one byte.
+        SpecError: if the mark is not one byte.
     """
 
     algorithm: Checksum = field(default_factory=Xor)
@@ -357,38 +376,40 @@ class HexCheck:
         return 1 + -(-self.algorithm.width // 4)
 
     def write(self, content: bytes) -> bytes:
-        """Return the mark and the digits for some content."""
+        """Return the mark and the digits of the checksum of some content."""
         return self.mark + b"%0*X" % (self.size - 1, self.algorithm(content))
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """Text in tokens: numbers in digits, each followed by a separator or the end; bytes of a struct
-    as their characters.
+    """Text in tokens, each followed by a separator or the end.
 
-    A number may have zeros in front, small letters, or a sign, which makes it decimal whatever the
-    base; signed fields without a sign are the digits of their bits. A float is the digits of its
-    bits in base 16. In base 10 it is a decimal fraction, and nan if the token is empty. A field of
-    bytes is a token of exactly as many characters, which may contain the separator.
+    A number is a token of digits. It may have leading zeros, lower-case digits, or a sign, which
+    makes it decimal in any base; signed fields without a sign have the digits of their bits. A
+    float has the digits of its bits in base 16. In base 10 it is a decimal fraction, and nan if the
+    token is empty. A field of bytes is a token of exactly as many characters, which may contain the
+    separator.
 
     Args:
-        start, sep: one byte each, that the frame begins with, and that separates tokens.
+        start: the byte that a frame begins with.
+        sep: the byte between tokens.
         end: the bytes that the frame ends with.
-        base: of the digits, 10 or 16.
-        width: digits that are written at least; others are read as well.
+        base: the base of the digits, 10 or 16.
+        width: the minimum number of digits to write; when reading, any number is accepted.
         check: the checksum before the end; None if there is none.
-        formats: path of a number -> the digits that are written at least, as manuals show them:
-            "hhmmss.ss" is six digits, and two behind the point.
+        formats: path of a number -> its minimum digits, as manuals show them: "hhmmss.ss" is six
+            digits, and two after the point.
         joined: the number of fields of bytes that form the first token.
-        padded: whether a token of bytes may be shorter than its field, which zero bytes then fill.
+        padded: whether a token of bytes may be shorter than its field, which is then filled with
+            zero bytes.
         optional: the number of fields of bytes at the end whose tokens may be missing; requires
             `padded`.
-        rest: whether the field of bytes after the first token is all the rest of the frame,
-            separators included; requires `padded`.
+        rest: whether the field of bytes after the first token is the whole rest of the frame,
+            including separators; requires `padded`.
 
     Raises:
-        SpecError: for a start or separator that is not one byte, or that begins the end, and for
-            other bases.
+        SpecError: for a start or separator that is not one byte, or that the end begins with, and
+            for other bases.
     """
 
     is_text: ClassVar[bool] = True
@@ -423,7 +444,7 @@ class Tokens:
         tokens = [token for token in (first, *texts[self.joined :]) if len(token)]
         for number, token in enumerate(tokens):
             if self.padded and number > 0 and None in token:
-                return characters  # it may be shorter
+                return characters  # the token may be shorter, so later offsets are not fixed
             characters += [*token, self.sep[0]]
         return characters[: -1 if tokens else None]
 
@@ -441,8 +462,8 @@ class Tokens:
         for distance, byte in enumerate(self.end[1:], 1):
             is_end[:-distance] &= buffer[distance:] == byte
             is_end[-distance:] = False
-        ends = next_places(np.flatnonzero(is_end), offsets + 1, none)
-        starts = next_places(np.flatnonzero(buffer == self.start[0]), offsets + 1, none)
+        ends = find_next_offsets(np.flatnonzero(is_end), offsets + 1, none)
+        starts = find_next_offsets(np.flatnonzero(buffer == self.start[0]), offsets + 1, none)
         sizes = np.where(ends + len(self.end) <= stops, ends + len(self.end) - offsets, NO_END)
         sizes[starts < np.minimum(ends, stops)] = NO_FRAME
         return sizes
@@ -457,8 +478,9 @@ class Tokens:
         return replace(decoded, problem=problem)
 
     def _find_stop(self, data: bytes) -> tuple[int | None, Problem | None]:
-        """Return the offset after the last token, None if that is missing, and what is wrong with
-        the checksum.
+        """Return the offset after the last token, and the fault of the checksum.
+
+        The offset is None if the end is missing, the fault is None if the checksum is correct.
         """
         if not data.endswith(self.end):
             return None, None
@@ -515,7 +537,7 @@ class Tokens:
         return int(256**size - 1)
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values for random bits that can be written: fractions of few digits."""
+        """Return values that can be encoded: fractions with few digits instead of random bits."""
         if self.base == 16:
             return values
         drawn = values.copy()
@@ -529,20 +551,21 @@ class Tokens:
 
 
 def _float_of_bits(bits: np.uint64, size: int) -> np.floating[Any]:
-    """Return the float of some bytes that has these bits."""
+    """Return the float of `size` bytes that has these bits."""
     return np.array([bits]).astype(f"u{size}").view(f"f{size}")[0]  # type: ignore[no-any-return]
 
 
 def _bits_of_float(value: float, size: int) -> int:
-    """Return the bits of a number as a float of some bytes."""
+    """Return the bits of a number as a float of `size` bytes."""
     with np.errstate(over="ignore"):
         return int(np.array(value).astype(f"f{size}").view(f"u{size}"))
 
 
 def _write_decimal(value: np.floating[Any], form: str) -> bytes:
-    """Return a float as a decimal fraction: all its digits, and at least those of a format.
+    """Return a float as a decimal fraction.
 
-    A missing value (nan) is an empty text.
+    It has all digits of the float, and at least the digits of a format. It is empty for nan, a
+    missing value.
     """
     if not np.isfinite(value):
         return b""
@@ -556,7 +579,7 @@ def _write_decimal(value: np.floating[Any], form: str) -> bytes:
 
 
 class _TokenReader:
-    """Reads the tokens of one frame; all numbers are converted when it is made.
+    """Reads the tokens of one frame; all numbers are converted in advance.
 
     Args:
         data: the frame, up to the end of the last token.
@@ -570,12 +593,12 @@ class _TokenReader:
         self._text_count = 0
         self._optional_left = form.optional
         self.position = 1
-        # One more separator, for the end behind the last token.
+        # Add a separator for the end after the last token.
         characters = np.frombuffer(data + form.sep, np.uint8)
         is_mark = characters == form.sep[0]
         is_mark[:1] = False
         is_mark[-1] = stop is not None
-        #: Offset of the separator or the end behind each token.
+        #: Offset of the separator or the end after each token.
         self._marks = is_mark.nonzero()[0]
         self._begins = np.append(1, self._marks + 1)[: len(self._marks)]
         self._magnitudes = np.zeros(len(self._marks), np.uint64)
@@ -588,11 +611,11 @@ class _TokenReader:
 
     def _convert_numbers(self, characters: NDArray[np.uint8]) -> None:
         """Convert all tokens that are digits without a sign."""
-        values, is_digit = _digit_values(self._form.base)
+        values, is_digit = _make_digit_values(self._form.base)
         lengths = self._marks - self._begins
         body = characters[1 : self._marks[-1] + 1]
         distances = self._marks.repeat(lengths + 1) - np.arange(1, len(body) + 1)
-        weights = _digit_weights(self._form.base).take(distances, mode="clip")
+        weights = _make_digit_weights(self._form.base).take(distances, mode="clip")
         self._magnitudes = np.add.reduceat(values[body] * weights, self._begins - 1)
         is_wrong = ~(is_digit[body] | (distances == 0))
         has_wrong = np.logical_or.reduceat(is_wrong, self._begins - 1)
@@ -627,7 +650,7 @@ class _TokenReader:
         return self._data[begin:end], np.array([begin])
 
     def _read_joined(self, run: TextRun) -> tuple[bytes, Offsets]:
-        """Read a field that the next one follows without a separator."""
+        """Read a field that is followed by the next field without a separator."""
         begin = self.position
         text = self._data[begin : begin + run.size]
         if len(text) < run.size or self._form.sep in text:
@@ -677,7 +700,10 @@ class _TokenReader:
         return run.to_bytes(values[:count]), self._begins[first : first + count]
 
     def _read_decimal(self, token: int, size: int) -> int | None:
-        """Return the bits of a decimal fraction as a float, nan if empty; None if it is neither."""
+        """Return a decimal fraction as the bits of a float.
+
+        An empty token is nan. Returns None for an invalid token.
+        """
         text = self._data[self._begins[token] : self._marks[token]]
         if not text:
             return _bits_of_float(np.nan, size)
@@ -691,15 +717,15 @@ class _TokenReader:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Steps of one to some echoes each, joined by a mark; in the struct each step has places for
-    all, and an echo that is missing is 0.
+    """Steps with a variable number of echoes, which are joined by a mark.
 
-    An echo whose numbers are all 0 is not sent when none follows it in its step, but for the first.
+    In the struct, each step has places for `most` echoes, and a missing echo is 0. The first echo
+    of a step is always sent. Others are not sent if they and all later echoes of the step are 0.
 
     Args:
         size: the characters of an echo.
-        most: echoes of a step.
-        mark: a character that is no digit.
+        most: the maximum number of echoes of a step.
+        mark: a character that is not a digit.
     """
 
     size: int
@@ -708,7 +734,7 @@ class Echoes:
 
     @cached_property
     def _step(self) -> re.Pattern[bytes]:
-        """A step: a mark joins two echoes if another character follows it."""
+        """A pattern for one step: a mark joins two echoes if another character follows it."""
         mark = re.escape(self.mark)
         echo = b"[^%b].{%d}" % (mark, self.size - 1)
         return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
@@ -719,14 +745,14 @@ class Echoes:
         """Insert the echoes that were not sent.
 
         Args:
-            offsets: of the characters in the frame, (n,).
-            end: offset of what follows them.
+            offsets: the offsets of the characters in the frame, (n,).
+            end: the offset after the last character.
             zero: the digit of a missing echo.
             is_whole: whether these are all characters of the frame.
 
         Returns:
-            The characters, and the offset of each, which for a missing echo is that of the next
-            one. A mark that joins no echoes stays, and can be read as no number.
+            The characters, and the offset of each. A missing echo has the offset of the next
+            character. A mark that joins no echoes is kept, and later fails to be read as a number.
         """
         stride = self.size + len(self.mark)
         step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
@@ -743,7 +769,7 @@ class Echoes:
         rest = characters[begin:]
         last_count = counts.item(-1) if len(counts) else self.most
         if last_count < self.most and self._begins_echo(rest, is_whole=is_whole):
-            # The last step goes on with an echo that is cut off, so that none is missing.
+            # The last step continues with a truncated echo, so none of its echoes is missing.
             size = len(steps) - (self.most - last_count) * self.size
             steps = steps[:size]
             places = places[:size]
@@ -751,7 +777,7 @@ class Echoes:
         return steps + characters[begin:], np.append(places, offsets[begin:])
 
     def _find_steps(self, characters: bytes) -> list[bytes]:
-        """Return the steps at the beginning of characters, up to the first that is incomplete."""
+        """Return the steps at the start of the characters, up to the first incomplete step."""
         steps = re.match(b"(?:%b)*" % self._step.pattern, characters, re.DOTALL)
         return [step[0] for step in self._step.finditer(steps[0])] if steps else []
 
@@ -768,7 +794,7 @@ class Echoes:
         """Return the steps as they are sent.
 
         Raises:
-            SpecError: for characters that are no steps.
+            SpecError: if the characters are not steps.
         """
         room = self.most * self.size
         if len(characters) % room:
@@ -779,7 +805,7 @@ class Echoes:
             )
         echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
         has_value = (echoes != zero[0]).any(axis=2)
-        # An echo is sent if it or one behind it in its step has a value, and the first always.
+        # An echo is sent if it or a later echo of its step is not 0. The first is always sent.
         is_sent = np.logical_or.accumulate(has_value[:, ::-1], axis=1)[:, ::-1]
         is_sent[:, 0] = True
         marks = np.full((*is_sent.shape, 1), self.mark[0], np.uint8)
@@ -792,19 +818,19 @@ class Echoes:
 
 @dataclass(frozen=True)
 class SixBits:
-    """Numbers in characters of six bits each, the highest first, as many as the field has bytes;
-    behind ``Lines(...) |``.
+    """Numbers in characters of six bits each, the highest bits first.
 
-    `Int16ub` is two characters, `Int24ub` three, `Int32ub` four, and one character an `Int8ub`, by
-    which decimal digits are read, too.
+    It is used as ``Lines(...) | SixBits()``. A number has as many characters as its field has
+    bytes: `Int16ub` is two characters, `Int24ub` three, `Int32ub` four. An `Int8ub` is one
+    character, which can also be a decimal digit.
 
     Args:
-        first: the character that is 0.
-        echoes: how the steps behind the head are sent that have echoes; None where all numbers are.
+        first: the character for 0.
+        echoes: how the steps with echoes after the head are sent; None if all numbers are sent.
 
     Raises:
-        SpecError: for a mark of echoes that is a digit or more than one character, and for echoes
-            without a character.
+        SpecError: for a mark of echoes that is a digit or not one character, and for echoes without
+            a character.
     """
 
     first: bytes = b"0"
@@ -824,7 +850,7 @@ class SixBits:
             )
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
-        """Return the characters of a struct; of numbers that are too large the low bits."""
+        """Return the characters of a struct; higher bits of large numbers are lost."""
         parts = list[bytes]()
         offset = 0
         for run in runs:
@@ -843,8 +869,8 @@ class _SixBitReader:
     """Reads numbers of `SixBits` from characters.
 
     Args:
-        offsets: of the characters in the frame, (n,).
-        end: offset of what follows them.
+        offsets: the offsets of the characters in the frame, (n,).
+        end: the offset after the last character.
     """
 
     def __init__(self, form: SixBits, characters: bytes, offsets: Offsets, end: int) -> None:
@@ -894,8 +920,11 @@ class _SixBitReader:
 
 @dataclass(frozen=True)
 class Scip:
-    """The check character of SCIP: six bits of the sum of a line's characters, from "0" on (SCIP
-    2.0, C-42-03320B, 5).
+    """The check character of SCIP: six bits of the sum of a line's characters.
+
+    Its value 0 is the character "0".
+
+    Source: SCIP 2.0, C-42-03320B, 5.
     """
 
     def __call__(self, line: bytes) -> int:
@@ -905,15 +934,17 @@ class Scip:
 
 @dataclass(frozen=True)
 class Lines:
-    """Text in lines of one length, behind some of their own; a frame ends with an empty line. ``|
-    SixBits()`` says how numbers stand in it.
+    """Text in lines of one length after a head; a frame ends with an empty line.
+
+    ``Lines(...) | SixBits()`` declares how numbers are written.
 
     Args:
-        width: the characters of each line but the last, without its check.
-        head: the characters of the first lines, which have lengths of their own.
-        bare: how many of the first lines have no check character.
-        check: from a line to its check character, such as `Scip`; None where there are none.
-        numbers: how numbers are written; None for bytes as they are.
+        width: the characters of each line except the last, without its check character.
+        head: the numbers of characters of the first lines, which have their own lengths.
+        bare: the number of first lines without a check character.
+        check: a function from a line to its check character, for example `Scip`; None if lines have
+            none.
+        numbers: how numbers are written; None for unchanged bytes.
 
     Raises:
         SpecError: for lines without a character, and for echoes without a head before them.
@@ -958,12 +989,12 @@ class Lines:
         return NO_END
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the sizes of frames, and `NO_FRAME` where a line has another length."""
+        """Return the sizes of frames, and `NO_FRAME` if a line has another length."""
         newlines = np.flatnonzero(buffer == NEWLINE)
         steps = np.diff(newlines, prepend=0)
-        ends = next_places(newlines[:-1][steps[1:] == 1], offsets, len(buffer))
+        ends = find_next_offsets(newlines[:-1][steps[1:] == 1], offsets, len(buffer))
         has_end = ends + 2 <= stops
-        # The newlines that end the first and the last line of which all bytes have arrived.
+        # The newlines at the ends of the first and the last complete line.
         first = newlines.searchsorted(offsets)
         last = newlines.searchsorted(np.where(has_end, ends + 1, stops)) - 1
         is_frame = np.ones(len(offsets), np.bool_)
@@ -975,7 +1006,7 @@ class Lines:
                 has_end | (offsets + place >= stops),
                 places[first + number] == offsets + place,
             )
-        # All lines behind the head have one length, but for the last one, which may be shorter.
+        # All lines after the head have one length, except the last line, which may be shorter.
         length = self.width + (self.check is not None) + 1
         right_before = np.append(0, np.cumsum(steps == length))
         begin = first + max(len(self.head), 1)
@@ -1022,8 +1053,10 @@ class Lines:
         return replace(decoded, problem=problem)
 
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
-        """Return the characters of all lines without checks, their offsets, and what is wrong; they
-        end before a line of another length.
+        """Return the characters of all lines without checks, and their offsets.
+
+        The characters end before a line of another length. The third value is the fault of the
+        lines; None if they are valid.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:
@@ -1083,18 +1116,18 @@ class Lines:
 
 @dataclass(frozen=True)
 class Escaped:
-    """Frames between two flags, in which a flag or an escape is sent as an escape and the byte with
-    some bits turned (as in HDLC).
+    """Frames between two flags, with escaped bytes (as in HDLC).
 
-    Each frame has both its flags. Any byte may be escaped on arrival; those that have to be are
-    when a frame is built.
+    A flag or an escape in the content is sent as an escape and the byte with some bits inverted.
+    Each frame has its own two flags. When reading, any byte may be escaped. When building, only
+    flags and escapes are.
 
     Args:
         flag, escape: bytes.
-        xor: the bits that are turned in an escaped byte.
+        xor: the bits to invert in an escaped byte.
 
     Raises:
-        SpecError: for flags and escapes that cannot be told apart.
+        SpecError: unless flag and escape are different bytes, which no escaped byte equals.
     """
 
     is_text: ClassVar[bool] = False
@@ -1115,7 +1148,7 @@ class Escaped:
             )
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        return [self.flag]  # any byte behind it may be escaped
+        return [self.flag]  # any byte after it may be escaped
 
     def find_end(self, data: bytes) -> int:
         end = data.find(self.flag, 1)
@@ -1126,7 +1159,7 @@ class Escaped:
         return NO_END
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        ends = next_places(np.flatnonzero(buffer == self.flag), offsets + 1, len(buffer))
+        ends = find_next_offsets(np.flatnonzero(buffer == self.flag), offsets + 1, len(buffer))
         sizes = np.where(ends < stops, ends + 1 - offsets, NO_END)
         sizes[(ends == offsets + 1) & (ends < stops)] = NO_FRAME
         return sizes
