@@ -14,10 +14,9 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-#: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor,
-#: else on that of its package. Imports go down or stay, wherever in a module they stand and for
-#: types alike.
-FLOORS = (
+#: Modules and packages in the order of the data flow, lowest layer first. A listed module has its
+#: own layer, all others have their package's. Imports within functions and for types also count.
+LAYERS = (
     "_version notebook_display errors optional_libraries"
     " trusted_files remote_files entry_points known_sensors",
     "transports.protocol",  # what a source is, as values that plugins give too
@@ -42,10 +41,10 @@ FLOORS = (
     "cli",
     "__main__ __init__",
 )
-FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
-IO_FLOOR = FLOOR_OF["plugins"]
+LAYER_OF = {name: layer for layer, names in enumerate(LAYERS) for name in names.split()}
+IO_LAYER = LAYER_OF["plugins"]
 #: packages with a face above their modules.
-PACKAGES = {name.removesuffix(".__init__") for name in FLOOR_OF if name.endswith(".__init__")}
+PACKAGES = {name.removesuffix(".__init__") for name in LAYER_OF if name.endswith(".__init__")}
 
 IO = {"asyncio", "logging", "serial", "socket", "threading", "time"}
 #: who may import a library; whoever is not named here may not.
@@ -195,36 +194,36 @@ def resolve(name: str, modules: Mapping[str, Module]) -> str | None:
     return name
 
 
-def floor(name: str) -> int | None:
+def layer(name: str) -> int | None:
     """Return the layer of a module: its own, otherwise its package's, otherwise None."""
     inside = name.partition(".")[2] or "__init__"
     if inside in PACKAGES:
-        inside = f"{inside}.__init__" if f"{inside}.__init__" in FLOOR_OF else inside
-    while inside not in FLOOR_OF and "." in inside:
+        inside = f"{inside}.__init__" if f"{inside}.__init__" in LAYER_OF else inside
+    while inside not in LAYER_OF and "." in inside:
         inside = inside.rpartition(".")[0]
-    return FLOOR_OF.get(inside)
+    return LAYER_OF.get(inside)
 
 
-def climbing(modules: Mapping[str, Module]) -> list[str]:
+def find_upward_imports(modules: Mapping[str, Module]) -> list[str]:
     """Return modules without a layer, imports from a higher layer, and the first cycle.
 
     Imports for types are included.
     """
     complaints = [
-        f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None
+        f"{name} has no layer: add it to LAYERS" for name in modules if layer(name) is None
     ]
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for module in modules.values():
-        here = floor(module.name)
+        here = layer(module.name)
         for line, imported in module.imports:
             target = resolve(imported, modules)
             if target is None or target == module.name:
                 continue
             graph[module.name].add(target)
-            there = floor(target)
+            there = layer(target)
             if here is not None and there is not None and there > here:
                 complaints.append(
-                    f"{module.name}:{line} (floor {here}) imports {target} (floor {there})"
+                    f"{module.name}:{line} (layer {here}) imports {target} (layer {there})"
                 )
     try:
         TopologicalSorter(graph).prepare()
@@ -233,18 +232,18 @@ def climbing(modules: Mapping[str, Module]) -> list[str]:
     return complaints
 
 
-def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
+def find_misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
     """Return imports for I/O below the I/O layer, and of optional libraries elsewhere."""
     complaints = []
     for module in modules.values():
-        here = floor(module.name)
+        here = layer(module.name)
         inside = module.name.partition(".")[2]
         for line, imported in module.imports:
             if line in module.typing_lines:
                 continue
             library = imported.partition(".")[0]
-            if library in IO and here is not None and here < IO_FLOOR:
-                complaints.append(f"{module.name}:{line} imports {library} below floor {IO_FLOOR}")
+            if library in IO and here is not None and here < IO_LAYER:
+                complaints.append(f"{module.name}:{line} imports {library} below layer {IO_LAYER}")
             allowed = CONFINED.get(library)
             if allowed is not None and not any(
                 inside == name or inside.startswith(f"{name}.") for name in allowed
@@ -256,7 +255,7 @@ def misplaced_imports(modules: Mapping[str, Module]) -> list[str]:
     return complaints
 
 
-def construct_asked(modules: Mapping[str, Module]) -> list[str]:
+def find_construct_checks(modules: Mapping[str, Module]) -> list[str]:
     """Return type checks for construct's classes outside construct's layer."""
     complaints = []
     for module in modules.values():
@@ -283,7 +282,7 @@ def construct_asked(modules: Mapping[str, Module]) -> list[str]:
     return complaints
 
 
-def private_imports(
+def find_private_imports(
     modules: Mapping[str, Module], public: Mapping[str, Collection[str]]
 ) -> list[str]:
     """Return the imports of a plugin that are not permitted.
@@ -342,7 +341,7 @@ def attributes(module: Module) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.attr
 
 
-def word(name: str) -> re.Pattern[str]:
+def name_pattern(name: str) -> re.Pattern[str]:
     """Return a pattern for a vendor, model or id as a word, with any separator.
 
     A word of one or two characters matches only in its own case, and not at the end of another
@@ -364,7 +363,7 @@ def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list
             "", module.text
         ).lower()  # where a name is missing whatever joins it, nothing has to be searched
         for name in (name for name, joined in sought.items() if joined in run):
-            if found := word(name).search(module.text):
+            if found := name_pattern(name).search(module.text):
                 complaints.append(
                     f"{module.name}:{module.text.count(chr(10), 0, found.start()) + 1} names {name}"
                 )

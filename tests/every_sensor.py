@@ -34,5 +34,5 @@ def distinct_frames(sensors: Iterable[Sensor]) -> list[tuple[Sensor, str]]:
 
 
 def stream_sensors(sensors: Iterable[Sensor]) -> list[Sensor]:
-    """Return one sensor for each set of frames among those that send a stream of bytes."""
+    """Return one sensor for each set of frames among the sensors that send a byte stream."""
     return distinct_sensors(sensor for sensor in sensors if not sensor.datagrams)

@@ -22,7 +22,7 @@ PROTOCOLS = CAPTURES.parent / "protocols"
 
 
 def capture(name: str) -> Path:
-    """The path of a capture; the test is skipped where it is absent."""
+    """Return the path of a capture; skip the test if it is missing."""
     return _present(CAPTURES / name)
 
 
@@ -35,13 +35,13 @@ def _read_vectors(file: str) -> dict[str, dict[str, Any]]:
 
 
 def vectors(file: str) -> dict[str, dict[str, Any]]:
-    """The test vectors of a file by id; the test is skipped where it is absent."""
+    """Return the test vectors of a file by id; skip the test if it is missing."""
     _present(PROTOCOLS / file)
     return _read_vectors(file)
 
 
 def vector_bytes(file: str, name: str) -> bytes:
-    """The bytes of one vector, out of the list or out of the file that it names."""
+    """Return the bytes of one vector, from the list or from the file that it names."""
     vector = vectors(file)[name]
     return (
         bytes.fromhex(vector["hex"])
@@ -76,7 +76,7 @@ def decode(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
 
 
 def clockwise(cloud: PointCloud) -> Any:
-    """The azimuths as a clockwise sensor counts them: degrees in [0, 360)."""
+    """Return clockwise azimuths: degrees in [0, 360)."""
     return np.rad2deg(-cloud.azimuth.astype(np.float64)) % 360
 
 

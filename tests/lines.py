@@ -47,18 +47,18 @@ class Port:
         os.write(self._master, data)
 
     def offer(self, data: bytes) -> None:
-        """Send what there is room for; the rest is lost, as on a line where nobody listens."""
+        """Send as many bytes as fit; the rest is lost, as on a port without a reader."""
         os.set_blocking(self._master, False)
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
         os.set_blocking(self._master, True)
 
     def discard(self) -> None:
-        """Throw away what was sent and nobody read; a sender that waits for room has it."""
+        """Discard the bytes that the program has not read, so that it can send more."""
         termios.tcflush(self._slave, termios.TCIFLUSH)
 
     def receive(self, size: int) -> bytes:
-        """The next bytes that the program on the other side wrote."""
+        """Return the next bytes that the program wrote."""
         found = b""
         while len(found) < size:
             found += os.read(self._master, size - len(found))
@@ -80,7 +80,7 @@ def port(folder: Path) -> Iterator[Port]:
 
 @contextlib.contextmanager
 def working(function: Callable[[threading.Event], None]) -> Iterator[threading.Event]:
-    """A function in a thread, given the event that asks it to stop."""
+    """Run a function in a thread; it gets the event that requests its end."""
     stop = threading.Event()
     thread = threading.Thread(target=function, args=(stop,))
     thread.start()
@@ -112,7 +112,7 @@ def send_paced(
 
 
 def until(condition: Callable[[], object], seconds: float = TIMEOUT_S) -> float:
-    """The seconds until something is so; fails where it does not become so."""
+    """Wait for a condition; return the seconds, and fail after the timeout."""
     began = time.monotonic()
     while not condition():
         assert time.monotonic() - began < seconds, "it did not happen in time"
@@ -138,14 +138,14 @@ def udp(host: str = "127.0.0.1") -> Iterator[socket.socket]:
 
 
 def free_port() -> int:
-    """A UDP port that nobody uses."""
+    """Return an unused UDP port."""
     with udp() as made:
         number: int = made.getsockname()[1]
         return number
 
 
 def _values(sensor: str, index: int) -> dict[str, Any]:
-    """What the packet of this number holds."""
+    """Return the values of the packet with this number."""
     match sensor:
         case "shape-clock":  # 40 packets a scan
             return {
@@ -164,7 +164,8 @@ def _values(sensor: str, index: int) -> dict[str, Any]:
 
 
 def turning(sensor: Sensor, number: int) -> list[bytes]:
-    """The first data frames of one of the shapes that live tests use, clock, commands or datagrams,
-    as it turns.
+    """Return the first data frames of a shape for live tests, while it rotates.
+
+    The shape is clock, commands or datagrams.
     """
     return [sensor.build("data", **_values(sensor.id, index)) for index in range(number)]

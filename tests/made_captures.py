@@ -133,7 +133,7 @@ def packet(
     ticks: int = 0,
     captured: int | None = None,
 ) -> bytes:
-    """A packet block of any of the three kinds."""
+    """Return a packet block of any of the three kinds."""
     times = struct.pack(order + "II", ticks >> 32, ticks & 0xFFFFFFFF)
     lengths = struct.pack(order + "II", len(data) if captured is None else captured, len(data))
     heads = {

@@ -16,12 +16,12 @@ from tests.architecture import (
     FACES,
     PAGE_MAY_IMPORT,
     Module,
-    climbing,
-    construct_asked,
     core_modules,
-    misplaced_imports,
+    find_construct_checks,
+    find_misplaced_imports,
+    find_private_imports,
+    find_upward_imports,
     named_sensors,
-    private_imports,
     read,
 )
 from tests.installed import sensor_modules
@@ -38,24 +38,24 @@ PLUGINS = sorted(
 
 def test_imports_go_down_without_circles() -> None:
     assert "lidarspec.spec" in CORE
-    assert not climbing(CORE)
+    assert not find_upward_imports(CORE)
 
 
 def test_an_import_inside_a_function_counts_as_a_cycle() -> None:
     name = "lidarspec.spec.sensor"
     upward = "\n\ndef parse():\n    from lidarspec.frames.parse import parse\n"
     planted = {**CORE, name: Module(name, CORE[name].text + upward, is_package=False)}
-    complaints = climbing(planted)
+    complaints = find_upward_imports(planted)
     assert any(line.startswith(f"{name}:") for line in complaints)
     assert any(line.startswith("circle: ") for line in complaints)
 
 
 def test_io_and_libraries_are_imported_where_they_belong() -> None:
-    assert not misplaced_imports(CORE)
+    assert not find_misplaced_imports(CORE)
 
 
 def test_one_package_knows_the_classes_of_construct() -> None:
-    assert not construct_asked(CORE)
+    assert not find_construct_checks(CORE)
 
 
 def test_no_submodule_shadows_a_public_name() -> None:
@@ -81,7 +81,7 @@ def test_the_core_names_no_model_of_a_sensor() -> None:
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
 def test_plugins_import_public_names_only(plugin: Path) -> None:
-    assert not private_imports(
+    assert not find_private_imports(
         read(plugin), {face: importlib.import_module(face).__all__ for face in FACES}
     )
 

@@ -22,7 +22,7 @@ START, STEP = 1_700_000_000 * 10**9, 1_327_104
 
 @pytest.fixture(scope="module")
 def frames() -> list[bytes]:
-    """Three turns of a VLP-16 and some more, without one packet."""
+    """Return three revolutions of a VLP-16 and some more packets, with one lost."""
     packets = simulate(ls.sensor("velodyne-vlp16"), 300)
     return packets[:150] + packets[151:]
 

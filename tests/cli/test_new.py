@@ -18,7 +18,7 @@ from lidarspec import spec
 from lidarspec.drafting.distribution import DistributionNames
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
-from tests.architecture import Module, private_imports
+from tests.architecture import Module, find_private_imports
 from tests.cli.running import ran
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -191,7 +191,7 @@ def test_it_is_written_as_the_projects_own_sensors_are(made: Path) -> None:
         (made / "lidarspec_acme_x1" / "__init__.py").read_text(encoding="utf-8"),
         True,
     )
-    assert not private_imports(
+    assert not find_private_imports(
         {module.name: module}, {"lidarspec": ls.__all__, "lidarspec.spec": spec.__all__}
     )
     config = ["--config", str(ROOT / "pyproject.toml")]

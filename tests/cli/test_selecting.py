@@ -21,7 +21,7 @@ ID = "velodyne-vlp16"
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds, 21 scans and pieces."""
+    """Return a recording of two seconds: 21 complete scans and partial ones."""
     path = tmp_path_factory.mktemp("drive") / "drive.lsr"
     ran("sim", ID, "--to", path, "-t", "2s")
     return path

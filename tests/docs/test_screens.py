@@ -19,7 +19,7 @@ SHOWING = ("find.md", "troubleshoot.md", "explain.md", "stats.md")
 
 
 def screens() -> dict[str, str]:
-    """What stands below each command on the pages."""
+    """Return the output below each command on the pages."""
     pages = [(PAGES / name).read_text(encoding="utf-8") for name in SHOWING]
     return {
         command: text

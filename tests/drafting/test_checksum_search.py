@@ -52,7 +52,7 @@ def find_best(frames: list[bytes]) -> ChecksumMatch:
 
 
 def found_among_crcs(frames: list[bytes]) -> ChecksumMatch:
-    """The same, where plain checksums are not tried before."""
+    """Search only the CRCs, without trying plain checksums first."""
     samples = SampleFrames(frames)
     return sort_matches(list(crc_matches(samples)) or list(crc_matches(samples, mixed=True)))[0]
 

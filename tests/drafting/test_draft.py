@@ -1,4 +1,4 @@
-"""Tests of drafts of unknown frames: a draft reads the capture that it came from."""
+"""Return the sensor that `new --from-capture` writes."""
 
 from __future__ import annotations
 
@@ -436,7 +436,7 @@ def test_points_may_depend_on_no_field() -> None:
 
 
 def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
-    """The texts of a draft of these frames."""
+    """Return the texts of a draft of these frames."""
     return text_of(
         make_draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
         origin="the tests",

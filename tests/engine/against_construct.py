@@ -33,7 +33,7 @@ def points(f: Fields) -> Polar:
 
 
 def sensor(struct: Construct, *, max_length: int = 200) -> Sensor:
-    """A sensor whose datagrams are such structs."""
+    """Return a sensor with this struct as its datagram."""
     return Sensor(
         "test-alike",
         vendor="Test",
@@ -49,8 +49,9 @@ def sensor(struct: Construct, *, max_length: int = 200) -> Sensor:
 
 
 def parse_by_construct(struct: Construct, data: bytes, *, max_length: int = 200) -> Any:
-    """What construct reads from the author's struct; None where it does not read exactly these
-    bytes.
+    """Return construct's value of the author's struct.
+
+    Returns None if construct does not read exactly these bytes.
     """
     stream = io.BytesIO(data)
     try:
@@ -61,7 +62,7 @@ def parse_by_construct(struct: Construct, data: bytes, *, max_length: int = 200)
 
 
 def plain(value: Any) -> Any:
-    """A parsed value as dicts, lists, numbers and bytes."""
+    """Return a parsed value as dicts, lists, numbers and bytes."""
     if isinstance(value, dict):
         return {name: plain(part) for name, part in value.items() if not name.startswith("_")}
     if isinstance(value, list):
@@ -72,12 +73,13 @@ def plain(value: Any) -> Any:
 def agree(
     struct: Construct, frames: Iterable[bytes], *, max_length: int = 200, kept: bool = True
 ) -> int:
-    """Assert that every engine reads these bytes as construct does; the number of those that are
-    frames.
+    """Fail unless every engine reads the input as construct does.
 
     Args:
-        kept: whether what is built of what was read has to be the same bytes, as it is not where
-            `Rebuild` fills in another value.
+        kept: require that a built value gives the same bytes; False if `Rebuild` replaces a value.
+
+    Returns:
+        The number of valid frames.
     """
     ours = sensor(struct, max_length=max_length)
     whole = list[tuple[bytes, Any]]()
@@ -112,9 +114,7 @@ def agree(
 
 
 def column_of(packets: Packets, path: str) -> Sequence[Any]:
-    """The raw values of a field; none where its branches go not together in a column, which is
-    said.
-    """
+    """Return the raw values of a field; () if its branches have no common column."""
     try:
         return packets.table.raw(path)
     except SpecError as error:
@@ -124,7 +124,7 @@ def column_of(packets: Packets, path: str) -> Sequence[Any]:
 
 
 def has_raw_form(packets: Packets) -> bool:
-    """Whether every name is the same kind of part in all branches that have it."""
+    """Return whether every name has the same kind of part in all its branches."""
     try:
         return packets.raw is not None
     except SpecError:
@@ -138,10 +138,12 @@ def clouds_agree(
     max_length: int = 200,
     backends: Sequence[str] = BACKENDS,
 ) -> int:
-    """Assert that a cloud has the values of a field of all elements in order, and no padding; the
-    number of fields tried.
+    """Fail unless a cloud has all elements of a field in order, without padding.
 
-    Of those of the deepest arrays, whose lengths differ from frame to frame but not within one.
+    The fields are in the deepest arrays with the same lengths within each frame.
+
+    Returns:
+        The number of compared fields.
     """
     plain_sensor = sensor(struct, max_length=max_length)
     whole = [(data, parse_by_construct(struct, data, max_length=max_length)) for data in frames]
@@ -178,7 +180,7 @@ def _ranges(f: Fields, path: str) -> Polar:
 
 
 def flat(value: Any, depth: int) -> Iterable[float]:
-    """The numbers in nested lists; nan for what is not there."""
+    """Return the numbers in nested lists; NaN for missing values."""
     if isinstance(value, list):
         for part in value:
             yield from flat(part, depth - 1)
@@ -187,9 +189,7 @@ def flat(value: Any, depth: int) -> Iterable[float]:
 
 
 def at(value: Any, names: Sequence[str]) -> Any:
-    """The value under a path, nested lists of them where arrays are passed; None where there is
-    none.
-    """
+    """Return the value at a path; nested lists if it passes arrays; None if missing."""
     if isinstance(value, list):
         return [at(part, names) for part in value]
     if not names:
@@ -200,7 +200,7 @@ def at(value: Any, names: Sequence[str]) -> Any:
 
 
 def same(column: Any, wanted: Any, where: str) -> None:
-    """Assert that a padded column holds the value: what is not there is 0."""
+    """Fail unless a padded column holds the value; missing elements must be 0."""
     if is_nothing(wanted):
         assert not np.any(column), where
     elif isinstance(wanted, list):
@@ -218,5 +218,5 @@ def same(column: Any, wanted: Any, where: str) -> None:
 
 
 def is_nothing(wanted: Any) -> bool:
-    """Whether there is no value, nor one in lists of them."""
+    """Return whether a value, or everything in nested lists, is None."""
     return all(map(is_nothing, wanted)) if isinstance(wanted, list) else wanted is None

@@ -26,29 +26,29 @@ class Parser:
         self.buffer, self.base = b"", 0
 
     def feed(self, data: bytes, at: int | None = None) -> list[Found]:
-        """The frames that these bytes complete."""
+        """Add bytes; return the frames that they complete."""
         self.stats.bytes_in += len(data)
         self.buffer += bytes(data)
         return self.cut(final=False)
 
     def idle(self) -> list[Found]:
-        """The frames in what waits, which is given up."""
+        """Discard the incomplete candidate; return the frames after it."""
         return self.cut(final=True)
 
     def finish(self) -> list[Found]:
-        """The frames in what waits at the end of the input."""
+        """End the input; return the frames in the remaining bytes."""
         return self.idle()
 
     def frames(self, data: bytes, at: int | None = None) -> list[Any]:
-        """The frames that these bytes complete, as the engine asks for them."""
+        """Return the frames that these bytes complete, in the form the engine needs."""
         return [pack_found(self.feed(data, at))]
 
     def rest(self) -> list[Any]:
-        """The frames in what waits, as the engine asks for them."""
+        """Return the frames in the remaining bytes, in the form the engine needs."""
         return [pack_found(self.idle())]
 
     def cut(self, *, final: bool) -> list[Found]:
-        """The frames in the buffer."""
+        """Remove the frames from the buffer; return them."""
         found, spot = list[Found](), 0
         while spot < len(self.buffer):
             size = self.size(self.buffer[spot : spot + LONGEST])
@@ -71,13 +71,14 @@ class Parser:
         return found
 
     def drop(self, number: int) -> None:
-        """Forget what was looked at."""
+        """Discard `number` bytes of the buffer."""
         self.buffer, self.base = self.buffer[number:], self.base + number
         self.stats.pending = len(self.buffer)
 
     def size(self, data: bytes) -> int | None:
-        """The length of the frame that these bytes begin with; 0 where none does, None where more
-        are needed.
+        """Return the length of the frame at the start of these bytes.
+
+        Returns 0 if there is none, and None if more bytes are needed.
         """
         for header, name in HEADERS.items():
             if data.startswith(header):
@@ -90,16 +91,16 @@ class Parser:
         return 0
 
     def too_long(self, size: int) -> bool:
-        """Whether no frame is so long."""
+        """Return whether the length exceeds every frame's maximum."""
         return size > LONGEST
 
     def frame(self, data: bytes) -> str:
-        """The type of a frame, "" where it is none."""
+        """Return the type of a frame, "" if it is invalid."""
         found = SOUND.split(data)
         return found[0].frame if len(found) == 1 and found[0].data == data else ""
 
     def step(self, spot: int, size: int) -> int:
-        """How far to go on where there is no frame; `size`: of one whose checksum is wrong."""
+        """Return how many bytes to skip after an invalid frame."""
         return 1
 
 
@@ -129,7 +130,7 @@ class MismatchingByteLost(Parser):
 
 
 class LongestRefused(Parser):
-    """>= stands where > is meant, at the longest length."""
+    """Mistake: >= instead of > in the comparison with the maximum length."""
 
     def too_long(self, size: int) -> bool:
         return size >= LONGEST
@@ -152,14 +153,14 @@ class BufferOfTheClass(Parser):
 
 
 class HeldOverSilence(Parser):
-    """What is held is not given up when the line falls silent."""
+    """Mistake: an incomplete candidate is kept when no more data arrives."""
 
     def idle(self) -> list[Found]:
         return []
 
 
 class ExceptionSwallowed(Parser):
-    """An exception is swallowed, and what it cost is not counted."""
+    """Mistake: an exception is ignored, and the lost bytes are not counted."""
 
     def feed(self, data: bytes, at: int | None = None) -> list[Found]:
         try:
@@ -175,7 +176,7 @@ class ExceptionSwallowed(Parser):
 
 
 class BufferCopied(Parser):
-    """The buffer is copied for each byte.
+    """Mistake: the buffer is copied for each byte.
 
     One of the copies is made byte by byte: a plain slice is so fast on some machines that the
     time of a short input hardly depends on it.
@@ -203,12 +204,12 @@ class Own(Sensor):
     parser: type[Any] = Parser
 
     def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Any:
-        """The parser in the place of the engine's."""
+        """Return the parser instead of the engine's decoder."""
         return type(self).parser(self)
 
 
 class Indexless(Sensor):
-    """A sensor whose errors do not say which element of an array they were in."""
+    """A sensor whose errors do not include the index of the array element."""
 
     def parse(self, data: Any, frame: str | None = None, *, verify: bool = True) -> Any:
         try:
@@ -221,5 +222,5 @@ class Indexless(Sensor):
 
 
 def read_by(parser: type[Parser]) -> Sensor:
-    """The sound sensor, read by a parser of its own."""
+    """Return the correct sensor with another parser."""
     return sound.sensor(kind=type(parser.__name__, (Own,), {"parser": parser}))

@@ -41,8 +41,9 @@ class Oracle:
         self._known: dict[tuple[str, int], int] = {}
 
     def frames(self) -> list[Cut]:
-        """The leftmost valid candidate, then on after its last byte; one byte further where there
-        is none.
+        """Return the valid frames: the leftmost candidate, then the next one after it.
+
+        At an invalid byte the search continues one byte further.
         """
         found: list[Cut] = []
         spot, run = 0, ("", -1)
@@ -59,8 +60,9 @@ class Oracle:
         return found
 
     def _is_accepted(self, name: str, spot: int, run: tuple[str, int]) -> bool:
-        """Whether a type stands here: valid, and if it is weak, within a long enough run of its
-        kind.
+        """Return whether a frame of this type is accepted at this offset.
+
+        It must be valid and, if it is weak, be part of a long enough run.
         """
         for _ in range(1 if run == (name, spot) else self._frames[name].confirm):
             if not self._valid(name, spot) or self._earlier(name, spot, run):
@@ -73,7 +75,7 @@ class Oracle:
         return any(self._is_accepted(other, spot, run) for other in before)
 
     def _valid(self, name: str, spot: int) -> int:
-        """The size of the valid candidate of this type at this offset, 0 if there is none."""
+        """Return the size of the valid candidate of this type at this offset, otherwise 0."""
         if self._frames[name].after not in (None, self._mode):
             return 0
         if (name, spot) not in self._known:

@@ -30,8 +30,10 @@ from lidarspec.spec import Echoes, Escaped, Lines, Tokens
 
 
 def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | None:
-    """The row of the frame that some bytes begin with, and its bytes on the wire; None where they
-    begin with none.
+    """Return the frame at the start of some bytes, without its wire form, and its size.
+
+    The size is the number of bytes on the wire. Returns None if the bytes do not begin with a
+    frame.
     """
     if isinstance(form, Tokens):
         return _tokens(form, struct, data)

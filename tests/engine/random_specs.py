@@ -63,13 +63,13 @@ class Known:
 
 @dataclass
 class Drawn:
-    """One spec under way.
+    """A random spec under construction.
 
     Attributes:
-        source: of chance.
-        size: how large it may become.
-        levels: what is known in each struct around the place, outermost first.
-        interpreted: whether parts may be drawn that construct alone can read.
+        source: the random generator.
+        size: the maximum size.
+        levels: the known fields of each enclosing struct, outermost first.
+        interpreted: whether to include parts that only construct can read.
     """
 
     source: Random
@@ -79,7 +79,7 @@ class Drawn:
     number: int = 0
 
     def struct(self, depth: int, *, members: int | None = None) -> str:
-        """A Struct of some members."""
+        """Return a Struct of some members."""
         self.levels.append([])
         count = members or self.source.randint(1, max(2, self.size - 2 * depth))
         parts = [part for _ in range(count) for part in self.member(depth)]
@@ -87,7 +87,7 @@ class Drawn:
         return f"Struct({', '.join(parts)})"
 
     def member(self, depth: int) -> list[str]:
-        """A member, or two of which the second depends on the first."""
+        """Return a member, or two if the second depends on the first."""
         self.number += 1
         name, kind = f"f{self.number}", self.source.random()
         if kind < 0.4:
@@ -101,7 +101,7 @@ class Drawn:
         return [f'"{name}" / {self.part(depth)}']
 
     def draw_struct(self, name: str, depth: int) -> str:
-        """A struct whose fields those after it may ask for; sometimes a sealed one."""
+        """Return a struct whose fields later parts may use, sometimes with a checksum."""
         self.levels.append([])
         parts = [part for _ in range(self.source.randint(1, 3)) for part in self.member(depth + 1)]
         inside = self.levels.pop()
@@ -115,7 +115,7 @@ class Drawn:
         return f'"{name}" / Struct({", ".join(parts)})'
 
     def control(self, name: str) -> str:
-        """An integer that others may depend on."""
+        """Return an integer that other parts may depend on."""
         word, kind = self.source.choice((*WORDS, *WORDS[:4], *ODD)), self.source.random()
         known = Known(name)
         text = word
@@ -223,7 +223,7 @@ class Drawn:
         return f"Switch({key}, {{{cases}}}{default})"
 
     def bits(self, name: str) -> str:
-        """A bit block of whole bytes; of those with a name, its integers may be asked for."""
+        """Return a bit block of whole bytes; later parts may use the integers of a named one."""
         left, parts = 8 * self.source.randint(1, 4), list[str]()
         order = self.source.choice(("", "", "ByteSwapped", "BitsSwapped"))
         while left:
@@ -253,7 +253,7 @@ class Drawn:
         return f"{order}({text})" if order else text
 
     def few_bits(self, name: str, width: int) -> str:
-        """An element of an array of bits: an integer, two of them, or an array again."""
+        """Return an element of an array of bits: an integer, two integers, or an array."""
         if width > 2 and self.source.random() < 0.3:
             return f'Struct("{name}x" / BitsInteger({width - 2}), "{name}y" / BitsInteger(2))'
         if width % 2 == 0 and self.source.random() < 0.2:
@@ -261,7 +261,7 @@ class Drawn:
         return f"BitsInteger({width})"
 
     def draw_reference(self) -> tuple[str, Known] | None:
-        """A field that stands before, as it is written from here."""
+        """Return a reference to an earlier field, as written at this position."""
         spots = [(up, one) for up, level in enumerate(reversed(self.levels)) for one in level]
         if not spots:
             return None
@@ -269,11 +269,11 @@ class Drawn:
         return f"this.{'_.' * up}{known.path}", known
 
     def function(self, path: str) -> str:
-        """The same as a Python function begins."""
+        """Return a reference as a Python lambda."""
         return f"lambda found: found{path.removeprefix('this')}"
 
     def count(self) -> str:
-        """The number of something."""
+        """Return an array's count."""
         asked = self.draw_reference()
         if asked is None:
             return str(self.source.randint(0, 3))
@@ -290,13 +290,14 @@ class Drawn:
 
 
 def spec(number: int, *, interpreted: bool = False) -> str:
-    """The text of the spec of this number; with `interpreted` it may hold what construct alone can
-    read.
+    """Return the text of the spec with this number.
+
+    If `interpreted`, it may contain parts that only construct can read.
     """
     source = Random(f"spec {number} {interpreted}")
     return Drawn(source, 2 + number % 7, interpreted).struct(0)
 
 
 def make_struct(text: str) -> construct.Construct:
-    """The struct that a text stands for."""
+    """Return the struct that a text describes."""
     return eval(text, NAMES)

@@ -27,8 +27,9 @@ MANY_HEADERS = 200
 
 
 def damage(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
-    """The stream with about this share of its bytes damaged, in runs of `burst`; at least one run,
-    unless the rate is 0.
+    """Return the stream with about this share of its bytes damaged, in runs of `burst`.
+
+    There is at least one run, unless the rate is 0.
     """
     if not rate:
         return data
@@ -102,7 +103,7 @@ def hostile_streams(subject: SensorUnderTest, length: int) -> Iterator[tuple[str
 
 
 def _repeat(make: Callable[[], bytes], length: int) -> bytes:
-    """Return pieces back to back, at least so many bytes; an empty piece counts as a zero byte."""
+    """Repeat pieces to at least this size; an empty piece counts as a zero byte."""
     found = bytearray()
     while len(found) < length:
         found += make() or b"\0"
@@ -126,7 +127,7 @@ def _cut(frame: bytes, source: random.Random) -> bytes:
 
 
 def clean(subject: SensorUnderTest, *, seed: int = 0, length: int = LENGTH) -> bytes:
-    """A conversation of about this length, at least one round."""
+    """Return a conversation of about this length, at least one round."""
     rounds = max(length // max(len(subject.stream(rounds=1)), 1), 1)
     return subject.stream(seed=seed, rounds=rounds)
 
@@ -154,8 +155,9 @@ def longest_example(subject: SensorUnderTest, name: str, headers: int = MANY_HEA
 
 
 class Books:
-    """A decoder whose books are checked after every call: each byte is in a frame, skipped or
-    pending.
+    """A decoder that verifies its counters after every call.
+
+    Each byte is in a frame, skipped or pending.
     """
 
     def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
@@ -163,11 +165,11 @@ class Books:
         self.found: list[Cut] = []
 
     def feed(self, chunk: bytes) -> Books:
-        """Enter what a chunk brings."""
+        """Decode a chunk and count its bytes and frames."""
         return self._add(cuts(self.decoder.feed(chunk)))
 
     def finish(self) -> list[Cut]:
-        """All frames, after the end of the input."""
+        """End the input; return all frames."""
         return self._add(cuts(self.decoder.finish())).found
 
     def _add(self, found: list[Cut]) -> Books:
@@ -180,7 +182,7 @@ class Books:
 
 
 def decode_chunks(sensor: Sensor, data: bytes) -> list[Cut]:
-    """The frames of a stream that comes in chunks of random sizes."""
+    """Decode a stream in chunks of random sizes; return its frames."""
     books = Books(sensor)
     for chunk in material.cut_randomly(data, random.Random(len(data))):
         books.feed(chunk)
@@ -188,7 +190,7 @@ def decode_chunks(sensor: Sensor, data: bytes) -> list[Cut]:
 
 
 def peak(task: Callable[[], object]) -> int:
-    """Bytes that a task holds at most beyond those held before."""
+    """Return the maximum of additional bytes that a task holds."""
     # collections are to look at what is made from here on, and not at all that the tests before
     # have left
     gc.freeze()

@@ -47,7 +47,7 @@ def line(tmp_path: Path) -> Iterator[Port]:
 
 
 def digest(packets: list[ls.Packets]) -> str:
-    """SHA-256 of what packets hold and of where they stand."""
+    """Return the SHA-256 of the packets' content and offsets."""
     found = hashlib.sha256()
     for name in ("raw", "offset", "host_ns", "breaks"):
         found.update(np.concatenate([getattr(batch, name) for batch in packets]).tobytes())
@@ -64,7 +64,7 @@ def receive(device: ls.Device, number: int) -> list[ls.Packets]:
 
 
 class TestReplay:
-    """P9: what was recorded decodes to what it was when it came, again and again."""
+    """Tests of P9: a recording decodes to the same values as the live data, repeatedly."""
 
     def test_a_frame_that_a_silence_cut_is_cut_again(self, line: Port, tmp_path: Path) -> None:
         frames, first, second = (
@@ -89,7 +89,7 @@ class TestReplay:
 
 
 class TestQueue:
-    """P12: produced == consumed + dropped + what waits, whatever the pace of both sides."""
+    """Tests of P12: produced == consumed + dropped + waiting, at any speed."""
 
     @pytest.mark.parametrize("policy", ["drop_oldest", "block"])
     @pytest.mark.parametrize("number", [20_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
@@ -122,7 +122,7 @@ class TestQueue:
 
 
 class TestFiles:
-    """P15: what stood under a name stays until its successor is whole."""
+    """Tests of P15: a file is kept until its replacement is complete."""
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz"])
     def test_an_export_that_fails_half_way_changes_nothing(

@@ -25,9 +25,7 @@ JIT = ("jit",) if importlib.util.find_spec("numba") else ()
 
 
 def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
-    """Bytes to try a spec on: its examples, damaged ones, and what construct reads from random
-    bytes.
-    """
+    """Return inputs for a spec: its examples, damaged ones, and random valid bytes."""
     source, found = Random(number), [b""]
     for seed in range(4):
         try:
@@ -54,7 +52,7 @@ def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
 
 
 def declare_sensor(struct: Construct) -> Sensor | None:
-    """A sensor of a spec; None where one name has several units in it, which is refused."""
+    """Return a sensor of a spec; None if it is refused because a name has several units."""
     try:
         return sensor(struct, max_length=LONGEST)
     except SpecError as error:
@@ -66,7 +64,7 @@ def declare_sensor(struct: Construct) -> Sensor | None:
 def try_spec(
     number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")
 ) -> None:
-    """Try a spec, and put its text before what fails."""
+    """Test a spec; add its text to the error of a failure."""
     text = spec(number, interpreted=interpreted)
     struct = make_struct(text)
     with contextlib.suppress(construct.SizeofError, KeyError):

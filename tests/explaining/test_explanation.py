@@ -279,7 +279,7 @@ def test_bit_fields_show_their_bits() -> None:
 
 
 def variant(*fields: object) -> Sensor:
-    """The sensor of a shape with another struct in its place."""
+    """Return the sensor of a shape with another struct."""
     struct = Checksummed(Struct(*fields), field="check", algorithm=Xor())
     frame = Frame(struct, data=True, max_length=9)
     return dataclasses.replace(

@@ -22,8 +22,9 @@ SPOT = 20
 def list_damaged(
     sent: Iterable[bytes], *, sensor: ls.Sensor = STL, datagrams: bool = False
 ) -> list[tuple[str, int, str]]:
-    """The type, length and verdict of each piece that is not a valid frame; all together are what
-    was sent, in order.
+    """Return type, length and verdict of each segment that is not a valid frame.
+
+    Fail unless the segments together are the input, in order.
     """
     sent = list(sent)
     found = iter_pieces(sensor, map(Chunk, sent), datagrams=datagrams)

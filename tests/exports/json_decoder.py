@@ -37,7 +37,7 @@ class Decoder:
         self.data, self.at, self.known = data, 0, {}
 
     def read(self, part: dict[str, Any]) -> Any:
-        """The value of a part that begins here."""
+        """Return the value of the part at this offset."""
         return getattr(self, "read_" + part["kind"])(part)
 
     def taken(self, size: int) -> bytes:
@@ -121,7 +121,7 @@ class Decoder:
         return found
 
     def read_one(self, kinds: list[dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
-        """A part as the first kind whose constants are right."""
+        """Return a part, decoded as the first type with matching constants."""
         start = self.at
         for kind in kinds:
             self.at = start

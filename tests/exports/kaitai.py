@@ -1,4 +1,4 @@
-"""Run the Kaitai compiler, if it is installed, and read frames with its output."""
+"""Return the compiled module of a sensor."""
 
 from __future__ import annotations
 
@@ -27,9 +27,7 @@ COMPILER = os.environ.get("LIDARSPEC_KSC", "kaitai-struct-compiler")
 
 
 def compile_all(sensors: Iterable[Sensor], folder: Path) -> None:
-    """A Python module for the export of each sensor; the test is skipped where there is no
-    compiler.
-    """
+    """Compile the export of each sensor to Python; skip the test without the compiler."""
     specs = []
     for sensor in sensors:
         specs.append(folder / f"{sensor.id}.ksy")
@@ -72,18 +70,19 @@ def module(sensor: Sensor, folder: Path) -> ModuleType:
 
 
 def reader(found: ModuleType, sensor: Sensor, frame: str) -> Any:
-    """The class of a frame type."""
+    """Return the class of a frame type."""
     return getattr(getattr(found, camel(identifier(make_prefix(sensor)))), camel(identifier(frame)))
 
 
 def camel(name: str) -> str:
-    """A name as Kaitai's classes have it."""
+    """Return a name as in Kaitai's classes."""
     return "".join(part.capitalize() for part in re.split("_+", name) if part)
 
 
 def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
-    """Where what construct parsed is not what Kaitai's class read; blocks and arrays inside it by
-    their flattened names.
+    """Return the differences between construct's values and those of Kaitai's class.
+
+    Blocks and arrays inside it are compared by their flattened names.
     """
     if isinstance(parsed, Mapping):
         return [

@@ -123,7 +123,7 @@ NUMBERS = Struct(
 
 
 def make_sealed_sensor(number: int, algorithm: Any, field: Any) -> Checksummed:
-    """A frame with a checksum in the middle."""
+    """Return a sensor with a checksum in the middle of its frame."""
     body = Struct(
         "magic" / Const(bytes([0xF1, number])),
         "count" / Int8ub,

@@ -29,7 +29,7 @@ def needs_tshark(test: Callable[..., None]) -> Callable[..., None]:
 
 
 def tshark(capture: Path, *arguments: str, scripts: Iterable[Path] = ()) -> str:
-    """What tshark prints; it must complain of nothing but being root."""
+    """Run tshark; return its output. Warnings other than about root are failures."""
     assert TSHARK is not None
     loaded = [option for script in scripts for option in ("-X", f"lua_script:{script}")]
     done = subprocess.run(
@@ -65,19 +65,19 @@ def columns(
 
 @functools.cache
 def dissector(sensor: Sensor) -> str:
-    """The dissector of a sensor, made once."""
+    """Return the dissector of a sensor, from a cache."""
     return export(sensor, "wireshark")
 
 
 def written(sensor: Sensor, folder: Path) -> Path:
-    """The dissector of a sensor in a file."""
+    """Write the dissector of a sensor to a file; return its path."""
     script = folder / f"{sensor.id}.lua"
     script.write_text(dissector(sensor))
     return script
 
 
 def write_capture(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
-    """A capture of these frames, one to a packet, as the sensor's data link carries them."""
+    """Write a capture of these frames, one a packet, for the sensor's data link."""
     link = sensor.links["data"]
     with path.open("wb") as file:
         file.write(capture_head(ETHERNET if sensor.datagrams else USER_LINKS[0]))

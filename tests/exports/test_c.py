@@ -86,7 +86,7 @@ int main(void)
 
 @functools.cache
 def subjects() -> dict[str, Sensor]:
-    """Load every sensor that C can say, one for each set of frames, by id."""
+    """Return every sensor that C supports, one for each set of frames, by id."""
     refused = {*REFUSED, *REFUSED_INSTALLED}
     sensors = distinct_sensors()
     return {
@@ -158,8 +158,9 @@ def test_every_header_is_cplusplus_too(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module", params=["plain", pytest.param("checked", marks=pytest.mark.soak)])
 def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A program that prints all fields of the frames it is given; checked, it stops at the first
-    byte read outside them.
+    """Compile a program that prints all fields of frames.
+
+    If checked, it ends at the first byte read outside a frame.
     """
     folder = tmp_path_factory.mktemp("c")
     source, program = folder / "reader.c", folder / "reader"
@@ -252,8 +253,9 @@ def _word(text: str) -> str:
 
 
 def _dump(sensor: Sensor, name: str) -> str:
-    """A function that prints the fields of one frame type: which they are, and in which arrays,
-    comes from the schema of lidarspec.
+    """Return a C function that prints the fields of one frame type.
+
+    The fields and arrays come from lidarspec's schema.
     """
     table = get_codec(sensor.frames[name]).schema
     prefix = f"{_word(make_prefix(sensor))}_{name}"
@@ -293,7 +295,7 @@ def _make_print_code(table: Schema, path: str, prefix: str, text: str) -> Iterat
 
 @functools.cache
 def export_of(name: str) -> str:
-    """The header of a sensor, made once."""
+    """Return the header of a sensor, from a cache."""
     return export(subjects()[name], "c")
 
 

@@ -18,7 +18,7 @@ PAGE, NAME = "how-to/export.md", "ldrobot-stl27l"
 
 
 def first(language: str) -> str:
-    """The first block of a language on the page."""
+    """Return the first block of a language on the page."""
     return next(block.text for block in blocks(PAGE) if block.language == language)
 
 

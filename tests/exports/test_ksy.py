@@ -47,14 +47,14 @@ REFUSED_INSTALLED = dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _
 
 @functools.cache
 def subjects() -> dict[str, Sensor]:
-    """Load every sensor that Kaitai can say, one for each set of frames, by id."""
+    """Return every sensor that Kaitai supports, one for each set of frames, by id."""
     sensors = distinct_sensors()
     refused = {*REFUSED, *REFUSED_INSTALLED, *find_recoded(sensors.values()), "shape-oddities"}
     return {name: sensor for name, sensor in sensors.items() if name not in refused}
 
 
 def make_sensor(*fields: Any, case: str = "odd") -> Sensor:
-    """A sensor of this one frame."""
+    """Return a sensor with only this frame."""
     frame = Frame(Struct("sync" / Const(b"\x01\x02"), *fields), data=True, max_length=64)
     return Sensor(
         f"acme-{case.replace('_', '-')}",

@@ -32,7 +32,7 @@ class Own(Checksum):
 
 
 def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
-    """A sensor with one frame of these fields."""
+    """Return a sensor with one frame of these fields."""
     struct: Any = Struct("magic" / Const(b"\xf0\x09"), "a" / Int8ub, *fields)
     if algorithm is not None:
         struct = Checksummed(struct, field="a", algorithm=algorithm)

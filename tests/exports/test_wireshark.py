@@ -154,8 +154,9 @@ def assert_shown(
     frames: Sequence[tuple[str, bytes]],
     *arguments: str,
 ) -> None:
-    """Fail unless tshark shows each packet as this frame, with the values that lidarspec parses,
-    and has nothing to say against it.
+    """Fail unless tshark shows each packet as this frame without warnings.
+
+    The values must be those that lidarspec parses.
     """
     prefix = sensor.id.replace("-", "_")
     paths = [

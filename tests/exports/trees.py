@@ -42,7 +42,7 @@ def distinct_frames(sensors: Iterable[Sensor]) -> list[tuple[Sensor, str]]:
 
 
 def is_recoded(sensor: Sensor) -> bool:
-    """Return whether a frame stands on the wire in a form that no other language reads."""
+    """Return whether a frame has a wire form that other languages cannot read."""
     return any(frame.wire is not None for frame in sensor.frames.values())
 
 
@@ -52,12 +52,12 @@ def find_recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
 
 
 def number(value: Any) -> Any:
-    """A value without the name that an Enum gives it, which other languages do not compare by."""
+    """Return a value without its Enum name, which other languages do not compare."""
     return int(value) if isinstance(value, EnumIntegerString) else value
 
 
 def values(parsed: Any) -> dict[str, list[Any]]:
-    """The values of a parsed frame in the order of the wire, by path without indices."""
+    """Return the values of a parsed frame in wire order, by path without indices."""
     found: dict[str, list[Any]] = {}
     _take(parsed, "", found)
     return found

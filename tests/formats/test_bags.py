@@ -36,7 +36,7 @@ def messages(path: Path) -> list[tuple[str, int, Any]]:
 
 
 def points(message: Any) -> np.ndarray:
-    """The points of a PointCloud2, (height, width), by what it says of itself."""
+    """Return the points of a PointCloud2, (height, width), by its own description."""
     fields = {
         "names": [field.name for field in message.fields],
         "formats": [TYPES[field.datatype] for field in message.fields],

@@ -31,7 +31,7 @@ def extras() -> list[Scan]:
 
 
 def picture(*, columns: int = 4, rows: int = 3) -> Scan:
-    """One organised scan; `ring` is the row of a point."""
+    """Return one organised scan; `ring` is the row of a point."""
     one = scan(0, columns * rows)
     return replace(
         one,

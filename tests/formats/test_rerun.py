@@ -27,7 +27,7 @@ reading = Library("rerun.chunk")
 
 
 def read_log(path: Path) -> dict[str, dict[str, list[Any]]]:
-    """What is logged under each path: the values of each column, in the order of the scans."""
+    """Return the logged values by path and column, in the order of the scans."""
     found: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for chunk in reading.RrdReader(path).stream():
         found[chunk.entity_path] += chunk.to_record_batch().to_pylist()

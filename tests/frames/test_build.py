@@ -23,7 +23,7 @@ VALUES = {"key": b"abc", "v": [1, 2], "s": [{"x": 1}] * 2, "t.u": 1, "t.w": 0}
 
 
 def make_command_sensor(**args: Any) -> Sensor:
-    """A sensor with a command that has these arguments."""
+    """Return a sensor with a command that has these arguments."""
     return sound.sensor(
         frames={"data": sound.frame(), "order": ORDER},
         commands={"start": Command("order", VALUES, args=args)},

@@ -141,7 +141,7 @@ class Case:
 
 
 def case(*members: Construct, frames: str, reason: str = "", is_rest: bool = False) -> Case:
-    """A case whose frames are given in hexadecimal, with spaces between them."""
+    """Return a case with frames in hexadecimal, separated by spaces."""
     return Case(members, tuple(map(bytes.fromhex, frames.split())), reason, is_rest)
 
 
@@ -363,12 +363,12 @@ CASES = COMPILED | PLAIN
 
 
 def of_links(made: Sensor, *links: Any) -> Sensor:
-    """A sensor with another data link."""
+    """Return a sensor with another data link."""
     return dataclasses.replace(made, links={"data": links[0]})
 
 
 def bare(value: Any) -> Any:
-    """A parsed value of construct as dicts, lists and values, with lazy ones read."""
+    """Return construct's value as dicts, lists and values, with lazy ones read."""
     if isinstance(value, construct.lib.containers.Container | construct.core.LazyContainer):
         return {name: bare(value[name]) for name in value if not name.startswith("_")}
     if callable(value):
@@ -379,7 +379,7 @@ def bare(value: Any) -> Any:
 
 
 def has_all(found: Any, wanted: Any) -> bool:
-    """Whether a value has everything that construct reads; it may have more fields."""
+    """Return whether a value has all fields of construct's; it may have more."""
     if isinstance(wanted, dict):
         return all(name in found and has_all(found[name], wanted[name]) for name in wanted)
     if isinstance(wanted, list):
@@ -388,7 +388,7 @@ def has_all(found: Any, wanted: Any) -> bool:
 
 
 def drop_unread(value: Any) -> Any:
-    """A parsed value without None, which construct gives where there is nothing to read."""
+    """Return a parsed value without None, construct's value for absent parts."""
     if isinstance(value, dict):
         return {name: drop_unread(part) for name, part in value.items() if part is not None}
     return value

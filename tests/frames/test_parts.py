@@ -318,7 +318,7 @@ FALSE_HEADERS = 300
 
 
 def make_numbered_sensor() -> Sensor:
-    """Return a sensor whose frames say with four bytes how many parts there are."""
+    """Return a sensor with frames that give the number of parts in four bytes."""
     kinds = {
         "short": Struct("type" / Const(b"\x01"), "value" / Int8ub),
         "long": Struct("type" / Const(b"\x02"), "length" / Int8ub, "content" / Bytes(this.length)),

@@ -39,7 +39,7 @@ MARK = 0x5A
 
 
 def plain_sensor(*members: Construct, max_length: int = 64) -> Sensor:
-    """A sensor whose frames have these members between a constant and a text."""
+    """Return a sensor with these members between a constant and a text."""
     mark = "mark" / Const(MARK, Int8ub)
     text = "text" / NullTerminated(GreedyBytes)
     made = sensor(Struct(mark, *members, text), max_length=max_length)

@@ -31,7 +31,7 @@ TOKENS, LINES, JOINED, ESCAPED = (
 
 
 def sensor(struct: Struct, form: object, longest: int = 200) -> Sensor:
-    """A sensor with one frame in this form."""
+    """Return a sensor with one frame in this form."""
     frames = {"data": Frame(struct, data=True, max_length=longest, wire=form)}  # type: ignore[arg-type]
     return dataclasses.replace(TOKENS, frames=frames, clock=None, sequence=None)
 
@@ -221,7 +221,7 @@ def test_a_status_of_scip_has_the_sum_of_the_specification() -> None:
 
 
 def make_joined_frame(steps: int, characters: bytes) -> bytes:
-    """A frame of shape-joined of these characters, in lines with their checks."""
+    """Return a frame of shape-joined with these characters, in lines with checksums."""
     lines = Lines(32, head=(4, 3), bare=1, check=Scip())
     return lines.encode(b"NE0%d000" % steps + characters, ())
 

@@ -34,7 +34,7 @@ def message(number: int) -> bytes:
 
 
 def fragments(number: int, size: int = 30) -> list[bytes]:
-    """The datagrams of a message."""
+    """Return the datagrams of a message."""
     data = message(number)
     parts = [data[start : start + size] for start in range(0, len(data), size)]
     return [

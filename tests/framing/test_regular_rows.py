@@ -44,8 +44,8 @@ QUICK_STREAMS = (
 )
 
 
-def as_it_comes(data: bytes, size: int, seed: int) -> list[bytes]:
-    """A stream in pieces of a few frames and a part of one."""
+def split_randomly(data: bytes, size: int, seed: int) -> list[bytes]:
+    """Return a stream in random pieces of up to five frames."""
     source, found = random.Random(seed), []
     while data:
         step = source.randint(1, 5 * size)
@@ -55,7 +55,7 @@ def as_it_comes(data: bytes, size: int, seed: int) -> list[bytes]:
 
 
 def is_steady(frames: Frames) -> bool:
-    """Whether frames were found as rows, one after another, without a search."""
+    """Return whether frames were found in rows, without a search."""
     return isinstance(frames.places, range)
 
 
@@ -80,7 +80,7 @@ def test_small_pieces_give_the_same_frames(name: str, rate: float) -> None:
         whole = Books(sensor).feed(data)
         expected = whole.finish()
         parts = Books(sensor)
-        for piece in as_it_comes(data, size, seed):
+        for piece in split_randomly(data, size, seed):
             parts.feed(piece)
         assert parts.finish() == expected
         assert parts.decoder.stats == whole.decoder.stats
@@ -89,7 +89,7 @@ def test_small_pieces_give_the_same_frames(name: str, rate: float) -> None:
 def test_clean_frames_are_found_so() -> None:
     data = b"".join(TWINS.example("data", seed=seed) for seed in range(40))
     decoder = TWINS.decoder()
-    found = [frames for piece in as_it_comes(data, 18, 1) for frames in decoder.frames(piece)]
+    found = [frames for piece in split_randomly(data, 18, 1) for frames in decoder.frames(piece)]
     assert sum(is_steady(frames) for frames in found) > 5
     assert sum(map(len, found)) == 40
 
@@ -131,7 +131,7 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
 def test_a_type_that_comes_first_is_looked_for_at_each_frame() -> None:
     data = b"".join(SHORT_FIRST.example("data", seed=seed) for seed in range(40))
     decoder = SHORT_FIRST.decoder()
-    for piece in as_it_comes(data, 18, 1):
+    for piece in split_randomly(data, 18, 1):
         decoder.frames(piece)
     assert decoder.stats.frames == {"data": 40}
     assert decoder.stats.bad_checksum + decoder.stats.implausible == 40

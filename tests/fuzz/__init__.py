@@ -10,5 +10,5 @@ from __future__ import annotations
 
 
 def slug(name: str) -> str:
-    """A target's name as that of a file."""
+    """Return a target's name as a file name."""
     return name.replace(" ", ".")

@@ -30,7 +30,7 @@ SEEDED = {"capture", "file", "log", "recording"}
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="make fuzz", description=__doc__)
     parser.add_argument(
         "--inputs",
@@ -110,7 +110,7 @@ def main() -> int:
 
 
 def list_targets(folder: Path, only: list[str] | None) -> dict[str, float]:
-    """The targets that are asked for, and what an input of each costs."""
+    """Return the requested targets, and the cost of an input of each."""
     from tests.every_sensor import every_sensor
     from tests.fuzz.targets import targets
 
@@ -126,8 +126,9 @@ def list_targets(folder: Path, only: list[str] | None) -> dict[str, float]:
 
 
 def spread(costs: dict[str, float], number: int) -> dict[str, int]:
-    """How many inputs each target gets: the shares of the groups, and within one the fewer the more
-    they cost.
+    """Return the number of inputs of each target.
+
+    It depends on the share of its group and, within the group, on the cost of an input.
     """
     from tests.fuzz.targets import SHARES
 
@@ -144,7 +145,7 @@ def spread(costs: dict[str, float], number: int) -> dict[str, int]:
 
 
 def run(given: argparse.Namespace, waiting: list[str], shares: dict[str, int]) -> None:
-    """Run the jobs, so many at a time; what each did is kept when it ends."""
+    """Run the jobs, `given.jobs` at a time, and store each result when a job ends."""
     running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
     queue = list(waiting)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -174,7 +175,7 @@ def run(given: argparse.Namespace, waiting: list[str], shares: dict[str, int]) -
 
 
 def start(given: argparse.Namespace, name: str, number: int) -> subprocess.Popen[bytes]:
-    """The process of one job."""
+    """Start the process of one job."""
     (given.folder / "jobs").mkdir(parents=True, exist_ok=True)
     report = given.folder / "jobs" / f"{slug(name)}.json"
     report.unlink(missing_ok=True)
@@ -203,7 +204,7 @@ def start(given: argparse.Namespace, name: str, number: int) -> subprocess.Popen
 def store_results(
     given: argparse.Namespace, name: str, asked: int, process: subprocess.Popen[bytes]
 ) -> None:
-    """Keep what a job did; the input at which its process died is a finding of its own."""
+    """Store the results of a job; the input that ended its process is a finding."""
     from tests.fuzz.campaign import keep
     from tests.fuzz.trial import Finding
 
@@ -251,8 +252,9 @@ def store_results(
 
 
 def print_results(given: argparse.Namespace, names: list[str]) -> int:
-    """Print what all jobs of this seed did, by group, and how each finding is had again; 1 where
-    there is one.
+    """Print the results of this seed by group, and the command to repeat each finding.
+
+    Returns 1 if there is a finding.
     """
     every = [
         json.loads(path.read_text())
@@ -286,8 +288,9 @@ def print_results(given: argparse.Namespace, names: list[str]) -> int:
 
 
 def child(given: argparse.Namespace) -> int:
-    """Run one job, or one input again, in this process: alone, in a folder of its own, and with
-    nobody's settings.
+    """Run one job, or one input again, in this process.
+
+    It uses a separate folder, and no user settings.
     """
     os.environ.update(OPENBLAS_NUM_THREADS="1", COLUMNS="80")
     is_guided = (

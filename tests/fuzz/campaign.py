@@ -52,18 +52,16 @@ class Job:
 
     @property
     def corpus(self) -> Path:
-        """The folder of inputs that reached something new."""
+        """Return the folder of inputs that reached new lines."""
         return self.folder / "corpus" / slug(self.target.name)
 
     @property
     def current(self) -> Path:
-        """The file of the input that is being read: what remains of a process that does not live to
-        report it.
-        """
+        """Return the file of the current input, which remains if the process dies."""
         return self.folder / "current" / slug(self.target.name)
 
     def read(self, data: bytes) -> None:
-        """Read an input, keep what is found."""
+        """Read an input, and store a finding."""
         self._current.seek(0)
         self._current.write(len(data).to_bytes(4, "little") + data)
         found = judge(self.target, data)
@@ -90,7 +88,10 @@ class Job:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[list[bytes]]:
-        """The inputs to begin with, each read once within no limits; then the limits hold."""
+        """Yield the initial inputs, within the limits of memory and time.
+
+        Each is read once before the limits apply.
+        """
         for path in (self.corpus, self.current.parent, self.folder / "jobs"):
             path.mkdir(parents=True, exist_ok=True)
         beginning = [
@@ -98,7 +99,7 @@ class Job:
             *(path.read_bytes() for path in sorted(self.corpus.iterdir())),
         ]
         for data in beginning:
-            with contextlib.suppress(Exception):  # told when it is read within the limits
+            with contextlib.suppress(Exception):  # reported when it is read again within the limits
                 self.target.run(data)
         with limits(), self.current.open("wb", buffering=0) as self._current:
             self._began = time.monotonic()
@@ -108,7 +109,7 @@ class Job:
 
 
 def keep(folder: Path, found: Finding) -> Path:
-    """Write the input of a finding to a file of its own, and what it did beside it."""
+    """Write the input of a finding and its report to files."""
     path = folder / "findings" / slug(found.target) / hashlib.sha256(found.data).hexdigest()[:12]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(found.data)

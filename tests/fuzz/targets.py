@@ -72,18 +72,18 @@ STL, VLP = "ldrobot-stl27l", "velodyne-vlp16"
 
 @dataclass(frozen=True)
 class Target:
-    """Something that reads.
+    """A reader under test.
 
     Attributes:
-        name: its group, and within it the sensor or format.
-        run: reads one input; whatever it raises that is not documented is a finding.
-        examples: valid inputs, made by the project itself.
-        documented: what it may raise.
-        words: what mutations put in as a whole; `EDGES` where there are none of its own.
-        spots: where the fields of an input begin.
-        mended: the input with its checksums right again, as far as it has some.
-        is_text: whether it has numbers, texts and lists, any of which becomes a word at times.
-        cost: of an input, beside those of others of its group: what is dear is read less often.
+        name: its group, then the sensor or format.
+        run: reads one input; an undocumented exception is a finding.
+        examples: returns valid inputs, made by the project itself.
+        documented: the documented exceptions.
+        words: returns byte strings that mutations insert; `EDGES` by default.
+        spots: returns the offsets of the fields of an input.
+        mended: returns the input with its checksums corrected, if it has some.
+        is_text: whether mutations may replace numbers, texts and lists.
+        cost: relative cost of an input within the group; expensive ones are read less often.
     """
 
     name: str
@@ -101,8 +101,9 @@ class Target:
         return self.name.partition(" ")[0]
 
     def mutation(self, data: bytes, other: bytes, source: random.Random) -> bytes:
-        """A neighbour of an input, with a piece of another one in it at times; half of them have
-        their checksums mended.
+        """Return a mutation of an input, sometimes with a piece of another one.
+
+        Half of the mutations have correct checksums.
         """
         if self.is_text and source.random() < 0.5 and (values := list(VALUE.finditer(data))):
             start, end = source.choice(values).span()
@@ -400,7 +401,7 @@ def _file(folder: Path) -> Target:
 
 
 def _log(folder: Path, kind: str) -> Target:
-    """Logs of ROS and Foxglove with packets of a sensor, named as what they are."""
+    """Read logs of ROS and Foxglove with packets of a sensor, under their own suffix."""
     path = folder / f"some.{kind}"
 
     def run(data: bytes) -> None:
@@ -456,7 +457,7 @@ def _manifest(folder: Path) -> Target:
 
 
 def write_recording(sensor: str, frames: Iterable[bytes]) -> bytes:
-    """A recording of these frames."""
+    """Write a recording of these frames."""
     datagrams = ls.sensor(sensor).datagrams
     sender = {"sender": ("192.0.2.1", 2368), "receiver": ("192.0.2.2", 2368)} if datagrams else {}
     records = [
@@ -775,7 +776,7 @@ def _metadata(rows: int) -> bytes:
 
 
 def _resolve_text(data: bytes) -> None:
-    """What a SOURCE's text says, as far as nothing is opened."""
+    """Parse the text of a SOURCE without opening it."""
     text = data.decode("utf-8", "replace")
     is_port(text)
     if (address := live_address(text)) is not None:
@@ -786,6 +787,6 @@ def _resolve_text(data: bytes) -> None:
 
 
 def _but(documented: type[Exception], call: Callable[[], object]) -> None:
-    """Make a call that may raise what is documented."""
+    """Make a call that may raise a documented exception."""
     with contextlib.suppress(documented):
         call()

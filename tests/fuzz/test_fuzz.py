@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def few(folder: Path) -> dict[str, Target]:
-    """The targets of the shapes, and the calibration files of a sensor."""
+    """Return the targets of the shapes, and the calibration files of a sensor."""
     return targets(folder, [*SHAPES.values(), ls.sensor("hesai-xt16")])
 
 

@@ -29,14 +29,14 @@ class TooLong(BaseException):
 
 @dataclass(frozen=True)
 class Finding:
-    """An input that did harm.
+    """An input with an undocumented result.
 
     Attributes:
-        target: the name of what read it.
-        data: it.
+        target: the name of the target.
+        data: the input.
         what: the exception.
-        place: the innermost line of lidarspec or of a plugin that it came out of: the same for the
-            same fault.
+        place: the innermost line of lidarspec or of a plugin in the traceback, which identifies
+            the fault.
     """
 
     target: str
@@ -47,9 +47,7 @@ class Finding:
 
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
-    """A process in which no input takes more memory than it may, and in which `judge` can count
-    its time.
-    """
+    """Limit the memory of the process, and let `judge` measure the time of an input."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     bound_memory()
     handlers = {kind: signal.signal(kind, _late) for kind in (signal.SIGPROF, signal.SIGALRM)}
@@ -62,8 +60,9 @@ def limits() -> Iterator[None]:
 
 
 def bound_memory() -> None:
-    """From now on the process may take so much more memory; asked for now and then, since what
-    chooses inputs keeps some of them.
+    """Limit the additional memory of the process.
+
+    Called again at times, because the input generator keeps some inputs.
     """
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
@@ -76,7 +75,7 @@ def _late(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def judge(target: Target, data: bytes) -> Finding | None:
-    """What is wrong with how an input is read; None where nothing is."""
+    """Return the finding for an input, None if its result is documented."""
     signal.setitimer(signal.ITIMER_PROF, BUSY)
     signal.setitimer(signal.ITIMER_REAL, WAITING)
     try:
@@ -93,7 +92,7 @@ def judge(target: Target, data: bytes) -> Finding | None:
 
 
 def _place(error: BaseException) -> str:
-    """The innermost line of ours, else the innermost of all."""
+    """Return the innermost line of our code, otherwise the innermost of all."""
     spots = traceback.extract_tb(error.__traceback__)
     ours = [spot for spot in spots if any(part in spot.filename for part in _OURS)]
     spot = (ours or spots)[-1]

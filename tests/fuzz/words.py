@@ -135,7 +135,7 @@ def spoken() -> list[bytes]:
 
 
 def words(data: bytes) -> list[str]:
-    """The command line that bytes choose."""
+    """Return the command line that bytes select."""
     if not data:
         return []
     verb = ENDING[data[0] % len(ENDING)]
@@ -171,7 +171,7 @@ def words(data: bytes) -> list[str]:
 
 
 def _value(name: str, kind: int, choice: int) -> str:
-    """A value for an argument or option: mostly one that fits."""
+    """Return a value for an argument or option, usually a valid one."""
     if kind % 4 == 0:
         return HOSTILE[choice % len(HOSTILE)]
     known = _list_known(name)

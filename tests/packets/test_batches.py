@@ -48,7 +48,7 @@ def column(batches: list[Packets], name: str) -> np.ndarray:
 
 
 def disturb(datagrams: list[bytes], draw: random.Random, loss: float) -> list[bytes]:
-    """The datagrams with some lost, some late, some twice, and noise between."""
+    """Return the datagrams with some lost, late or duplicate, and noise between them."""
     left = [datagram for datagram in datagrams if draw.random() >= loss]
     for _ in range(len(left) // 20 if loss else 0):
         spot = draw.randrange(len(left))

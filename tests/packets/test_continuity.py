@@ -29,8 +29,10 @@ def decode(sensor: Sensor, frames: Sequence[bytes]) -> Packets:
     return sensor.decode(list(frames) if sensor.datagrams else b"".join(frames))
 
 
-def in_pieces(sensor: Sensor, frames: Sequence[bytes], size: int) -> tuple[np.ndarray, Counters]:
-    """The index of each packet of datagrams that come some at a time."""
+def decode_in_pieces(
+    sensor: Sensor, frames: Sequence[bytes], size: int
+) -> tuple[np.ndarray, Counters]:
+    """Decode datagrams in pieces; return the index of each packet, and the counters."""
     decoder = sensor.decoder()
     stream = PacketStream(sensor, "data", decoder.stats)
     parts = [frames[start : start + size] for start in range(0, len(frames), size)]
@@ -217,9 +219,9 @@ def test_pieces_do_not_matter(name: str, seed: int) -> None:
         spot = draw.randrange(20, len(frames) - 20)
         frames.insert(spot + draw.randint(0, 5), frames.pop(spot))
         frames.insert(draw.randrange(len(frames)), frames[spot])
-    index, stats = in_pieces(sensor, frames, len(frames))
+    index, stats = decode_in_pieces(sensor, frames, len(frames))
     for size in (1, 7, 64):
-        other, others = in_pieces(sensor, frames, size)
+        other, others = decode_in_pieces(sensor, frames, size)
         assert np.array_equal(other, index)
         assert others == stats
 

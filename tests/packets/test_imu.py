@@ -137,7 +137,7 @@ def test_scans_have_their_imu_samples(tmp_path: Path) -> None:
 
 
 def written(folder: Path) -> str:
-    """A sensor's module."""
+    """Write a sensor's module; return its path."""
     path = folder / "inertia.py"
     hook = [
         "from lidarspec.spec import hookimpl",

@@ -32,7 +32,7 @@ def make_frames(*numbers: int) -> list[bytes]:
 
 
 def block(number: int | None) -> bytes:
-    """A frame of one block, with this counter or without."""
+    """Return a frame of one block, with or without a counter."""
     channels = [{"distance": 500, "strength": 9}] * 3
     blocks = [{"azimuth": 0, "channels": channels}]
     return headed.SENSOR.build(

@@ -74,7 +74,10 @@ print(json.dumps(sorted(set(sys.modules) - before)))
 
 
 def list_imported(code: str) -> set[str]:
-    """The modules that a new process imports for this, beyond NumPy, construct and pluggy."""
+    """Return the modules that a new process imports for this code.
+
+    NumPy, construct and pluggy are left out.
+    """
     done = subprocess.run(
         [sys.executable, "-c", LOADED.format(code)],
         check=True,

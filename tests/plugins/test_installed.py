@@ -29,7 +29,7 @@ from tests.shapes import SHAPES
 
 
 def by_metadata(group: str) -> list[tuple[str, str, str, str]]:
-    """The reference."""
+    """Return the entry points as importlib.metadata finds them."""
     found = [
         (e.name, e.value, e.dist.name, e.dist.version)
         for e in importlib.metadata.entry_points(group=group)

@@ -31,7 +31,7 @@ def lidarspec_verbs():
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder with a distribution of some verbs."""
+    """Return a folder with a distribution of some verbs."""
     about = tmp_path / "acme_survey-1.2.dist-info"
     about.mkdir()
     (about / "METADATA").write_text(

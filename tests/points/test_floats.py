@@ -30,7 +30,7 @@ ODD = [0.0, -0.0, np.nan, np.inf, -np.inf, 3.4e38, -1.0, 1.5, 1e-45, -1e-38, 0.1
 
 
 def bits(column: NDArray[Any]) -> NDArray[Any]:
-    """A float32 column bit by bit, but for what kind of no number a nan is."""
+    """Return a float32 column as bits, with all NaNs equal."""
     return np.where(np.isnan(column), np.float32(np.nan), column).view(np.uint32)
 
 

@@ -50,7 +50,10 @@ def _forget() -> None:
 
 
 def _is_read() -> bool:
-    """Whether the kernel, as in a new process, comes out of the folder; right it is in any case."""
+    """Return whether a new process would read the kernel from the folder.
+
+    Fail unless the kernel is correct.
+    """
     _forget()
     kernel = compile_source(SOURCE)
     assert kernel(41) == 42

@@ -38,7 +38,7 @@ SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 
 
 def plan(packets: Packets) -> Any:
-    """The plan of the longest packets that have points; why there is none, where there is none."""
+    """Return the plan of the longest packets with points, or the reason for its absence."""
     assert isinstance(packets.table, CompiledTable)
     made: Any = None
     for group in sorted(packets.table.groups, key=lambda group: -group.layout.size):
@@ -78,7 +78,7 @@ def test_every_installed_sensor_has_a_plan(module: str) -> None:
 
 
 def assert_sensors_have_a_plan(sensors: list[Sensor]) -> None:
-    """Fail unless points of each sensor are planned, and are those of the plain evaluation."""
+    """Fail unless each sensor has a plan, with the points of the plain evaluation."""
     for installed in sensors:
         packets = packets_of(installed, 5)
         if packets.points().valid.any():  # headers of random counts may leave none

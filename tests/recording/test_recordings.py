@@ -337,7 +337,7 @@ for number in range(10**9):
 
 
 def kill_recorder(path: Path, after: float) -> int:
-    """The last number that a recorder acknowledged before it was killed."""
+    """Kill a recorder; return the last number that it acknowledged."""
     with subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE
     ) as child:

@@ -38,7 +38,7 @@ posix = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo term
 
 @pytest.fixture
 def stream(tmp_path: Path) -> Path:
-    """A serial recording of 200 frames in pieces that do not end where frames do."""
+    """Return a serial recording of 200 frames, in pieces that end within frames."""
     sensor = ls.sensor(STREAM)
     data = b"".join(sensor.example("data", seed=seed) for seed in range(200))
     pieces = [data[start : start + 100] for start in range(0, len(data), 100)]
@@ -52,7 +52,7 @@ def stream(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def datagrams(tmp_path: Path) -> Path:
-    """A recording of 100 datagrams to two ports."""
+    """Return a recording of 100 datagrams to two ports."""
     sensor = ls.sensor(DATAGRAMS)
     frames = [sensor.example("data", seed=seed) for seed in range(8)]
     path = tmp_path / "datagrams.lsr"

@@ -16,7 +16,7 @@ from lidarspec.scans.beams import PlanarScans
 
 
 def simulate_scans(name: str, packets: int = 1000) -> list[Scan]:
-    """The whole scans of a simulated sensor."""
+    """Return the complete scans of a simulated sensor."""
     sensor = ls.sensor(name)
     return [scan for scan in sensor.scans(simulate(sensor, packets)) if scan.whole]
 
@@ -28,7 +28,7 @@ def planar(planes: PlanarScans, scans: Iterable[Scan]) -> list[LaserScan]:
 
 
 def beams_of(one: LaserScan, scan: Scan) -> np.ndarray:
-    """The beam of each point."""
+    """Return the beam of each point."""
     ahead = scan.points.azimuth.astype(float) - one.angle_min + one.angle_increment / 2
     return np.floor(ahead % (2 * math.pi) / one.angle_increment).astype(int)
 

@@ -159,7 +159,7 @@ def test_small_scans_may_be_read_in_any_order(seed: int) -> None:
 
 
 def small_scans() -> Sensor:
-    """A sensor whose every packet is a scan of its own."""
+    """Return a sensor with one scan per packet."""
     vlp16 = ls.sensor("velodyne-vlp16")
     return Sensor(
         "test-small",
@@ -291,7 +291,7 @@ def test_scans_with_gaps_are_incomplete_or_not_whole(
     noise = random.Random(5)
 
     def scans_with(share: float, pieces: int) -> list[Scan]:
-        """The scans where a share of the packets is damaged, read in so many pieces."""
+        """Return the scans with a share of the packets damaged, read in `pieces` pieces."""
         data = b"".join(bytes(len(frame)) if noise.random() < share else frame for frame in frames)
         stream, decoder = ScanStream(sensor), judged.decoder(stream=True)
         packets = PacketStream(sensor, "data", decoder.stats, backend=judged.backend)

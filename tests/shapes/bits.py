@@ -55,7 +55,7 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """Two returns on each beam, out of the two arrays; both stand on the axis of the first."""
+    """Return two returns of each beam, from two arrays, on the axis of the first."""
     step = np.arange(SAMPLES) * 2.0
     azimuth = np.deg2rad(f.first + f.drift * 0.001 + step)
     return Polar(

@@ -19,7 +19,7 @@ EXAMPLE = Path(__file__).with_name("calibration.json")
 
 
 def data(channels: int) -> Checksummed:
-    """The data frame of a model with so many channels."""
+    """Return the data frame of a model with this number of channels."""
     return Checksummed(
         Struct(
             "header" / Const(b"\xca\x1b"),
@@ -34,7 +34,7 @@ def data(channels: int) -> Checksummed:
 
 
 def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
-    """The sensor with the frames and elevations of a calibration file."""
+    """Return the sensor with the frames and elevations of a calibration file."""
     try:
         elevations = json.loads(Path(calibration).read_text(encoding="utf-8"))["elevations"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -44,7 +44,7 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
     table = np.deg2rad(elevations)
 
     def points(f: Fields) -> Polar:
-        """A row that the file does not know gives no direction."""
+        """Return points; a row that is not in the file has no direction."""
         return Polar(
             range=f.channels.distance,
             azimuth=np.deg2rad(f.azimuth),

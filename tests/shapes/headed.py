@@ -52,7 +52,7 @@ def points_with(elevation: Any, *, nominal: bool) -> Callable[[Fields], Polar]:
 
 
 def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
-    """The sensor with the elevations of a file."""
+    """Return the sensor with the elevations of a file."""
     elevations = json.loads(Path(calibration).read_text(encoding="utf-8"))["elevations"][:CHANNELS]
     return dataclasses.replace(sensor, points=points_with(elevations, nominal=False))
 

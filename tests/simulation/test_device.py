@@ -48,7 +48,7 @@ def on(sensor: Sensor, **options: object) -> SimulatedDevice:
 
 
 def send_command(device: SimulatedDevice, name: str, now: int, **arguments: object) -> bytes:
-    """What comes at once for a command."""
+    """Send a command; return the immediate replies."""
     command = device.sensor.commands[name]
     device.receive(device.sensor.command(name, **arguments), now, command.link)
     return b"".join(data for _, data in device.outgoing(now))

@@ -47,7 +47,7 @@ def vlp() -> ls.Sensor:
 
 
 def scans(device: ls.Device, number: int) -> list[ls.Scan]:
-    """So many scans of which both ends were seen; fails where they do not come."""
+    """Read `number` whole scans; fail if they do not arrive."""
     found: list[ls.Scan] = []
     deadline = time.monotonic() + TIMEOUT_S
     for scan in device.scans(wait=0.05):

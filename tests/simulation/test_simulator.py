@@ -39,8 +39,9 @@ SHAPE = count.SENSOR
 
 
 def take_coordinates(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
-    """The coordinates of the valid points; those of the last packet are left out, where directions
-    ask for what follows.
+    """Return the coordinates of the valid points without those of the last packets.
+
+    Their directions may depend on the next packet.
     """
     xyz = np.stack([cloud.x, cloud.y, cloud.z], axis=1)[: len(cloud) - 2 * len(cloud) // packets]
     return xyz[cloud.valid[: len(xyz)]].astype(np.float64)
@@ -65,7 +66,7 @@ def half_step(sensor: Sensor, frame: str) -> float:
 
 
 def run_device(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], SimulatedDevice]:
-    """What a device sends in so many seconds of its time, opened as a program would."""
+    """Open a simulated device; return its messages in `seconds` of its time, and the device."""
     device = SimulatedDevice(sensor, scene=room)
     device.start(0)
     out: list[bytes] = []

@@ -322,7 +322,7 @@ def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
 
 
 def left(sensor: Sensor) -> set[str]:
-    """What its declaration leaves over."""
+    """Return the unacknowledged findings of a declaration."""
     return {
         finding.code
         for finding in list_unacknowledged(
@@ -372,7 +372,7 @@ BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
 
 
 def list_lacking(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> list[str]:
-    """What the golden vectors of a sensor are said to lack."""
+    """Return the findings about missing golden vectors of a sensor."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "vectors.json"
         file.write_text(json.dumps(vectors), encoding="utf-8")

@@ -80,8 +80,9 @@ def test_ascii_keeps_the_density_of_dots() -> None:
 
 
 def emulate_terminal(before: list[str], text: str) -> list[str]:
-    """What a terminal shows after some output: cursor addressing and characters, as ECMA-48 has
-    them.
+    """Return the screen of a terminal after some output.
+
+    Supports cursor addressing and characters according to ECMA-48.
     """
     grid = [list(line) for line in before]
     row = column = 0

@@ -17,7 +17,7 @@ PAPERS: dict[Theme, str] = {"dark": "#14161b", "light": "#ffffff"}
 
 
 def luminance(colours: list[tuple[int, int, int]]) -> np.ndarray:
-    """The relative luminance of WCAG 2, (n,)."""
+    """Return the relative luminance of WCAG 2, (n,)."""
     parts = np.array(colours) / 255
     linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
     return np.asarray(linear @ (0.2126, 0.7152, 0.0722))

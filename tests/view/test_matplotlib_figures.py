@@ -31,7 +31,7 @@ def simulate_scan(name: str, packets: int) -> Scan:
 
 
 def offsets(axes: Any) -> np.ndarray:
-    """The points of a panel, (n, 2)."""
+    """Return the points of a panel, (n, 2)."""
     return np.asarray(axes.collections[0].get_offsets())
 
 

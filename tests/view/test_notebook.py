@@ -79,7 +79,7 @@ def packets(sensor: ls.Sensor, number: int) -> ls.Packets:
 
 
 def cells(html: str) -> list[list[str]]:
-    """The texts of the cells of a table, row by row."""
+    """Return the texts of the cells of a table, row by row."""
     table = re.search(r"<table.*</table>", html, re.DOTALL)
     assert table is not None
     rows = ET.fromstring(table[0].replace("<br>", "<br/>").replace("&nbsp;", " ")).iter("tr")

@@ -72,7 +72,7 @@ def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
 
 
 def of_points(points: PointCloud) -> set[tuple[int, int]]:
-    """The dots that are not there without the points."""
+    """Return the dots that are drawn only with the points."""
     return dots(draw_lines(points)) - dots(draw_lines(points[:0]))
 
 
@@ -223,7 +223,7 @@ def test_small_heights_are_enlarged_with_a_note() -> None:
 
 
 def most(values: Iterable[int]) -> int:
-    """The most frequent value."""
+    """Return the most frequent value."""
     return Counter(values).most_common(1)[0][0]
 
 

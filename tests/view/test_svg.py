@@ -18,7 +18,7 @@ NAMESPACE = "{http://www.w3.org/2000/svg}"
 
 
 def walls(forward: float, left: float) -> list[tuple[float, float, float]]:
-    """A room of 8 by 5 metres with its middle somewhere."""
+    """Return a room of 8 by 5 metres, not centred on the sensor."""
     turn = np.linspace(0, 2 * np.pi, 400)
     larger = np.maximum(abs(np.cos(turn)), abs(np.sin(turn)))
     height = np.tile(np.linspace(-1, 1, 16), 25)

@@ -25,7 +25,7 @@ LIVE = ("view", "sim:ldrobot-stl27l", *SENSOR)
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three seconds of a sensor."""
+    """Return a capture of three seconds of a sensor."""
     path = tmp_path_factory.mktemp("view") / "three.bin"
     path.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 5_400)))
     return path

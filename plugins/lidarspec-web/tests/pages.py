@@ -41,7 +41,7 @@ class Station:
 
     Attributes:
         said: reports about pages.
-        failure: the error that ended the reading.
+        failure: the exception that ended the thread.
     """
 
     def __init__(

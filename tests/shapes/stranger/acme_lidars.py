@@ -82,11 +82,11 @@ NOMINAL = (-1.5, -0.5, 0.5, 1.5)
 
 
 def points_with(elevations: Iterable[float]) -> Any:
-    """The points function for these elevations of the four rows, in degrees."""
+    """Return the points function for these elevations of the four rows, in degrees."""
     table = np.deg2rad(list(elevations))
 
     def points(f: Fields) -> Polar:
-        """The samples are spread from this packet's start up to the next one's."""
+        """Return points spread from this packet's start up to the next packet's."""
         step = wrap(following(f.start) - f.start, 360)
         step = np.where(np.isfinite(step), step, wrap(f.start - previous(f.start), 360)) / f.count
         clockwise = f.start - f.state.mount.zero + step * f.count.steps()
@@ -101,7 +101,7 @@ def points_with(elevations: Iterable[float]) -> Any:
 
 
 def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
-    """The sensor with the elevations of a file: four numbers in degrees."""
+    """Return the sensor with the elevations of a file: four numbers in degrees."""
     try:
         elevations = [float(word) for word in Path(calibration).read_text(encoding="utf-8").split()]
     except (OSError, ValueError) as error:
@@ -144,5 +144,5 @@ X1 = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Acme sensors."""
+    """Return the Acme sensors."""
     return [X1]
