@@ -32,18 +32,19 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: Nanoseconds of the device's time for which data is made at once, and the maximum number of
 #: packets.
-AHEAD = SECOND // 4
-MOST = 128
+#: Maximum size of a batch of data: in ns of the device's time, and in packets.
+#: packets.
+MAX_BATCH_NS = SECOND // 4
+MAX_BATCH_PACKETS = 128
 #: Number of fillers that are sent in a pause.
-FILLERS = 14
-#: Maximum delay of a device in ns; if it is polled less often, its time stands still.
-BEHIND = SECOND
+PAUSE_FILLERS = 14
+#: Maximum delay of a device in ns. If it is polled less often, its time does not catch up.
+MAX_DELAY_NS = SECOND
 
 Packet = tuple[str, bytes]
-#: Nanoseconds of silence after which half a request is discarded.
-PATIENCE = 50_000_000
+#: Nanoseconds without input after which an incomplete request is discarded.
+REQUEST_TIMEOUT_NS = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class ReplyPart(NamedTuple):
 
 
 class ReplyMaker:
-    """The replies of one sensor.
+    """Makes the replies of one sensor to its commands.
 
     Args:
         shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
@@ -85,7 +86,7 @@ class ReplyMaker:
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
-        if now - self._received.get(link, now) > PATIENCE:
+        if now - self._received.get(link, now) > REQUEST_TIMEOUT_NS:
             decoder.idle()
         self._received[link] = now
         requests = (self._request(item.frame, item.data, link) for item in decoder.feed(data))
@@ -103,7 +104,7 @@ class ReplyMaker:
         return [self._make_reply(answer, request) for answer in chosen]
 
     def unasked_frame(self, name: str, number: int) -> bytes:
-        """Return the frame of this number of a type that the sensor sends unasked."""
+        """Return the frame with this number of a type that the sensor sends periodically."""
         return self._frames.numbered(name, number)
 
     def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
@@ -122,12 +123,12 @@ class ReplyMaker:
             path: request.values[path] for path in request.command.echoes if path in request.values
         } | dict(request.command.matches)
         return {
-            path: _physical(fields[path], value) for path, value in raw.items() if path in fields
+            path: _to_physical(fields[path], value) for path, value in raw.items() if path in fields
         }
 
     def _request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
-        """Return the command of a frame, the most specific of several that match."""
-        values = dict(_flat(parse(self._sensor, data, frame=frame)))
+        """Return the command of a frame; if several match, the most specific."""
+        values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
         sent = [
             one
             for one in self._sensor.commands.items()
@@ -162,7 +163,7 @@ def _as_incoming(frame: Frame) -> Frame:
     return replace(frame, direction="in")
 
 
-def _physical(info: FieldInfo, value: Any) -> Any:
+def _to_physical(info: FieldInfo, value: Any) -> Any:
     """Return a parsed value in the unit of its field.
 
     Bytes are unchanged, labels become numbers, and arrays are converted element by element.
@@ -170,20 +171,20 @@ def _physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
         return value
     if isinstance(value, list | tuple):
-        return [_physical(info, one) for one in value]
+        return [_to_physical(info, one) for one in value]
     return info.physical(next((raw for raw, name in info.labels.items() if name == value), value))
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from _iter_flat(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
 
 
 class _PlannedData(NamedTuple):
-    """Data to be sent at a time, in ns since power-on; first planned, first sent."""
+    """Planned data with its time, in ns since power-on; ordered by time, then by plan."""
 
     at: float
     number: int
@@ -193,10 +194,10 @@ class _PlannedData(NamedTuple):
 
 
 class _FrameStream:
-    """The data frames of one type from a time on, in ns since power-on.
+    """The data frames of one type from a start time, in ns since power-on.
 
     Attributes:
-        clock_offset: seconds that are added to the sensor's clock from the next batch on.
+        clock_offset: seconds that are added to the sensor's clock, starting with the next batch.
         due: the time of the next frame.
     """
 
@@ -240,8 +241,8 @@ class _FrameStream:
         return taken
 
     def _more(self) -> None:
-        """Make the next batch."""
-        count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
+        """Make the next batch of frames."""
+        count = max(min(int(MAX_BATCH_NS / max(self._made.interval, 1)), MAX_BATCH_PACKETS), 1)
         block = self._made.block(
             self._next, count, self._scene, self._end / SECOND, self._shake, self.clock_offset
         )
@@ -302,7 +303,7 @@ class SimulatedDevice:
             self._simulation(sensor.data_frame)
 
     def _line(self, name: str, seed: int) -> FaultyLink:
-        """Return the faulty line of a link.
+        """Return the link of this name with its faults.
 
         A byte stream other than the data link is TCP or HTTP, which lose nothing.
         """
@@ -331,22 +332,23 @@ class SimulatedDevice:
     def _waits_for_a_command(self) -> bool:
         """Return whether it sends no data until a command of `on_open` starts it.
 
-        A sensor with a start command that `on_open` leaves out sends from power-on: no program
-        would start it otherwise.
+        If the start command of a sensor is not in `on_open`, it sends from power-on, because no
+        program would start it.
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
 
     def unplug(self) -> None:
-        """Pull the plug; `start` plugs it in again."""
+        """Disconnect the device; `start` connects it again."""
         self.present = False
         self._plug = None
 
     def jump_clock(self, seconds: float) -> None:
-        """Let the sensor's clock jump, from a packet within the next quarter of a second on.
+        """Make the sensor's clock jump, starting within the next quarter of a second.
 
         Args:
-            seconds: how far, forward or back; added to earlier jumps until the next `start`.
+            seconds: the size of the jump, negative for a jump back; added to earlier jumps until
+                the next `start`.
 
         Raises:
             UsageError: if the clock is not a single field of the data frame, or no data is sent.
@@ -378,7 +380,7 @@ class SimulatedDevice:
         self._switch_plug(now)
         if not self.present:
             return []
-        self._time = self._clock(now) + (AHEAD if math.isinf(self.rate) else 0)
+        self._time = self._clock(now) + (MAX_BATCH_NS if math.isinf(self.rate) else 0)
         packets: dict[str, list[Packet]] = {}
         for link, frame, data in self._due(self._time):
             packets.setdefault(link, []).append((frame, data))
@@ -394,7 +396,7 @@ class SimulatedDevice:
 
     @property
     def deadline(self) -> int | None:
-        """The time of the next output or change of the plug, None if there is none."""
+        """The time of the next output, disconnection or reconnection, or None."""
         times = [self._plug] if self._plug is not None else []
         if self.present:
             due = [self._plan[0].at] if self._plan else []
@@ -404,7 +406,7 @@ class SimulatedDevice:
 
     @property
     def replied_at(self) -> int | None:
-        """The time of the last planned reply to a command, None if there is none."""
+        """The time of the last planned reply to a command; None if there is none."""
         times = [due.at for due in self._plan if not self._is_periodic(due)]
         if not times or math.isinf(self.rate):
             return None
@@ -420,7 +422,7 @@ class SimulatedDevice:
         """
         if math.isinf(self.rate):
             return self._time
-        late = int((now - self._powered) - self._time / self.rate) - BEHIND
+        late = int((now - self._powered) - self._time / self.rate) - MAX_DELAY_NS
         self._powered += max(late, 0)
         return (now - self._powered) * self.rate
 
@@ -500,16 +502,16 @@ class SimulatedDevice:
                 self._begin(time_ns, chosen)
 
     def _begin_unasked(self, at: float) -> None:
-        """Plan the first frames of the types that are sent periodically, besides the data."""
+        """Plan the first frame of each type without points that is sent periodically."""
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
                 self._put(at, "data", name, self._replies.unasked_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
         """Send fillers during a pause, and return the time of its end."""
-        for step in range(FILLERS if self.sensor.fillers else 0):
+        for step in range(PAUSE_FILLERS if self.sensor.fillers else 0):
             data = bytes([self._source.choice(self.sensor.fillers)])
-            self._put(at + seconds * SECOND * (step + 1) / (FILLERS + 1), link, "", data)
+            self._put(at + seconds * SECOND * (step + 1) / (PAUSE_FILLERS + 1), link, "", data)
         return at + seconds * SECOND
 
     def _begin(self, at: float, frame: str) -> None:
@@ -532,7 +534,7 @@ class SimulatedDevice:
         heapq.heappush(self._plan, _PlannedData(at, self._planned, link, frame, data))
 
     def _switch_plug(self, now: int) -> None:
-        """Pull the plug or plug it in, if it is time."""
+        """Disconnect or reconnect the device when it is due."""
         if self._plug is None or now < self._plug:
             return
         if self.present:

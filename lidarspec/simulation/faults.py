@@ -18,7 +18,7 @@ from lidarspec.errors import OutOfRange, UsageError
 from lidarspec.spec.fields import duration, share
 
 #: Fraction of datagrams that are delayed if `reorder` is set.
-LATE = 0.1
+DELAYED_SHARE = 0.1
 #: The value of `rotor` for a rotor that does not turn.
 BLOCKED = "blocked"
 
@@ -67,7 +67,7 @@ class Faults:
 
 
 def parse_faults(options: Mapping[str, str]) -> Faults:
-    """Parse options such as ``{"errors": "1%", "loss": "0.01", "unplug": "30s"}``.
+    """Parse options, for example ``{"errors": "1%", "unplug": "30s"}``.
 
     Raises:
         UsageError: if a value cannot be parsed.
@@ -138,7 +138,7 @@ class FaultyLink:
                 if data in corrupted:  # a byte inserted after the frame does not corrupt it
                     self.intact += 1
                 depth = self._faults.reorder
-                if depth and self._source.random() < LATE:
+                if depth and self._source.random() < DELAYED_SHARE:
                     delay = self._source.randint(1, depth)
                 else:
                     delay = 0

@@ -1,8 +1,8 @@
-"""Make frames from physical values by path; other fields are 0.
+"""Make frames from physical values by path; all other fields are 0.
 
-Constants and checksums are filled in. This is `build` for many frames at once that does not require
-every field: the values of a `sweep` or a reply are enough, and counts and options in the header
-decide the layout as in a decoder.
+Constants and checksums are filled in. Unlike `build`, this makes many frames at once and does not
+require every field: the values of a `sweep` or a reply are enough. Counts and options in the header
+select the layout, as in a decoder.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class FrameMaker:
     def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return one frame for each mapping of field paths to physical values.
 
-        Arrays may also be given as bytes, and parts as such mappings.
+        Arrays may also be bytes, and parts are mappings of the same form.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -193,7 +193,10 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the first field of a formula, if it is not given, so that it gives `number`."""
+        """Set the first field of a formula so that it gives `number`.
+
+        A field that is already given keeps its value.
+        """
         if formula is None:
             paths = []
         else:

@@ -48,25 +48,25 @@ from lidarspec.spec.tree import FieldInfo, to_exact
 
 Times = NDArray[np.int64]
 #: Bits on a serial line for each byte: start, eight, stop.
-BITS = 10
+BITS_PER_BYTE = 10
 #: Nanoseconds; a clock that deviates less from even steps counts as coarse, and the steps as even.
-COARSE = 1_000_000
+CLOCK_TOLERANCE_NS = 1_000_000
 #: Number of extra packets to simulate, since directions may depend on the next packet.
 AHEAD = 1
 #: Number of packets that show which fields hold the ranges, and the packet rate.
-PROBED = 256
+MAX_PROBED_PACKETS = 256
 #: Maximum bytes of these packets, and their minimum number.
-PROBED_BYTES = 1 << 21
-LEAST_PROBED = 4
+MAX_PROBED_BYTES = 1 << 21
+MIN_PROBED_PACKETS = 4
 Floats = NDArray[np.float64]
 #: Maximum number of measurements while directions still change.
-ROUNDS = 8
+MAX_ROUNDS = 8
 #: The attributes of points that define beams.
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: The raw value that is set to find the points that depend on a field.
-PROBE = 100
+PROBE_VALUE = 100
 #: Relative tolerance between a range and its field, for rounding errors.
-EXACT = 1e-9
+RANGE_TOLERANCE = 1e-9
 #: Number of frames without points that are made together.
 UNASKED_BATCH = 50
 #: Standard gravity, m/s2.
@@ -75,13 +75,14 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, eq=False)
 class RangeField:
-    """A field that ranges come from.
+    """A field that gives ranges.
 
     Attributes:
         path: path of the field.
         inner: index of the innermost axes of the points that belongs to it.
-        step, zero: metres per raw step, and of raw 0; `step` is None if packets have their own,
-            such as the header's or a calibration's.
+        step: metres per raw step; None if each packet has its own, for example from the header or a
+            calibration.
+        zero: metres of raw 0.
     """
 
     path: str
@@ -97,7 +98,7 @@ class Beams:
     Attributes:
         range, azimuth, elevation, time, origin: as in `Polar`; unknown directions are nan.
         counts: (n,) number of points of each packet.
-        intensity: path of the field that it comes from, "" if there is none.
+        intensity: path of the field with the intensity; "" if there is none.
         places: x, y and z of Cartesian points, (3, n, ...).
     """
 
@@ -149,7 +150,7 @@ class Measurement:
     ) -> Measurement:
         """Return the measurement of a frame's points.
 
-        It is a `PointPlacement` for Cartesian points, else a `Measurement`.
+        It is a `PointPlacement` for Cartesian points, otherwise a `Measurement`.
         """
         return (
             PointPlacement
@@ -170,10 +171,10 @@ class Measurement:
         before = np.zeros(1)
         blind = np.zeros(1, np.bool_)
         written: dict[str, NDArray[Any]] = {}
-        for attempt in range(ROUNDS):
+        for attempt in range(MAX_ROUNDS):
             beams = self.beams(table)
             ranges = self._measure(beams, scene, times)
-            if attempt == ROUNDS - 2:
+            if attempt == MAX_ROUNDS - 2:
                 blind = ~np.isclose(ranges, before)
             before = ranges
             ranges = np.where(blind, 0, ranges)
@@ -183,7 +184,7 @@ class Measurement:
             written = values
             for path, raw in values.items():
                 write_raw(table, path, raw)
-            if not self._coupled or attempt >= ROUNDS - 2:
+            if not self._coupled or attempt >= MAX_ROUNDS - 2:
                 break
         if self._intensity and not self._encode:
             self._fill_intensity(table, written[self._targets[0].path])
@@ -287,14 +288,14 @@ class Measurement:
                 path in group.layout.leaves for group in table.groups
             ):
                 continue
-            answer = self._probe(table, [path], PROBE)[0].range
-            expected = info.physical(PROBE)
+            answer = self._probe(table, [path], PROBE_VALUE)[0].range
+            expected = info.physical(PROBE_VALUE)
             for inner in self._inner(table, answer):
                 part = _part(answer, inner)
                 near = part[
                     np.isclose(part, expected)
                 ]  # a direction with a length of nearly 1 is part of the range
-                if np.allclose(near, expected, EXACT, 0):
+                if np.allclose(near, expected, RANGE_TOLERANCE, 0):
                     step = info.scale
                 else:
                     step = None
@@ -309,10 +310,10 @@ class Measurement:
         return tuple(targets)
 
     def _linear(self, table: CompiledTable) -> list[RangeField]:
-        """Return the fields that ranges are linear in with another scale than their own.
+        """Return the fields that ranges depend on linearly, but not by their own scale.
 
-        These are fields in metres that a correction shifts or stretches, and elements of arrays
-        without a unit that are proportional to ranges, since the header has the unit.
+        These are fields in metres that a correction shifts or scales, and elements of arrays
+        without a unit that are proportional to ranges, because the header has the unit.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -320,7 +321,10 @@ class Measurement:
             if not metres and (info.unit or info.kind != "int" or not info.axes):
                 continue
             answers = [
-                beams.range for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+                beams.range
+                for beams in self._probe(
+                    table, [path], PROBE_VALUE, 2 * PROBE_VALUE, 3 * PROBE_VALUE
+                )
             ]
             for inner in self._inner(table, answers[0]):
                 once, twice, thrice = (_part(answer, inner) for answer in answers)
@@ -347,9 +351,9 @@ class Measurement:
             return target.step, target.zero
         once, twice = (
             _part(beams.range, target.inner)
-            for beams in self._probe(table, [target.path], PROBE, 2 * PROBE)
+            for beams in self._probe(table, [target.path], PROBE_VALUE, 2 * PROBE_VALUE)
         )
-        return (twice - once) / PROBE, 2 * once - twice
+        return (twice - once) / PROBE_VALUE, 2 * once - twice
 
     def _inner(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
         """Return the indices of the axes that points have in addition to the fields."""
@@ -361,7 +365,7 @@ class Measurement:
     def _directions_depend_on_range(self, table: CompiledTable) -> bool:
         """Return whether directions depend on ranges."""
         first, second = self._probe(
-            table, [target.path for target in self._targets], PROBE, 2 * PROBE
+            table, [target.path for target in self._targets], PROBE_VALUE, 2 * PROBE_VALUE
         )
         same = (
             np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True)
@@ -429,7 +433,7 @@ class PointPlacement(Measurement):
             paths = [target.path for target in self._targets if target.inner == inner]
             infos = [table.schema.fields[path] for path in paths]
             zero, *ones = (_part(places, inner) for places in self._move(table, paths))
-            slopes = np.stack([(one - zero) / PROBE for one in ones])
+            slopes = np.stack([(one - zero) / PROBE_VALUE for one in ones])
             raw = [
                 round_raw(info, column)
                 for info, column in zip(
@@ -456,7 +460,7 @@ class PointPlacement(Measurement):
         before = {path: table.raw(path) for path in paths}
         for path in paths:
             write_raw(table, path, np.array(0))
-        beams = [self.beams(table), *(self._probe(table, [path], PROBE)[0] for path in paths)]
+        beams = [self.beams(table), *(self._probe(table, [path], PROBE_VALUE)[0] for path in paths)]
         for path, raw in before.items():
             write_raw(table, path, raw)
         return [each.places for each in beams if each.places is not None]
@@ -475,7 +479,9 @@ class PointPlacement(Measurement):
                 continue
             places = [
                 beams.places
-                for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+                for beams in self._probe(
+                    table, [path], PROBE_VALUE, 2 * PROBE_VALUE, 3 * PROBE_VALUE
+                )
                 if beams.places is not None
             ]
             for inner in self._inner(table, places[0][0]):
@@ -652,7 +658,7 @@ class RestingImu:
         for path in self._targets:
             write_raw(table, path, np.array(0))
         zero = self._read_motion(table)
-        slopes = np.stack([self._probe(table, path) - zero for path in self._targets]) / PROBE
+        slopes = np.stack([self._probe(table, path) - zero for path in self._targets]) / PROBE_VALUE
         if shake:
             aims = np.random.default_rng(seed).normal(0.0, shake, zero.shape)
         else:
@@ -681,7 +687,7 @@ class RestingImu:
                 continue
             before = table.raw(path)
             answers = []
-            for probe in (0, PROBE, 2 * PROBE):
+            for probe in (0, PROBE_VALUE, 2 * PROBE_VALUE):
                 write_raw(table, path, np.array(probe))
                 answers.append(self._read_motion(table))
             write_raw(table, path, before)
@@ -698,7 +704,7 @@ class RestingImu:
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
         """Return the readings with one field at its probe value, and the others at 0."""
-        write_raw(table, path, np.array(PROBE))
+        write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
         return readings
@@ -758,7 +764,7 @@ class PacketTimes:
             steps = beams().counts * self._point * 1e9
         else:
             if self._baud:
-                steps = _sizes(table) * BITS * 1e9 / self._baud
+                steps = _sizes(table) * BITS_PER_BYTE * 1e9 / self._baud
             else:
                 steps = np.zeros(len(table))
         return np.asarray(np.rint(np.concatenate([[0], np.cumsum(steps[:-1])])), np.int64)
@@ -771,7 +777,7 @@ class PacketTimes:
             steps = (steps + turn // 2) % turn - turn // 2
         times = np.concatenate([[0], np.cumsum(steps)])
         even = np.asarray(np.rint(np.linspace(0, times[-1], len(times))), np.int64)
-        if bool((np.abs(even - times) <= COARSE).all()):
+        if bool((np.abs(even - times) <= CLOCK_TOLERANCE_NS).all()):
             return even
         return times
 
@@ -807,8 +813,8 @@ class FrameSimulation:
     """A data frame type of a sensor, ready to be simulated.
 
     Args:
-        blocked: whether the rotor stands still: angles and the field that separates scans stay as
-            in the second frame.
+        blocked: whether the rotor does not turn. Then the angles, and the field that separates
+            scans, keep their values of the second frame.
 
     Attributes:
         interval: mean ns from one packet to the next; 0 if the spec has no times.
@@ -831,7 +837,9 @@ class FrameSimulation:
         self._maker = FrameMaker(sensor, frame)
         self._blocked_values = self._angle_values(sweep(1)) if blocked else {}
         length = len(self._maker.frame(self._sweep_values(range(1))[0]))
-        swept = self._sweep_values(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
+        swept = self._sweep_values(
+            range(min(MAX_PROBED_PACKETS, max(MAX_PROBED_BYTES // length, MIN_PROBED_PACKETS)))
+        )
         table = self._maker.table(swept)
         self._parts = sensor.parts_with("points", frame)
         if self._parts:
@@ -922,7 +930,7 @@ class FrameSimulation:
         return table
 
     def _beams(self, table: CompiledTable) -> Beams:
-        """Return the beams of frames, with those of their parts joined."""
+        """Return the beams of frames and of their parts."""
         measured = self._with_points(table)
         beams = self._measurement.beams(measured)
         if not isinstance(measured, PartRows):
@@ -949,7 +957,7 @@ class FrameSimulation:
 
 
 class FramesWithoutPoints:
-    """Makes frames of the types without points: replies, and those sent unasked.
+    """Makes frames of the types without points: replies and periodic frames.
 
     Each has the defaults of the spec, the values of its `sweep`, and the readings of an IMU at
     rest.
@@ -1005,7 +1013,7 @@ class FramesWithoutPoints:
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
-    """Yield the times of frames in seconds, with their type and number, without an end."""
+    """Yield the time in seconds, type and number of each periodic frame, endlessly."""
     return ((number / rate, name, number) for number in itertools.count())
 
 
@@ -1020,12 +1028,12 @@ def simulate(
 ) -> list[bytes]:
     """Return the data frames that a sensor in a scene sends, in order.
 
-    A sensor without points sends its periodic frames, those with a `rate`.
+    For a sensor without points, it returns its periodic frames (with a `rate`).
 
     Args:
         packets: number of frames.
-        start: the number of the first one since the sensor was switched on.
-        scene: the surroundings, such as `read_scene` reads from a file; by default a room.
+        start: the number of the first frame since the sensor was switched on.
+        scene: the surroundings, for example from `read_scene`; by default a room.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or no `rate` if it has no points.
@@ -1042,7 +1050,7 @@ def simulate(
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:
-    """Return the frame that has to precede the data frames, empty if there is none."""
+    """Return the frame that has to precede the data frames; b"" if none is needed."""
     after = sensor.frames[sensor.data_frame].after
     if after is None:
         return b""
