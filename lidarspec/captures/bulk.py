@@ -31,8 +31,8 @@ from lidarspec.frames.layout import gather_rows
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
-#: Largest size of the headers of a record that are compared; records with longer ones are read one
-#: by one.
+#: Maximum size of the headers of a record that are compared, in bytes. Records with longer headers
+#: are read singly.
 WIDEST = 128
 
 #: Largest size of a buffer in bytes.
@@ -73,13 +73,13 @@ class RecordKind:
     def find(
         self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Return which of n records are of this kind, and the times of the matching records.
+        """Return which of n records are of this kind, and their times.
 
         Args:
             storage: the buffer, with at least `WIDEST` bytes from each start on.
 
         Returns:
-            An (n,) mask, or None if all records match; and the times of those that match, ns.
+            An (n,) mask, or None if all records match; and the times of the matching records, ns.
         """
         same = lengths == self.length
         if not same.all():
@@ -122,7 +122,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
 
     Args:
         record: all bytes of the record.
-        datagram: in it.
+        datagram: the datagram in the record.
         form: the reader of its file.
     """
     headers = datagram.headers
@@ -339,7 +339,7 @@ class StreamBatches(StreamReader, CaptureBatches):
 
 
 class _RecordBlock:
-    """The whole records in the buffer; if there are none, the next record alone."""
+    """The complete records in the buffer; if it has none, only the next record."""
 
     def __init__(
         self,
@@ -363,7 +363,7 @@ class _RecordBlock:
         self._at = np.zeros(number, np.int64)
         self._singles: dict[int, Datagram] = {}
         self._kinds_added = 0  # number of kinds that these records added
-        # Packets that were read one by one, are already in the statistics and match a kind.
+        # Number of packets with a kind that were read singly, and so are already counted.
         self._matched_singles = 0
         self._only: RecordKind | None = None  # the kind of all records, if there is only one
         self._section = form.sections
@@ -454,9 +454,10 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Return the buffer with the datagrams appended that were read one by one.
+        """Return the buffer with the datagrams of single records appended.
 
-        Their rows are inserted into `columns` in the order of the records.
+        These are the records that were read without a kind. Their rows are inserted into `columns`
+        in the order of the records.
         """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
@@ -495,10 +496,10 @@ class _RecordBlock:
                 self._matched_singles += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Assign a kind to all records that match it; return whether all records now have a kind.
+        """Assign a kind to all records that match it, and return whether all have a kind now.
 
-        Records before `since` were already read and are left out: one that was malformed then may
-        match by now.
+        Records before `since` were already read and are left out, because a record that was
+        malformed when it was read may match now.
         """
         template = self._known[kind]
         number = len(self._kinds)

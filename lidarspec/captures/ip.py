@@ -215,11 +215,11 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
 
 
 def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
-    """Return the extent of the headers of a UDP packet; None for a reassembled one.
+    """Return the extent of the headers of a UDP packet; None for a reassembled packet.
 
     Frames of one link type and one length, with equal headers except for the variable bytes, have
-    their payload at the same offset and come from the same sender: `parse_ip` and `parse_udp` read
-    nothing else.
+    their payload at the same offset and come from the same sender, because `parse_ip` and
+    `parse_udp` read nothing else.
     """
     if not packet.body_offset:
         return None
@@ -388,7 +388,10 @@ def _parse_ipv6(frame: bytes, start: int) -> IpPacket:
 
 
 def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
-    """Return the protocol after the extension headers of IPv6, and its offset in the body."""
+    """Return the protocol after the extension headers of IPv6, and its offset.
+
+    The offset is counted from the start of the body.
+    """
     offset = 0
     while protocol in _EXTENSION_PROTOCOLS:
         protocol, extra_units = struct.unpack_from(">BB", body, offset)
@@ -397,10 +400,10 @@ def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
 
 
 def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragment | None:
-    """Return the fragment that header fields describe; None for a whole packet.
+    """Return the fragment for these header fields; None for a whole packet.
 
     Raises:
-        NoDatagramError: if no valid packet has such a fragment.
+        NoDatagramError: if the fragment is impossible in a valid packet.
     """
     if not more and not start:
         return None
@@ -453,9 +456,9 @@ class _PartialPacket:
 class Reassembly:
     """Reassembles IP fragments that arrive in any order, in bounded memory.
 
-    A packet whose fragments overlap is dropped (RFC 5722), but a repeated fragment is ignored. The
-    oldest packets are dropped if more than `MAX_PACKETS` or `MAX_BYTES` wait for fragments, or if
-    they are older than `TIMEOUT_NS`.
+    If fragments of a packet overlap, the packet is dropped (RFC 5722), but a repeated fragment is
+    ignored. The oldest packets are dropped if more than `MAX_PACKETS` or `MAX_BYTES` wait for
+    fragments, or if they are older than `TIMEOUT_NS`.
 
     Attributes:
         dropped: the number of fragments of packets that were dropped.
@@ -465,7 +468,7 @@ class Reassembly:
     MAX_BYTES = 4 << 20
     #: At 10,000 datagrams a second the 16-bit identification of IPv4 repeats after 6.5 s.
     TIMEOUT_NS = 5_000_000_000
-    #: Bytes of Python objects around each fragment, so that many tiny ones are bounded too.
+    #: Bytes of Python objects for each fragment, which bound the number of tiny fragments.
     _OVERHEAD_BYTES = 160
 
     def __init__(self) -> None:

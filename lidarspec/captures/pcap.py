@@ -52,7 +52,7 @@ MAX_COUNTED_KINDS = 16
 UNKNOWN_ENDPOINT = ("0.0.0.0", 0)
 #: The bytes in front of an IPv4 address that is written as an IPv6 address (RFC 4291).
 _IPV4_MAPPED_PREFIX = bytes.fromhex("00000000000000000000ffff")
-#: More bytes fit into a datagram over IPv6, whose length does not count its header.
+# #: A datagram over IPv6 can be longer, because the length does not count its header.
 _EXTRA_PAYLOAD_BYTES_IPV6 = 20
 
 
@@ -239,7 +239,7 @@ class CaptureReader(ClosingContext):
         self.stats.incomplete_fragments = self._fragments.dropped
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Return the datagram that this packet contains or completes, and count the packet."""
+        """Count a packet, and return the datagram that it contains or completes."""
         if isinstance(packet, NoPacketReason):
             if packet is NoPacketReason.MALFORMED:
                 self.stats.malformed += 1
@@ -285,7 +285,7 @@ class StreamReader(CaptureReader):
     """
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Return the content of the packet; count a packet of another link type."""
+        """Return the content of the packet; a packet of another link type is only counted."""
         if isinstance(packet, NoPacketReason):
             return None
         self.stats.packets += 1
@@ -327,7 +327,9 @@ def datagram_frame(datagram: Datagram) -> bytes:
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Return whether a little-endian capture begins with the private link type of a byte stream.
+    """Return whether a capture begins with the private link type of a byte stream.
+
+    Only little-endian files are recognised.
 
     Args:
         head: the first bytes of a file; 24 bytes of pcap and 64 of pcapng are enough.

@@ -128,7 +128,7 @@ class TimeEncoding:
     offset: int = 0
 
     def fits(self) -> bool:
-        """Return whether 64 bits suffice for all times up to `_FURTHEST`."""
+        """Return whether all times up to `_FURTHEST` fit into 64 bits."""
         return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
@@ -220,7 +220,7 @@ class PcapRecords:
         """Read the next record and return its packet.
 
         Raises:
-            Truncated, Damaged: if the record at `source.record` cannot be read.
+            TruncatedError, DamagedRecordError: if the record at `source.record` cannot be read.
         """
         head = self._source.peek(self._head.size)
         if len(head) < self._head.size:
@@ -240,9 +240,9 @@ class PcapRecords:
         )
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a record may begin; None if there is none.
+        """Return the first offset below `stop` at which a record may begin, or None.
 
-        The record has to be followed by another one, or by the end of the input.
+        The record has to be followed by another record, or by the end of the input.
 
         Args:
             is_end: whether the input ends with `data`.
@@ -326,14 +326,16 @@ class PcapngBlocks:
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the block at an offset; 0 if `read` has to handle the block.
+        """Return the length of the block at an offset; 0 if only `read` can handle it.
 
-        This applies to the start of a section, an invalid length and a block longer than
+        It is 0 at the start of a section, for an invalid length, and for a block longer than
         `LARGEST_BLOCK`.
         """
         kind, length = struct.unpack_from(self.order + "II", data, at)
         return (
-            0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
+            0
+            if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _is_possible_length(length)
+            else length
         )
 
     def length_field(self, length: int) -> tuple[int, str, int]:
@@ -341,7 +343,7 @@ class PcapngBlocks:
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
-        """Return the layout of a block; None if such blocks are read one by one."""
+        """Return the layout of a block; None if blocks of its type are read singly."""
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None
@@ -354,7 +356,7 @@ class PcapngBlocks:
         """Read the next block and return its packet.
 
         Raises:
-            Truncated, Damaged: if the block at `source.record` cannot be read.
+            TruncatedError, DamagedRecordError: if the block at `source.record` cannot be read.
         """
         head = bytes(self._source.peek(12))
         if len(head) < 12:
@@ -386,10 +388,10 @@ class PcapngBlocks:
         return NoPacketReason.NO_PACKET
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a block may begin; None if there is none.
+        """Return the first offset below `stop` at which a block may begin, or None.
 
         If an interface block was lost, only the start of a section counts. Packets refer to
-        interfaces by number, so that a lost one would assign all later packets wrongly.
+        interfaces by number, so later packets would be assigned to wrong interfaces.
         """
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -415,7 +417,9 @@ class PcapngBlocks:
         not repeat it. If the end cannot be checked, it is wrong if another block begins within the
         block.
         """
-        if not _can_be(length) or (length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}):
+        if not _is_possible_length(length) or (
+            length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}
+        ):
             return True
         size = _REACH if length > LARGEST_BLOCK else length
         data = self._source.peek(size)
@@ -432,7 +436,7 @@ def make_record_reader(source: BufferedInput) -> Form:
     """Return the reader for a file that `is_capture` accepts.
 
     Raises:
-        Truncated: if the file header is incomplete.
+        TruncatedError: if the file header is incomplete.
     """
     if source.peek(4) == _SECTION:
         return PcapngBlocks(source)
@@ -455,18 +459,19 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 
 
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
-    """Skip to at most `NEAR` bytes before the first packet captured at a time or later.
+    """Seek to shortly before the first packet captured at a time or later.
 
-    The search assumes that packets are in the order of their times, and that all sections of a
-    pcapng file have the interfaces of the current one. It does not skip the start of a section, nor
-    times that are years away: another section may encode times differently.
+    The position is at most `NEAR` bytes before the packet. The search assumes that packets are in
+    the order of their times, and that all sections of a pcapng file have the interfaces of the
+    current section. It does not skip the start of a section, nor times that are years away, because
+    another section may encode times differently.
 
     Args:
         at: ns since 1970.
 
     Returns:
-        False if nothing was skipped: the packet is not ahead, or the file is a pipe or compressed.
-        The position is then unchanged.
+        False if nothing was skipped, because the packet is not ahead, or the file is a pipe or
+        compressed. The position is then unchanged.
     """
     here = low = source.offset
     high = source.size
@@ -485,9 +490,9 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
 
 
 def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[int, int] | None:
-    """Return the time and offset of the next packet with a time; None if none begins before `stop`.
+    """Return the time and offset of the next packet with a time.
 
-    The search ends at the start of another section.
+    Returns None if none begins before `stop`, or before the start of another section.
     """
     form, section = form.reopen(source), form.sections
     while skip_damage(source, form) and source.begin_record() and source.record < stop:
@@ -504,8 +509,11 @@ def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[in
     return None
 
 
-def _can_be(length: int) -> bool:
-    """Return whether a block can have this length: a multiple of 4, with header and trailer."""
+def _is_possible_length(length: int) -> bool:
+    """Return whether a block can have this length.
+
+    It is a multiple of 4, and at least the size of the header and the trailer.
+    """
     return length >= 12 and length % 4 == 0
 
 

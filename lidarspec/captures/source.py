@@ -89,7 +89,7 @@ class BufferedInput:
 
     @property
     def size(self) -> int | None:
-        """The size of the file in bytes, None if it is not seekable."""
+        """The size of the file in bytes; None if it is not seekable."""
         if not self._file.seekable():
             return None
         here = self._file.tell()
@@ -98,7 +98,10 @@ class BufferedInput:
         return size
 
     def peek(self, size: int) -> memoryview:
-        """Return the next `size` bytes without consuming them; fewer at the end of the input."""
+        """Return the next `size` bytes without consuming them.
+
+        At the end of the input it returns fewer.
+        """
         self._has(size)
         return self._data[self.at : self.at + size]
 
@@ -108,10 +111,10 @@ class BufferedInput:
         return self._has(1)
 
     def take(self, size: int) -> bytes:
-        """Return the next `size` bytes; the caller limits `size`.
+        """Return the next `size` bytes and advance; the caller limits `size`.
 
         Raises:
-            Truncated: if fewer are left.
+            TruncatedError: if fewer bytes are left.
         """
         if not self._has(size):
             raise TruncatedError
@@ -122,7 +125,7 @@ class BufferedInput:
         """Skip any number of bytes.
 
         Raises:
-            Truncated: if fewer are left.
+            TruncatedError: if fewer bytes are left.
         """
         while size:
             step = min(size, SMALLEST)
@@ -132,9 +135,9 @@ class BufferedInput:
             size -= step
 
     def read_more(self) -> bool:
-        """Read at least one more byte into the buffer; return False at the end of the input.
+        """Read at least one more byte; return False at the end of the input.
 
-        This can replace `storage` and reset `at`.
+        The byte is added to the buffer. This can replace `storage` and reset `at`.
         """
         return self._has(len(self._data) - self.at + 1)
 
