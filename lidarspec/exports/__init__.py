@@ -48,7 +48,7 @@ class UnknownExport(UnknownName):
 
 
 def select_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor with only one frame type, and no commands.
+    """Return a copy of the sensor with only one frame type, and no commands.
 
     Exports of a single message are made from it.
 
@@ -88,7 +88,7 @@ def export(sensor: Sensor, kind: str) -> str:
 
 
 def _line(text: str) -> str:
-    """Return a text as one printable line, for a heading, comment or string.
+    """Return a text as one printable line for a heading, comment or string.
 
     Each export escapes its own special characters.
     """
@@ -105,7 +105,7 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """The checksums, by the path of each field that holds one or a part of it."""
+        """The checksums, by the path of each field that stores all or part of one."""
         return {
             path: node
             for node in tree.nodes(self.root)
@@ -121,7 +121,8 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
         on_wire: whether the export describes the bytes as they are sent, not only the fields.
 
     Raises:
-        ExportError: if there are no frames yet, or one contains Python code or has a wire form.
+        ExportError: if the sensor has no frames yet, or if a frame contains Python code or has a
+            wire form.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id} has no frames until it is configured")
@@ -134,14 +135,14 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
         raise ExportError(
             f"{sensor.id}: exports do not support frames with a wire form: {', '.join(formed)}"
         )
-    return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
+    return tuple(_make_exported_frame(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:
     """Return the fields that a node depends on.
 
-    These are the fields in formulas of the node and its descendants, and those that lengths and
-    conditions are compared with.
+    These are the fields in formulas of the node and its descendants, and the fields that lengths
+    and conditions are compared with.
     """
     formulas = [
         value
@@ -161,11 +162,11 @@ def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
     }
 
 
-def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
+def _make_exported_frame(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
     try:
         root = frame.tree
         for node in tree.nodes(root):
-            _check(node)
+            _refuse_inexpressible(node)
     except (ExportError, SpecError) as refused:
         raise ExportError(f"{sensor.id} {name}: {refused}") from None
     if not isinstance(root, tree.Struct | tree.Sealed):
@@ -173,7 +174,7 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
     return ExportedFrame(name, frame, root)
 
 
-def _check(node: tree.Node) -> None:
+def _refuse_inexpressible(node: tree.Node) -> None:
     """Raise `ExportError` if other languages cannot express a node."""
     for formula in (
         *tree.formulas(node),

@@ -1,9 +1,9 @@
 """Generate a C99 header for a sensor.
 
-The header has functions of bytes: accessors, lengths, checksums and scaling. It does not depend on
-struct packing. `header` joins:
+The header has functions that take the bytes of a frame: accessors, lengths, checksums and scaling.
+It does not depend on struct packing. `header` joins:
 
-* the helpers of all headers (``c_bytes.h``, beside this module),
+* the helpers of all headers (``c_bytes.h``, in the folder of this module),
 * a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
   argument, so that all frame types share it,
 * for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions of the whole
@@ -69,7 +69,9 @@ static inline uint64_t {name}(const uint8_t *p, const int64_t (*spans)[2], size_
 
 @dataclass(frozen=True)
 class _ChecksumBody:
-    """The C code of one checksum algorithm. In it, `i` is the number of bytes covered so far.
+    """The C code of one checksum algorithm.
+
+    In the code, `i` is the number of bytes covered so far.
 
     Attributes:
         begin: statements before the first byte.
@@ -161,9 +163,9 @@ def _make_word_xor_body(algorithm: WordXor) -> _ChecksumBody:
 
 
 def _make_crc_body(crc: Crc) -> _ChecksumBody:
-    """Return a CRC that uses the byte table of `lidarspec.spec.checksums`.
+    """Return the body of a CRC that uses the byte table of `lidarspec.spec.checksums`.
 
-    As there, the low byte of the register is combined with the next byte of data.
+    As in that module, the low byte of the register is combined with the next byte of data.
     """
     size = next(size for size in (8, 16, 32, 64) if crc.width <= size)
     entries = [
@@ -232,7 +234,7 @@ static inline int {name}(const uint8_t *p, size_t n)
 
 
 def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
-    """Yield the functions of a frame type that read a whole frame.
+    """Yield the C functions of a frame type that read a whole frame.
 
     Args:
         algorithms: the name of the C function of each checksum algorithm.
@@ -246,8 +248,8 @@ def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -
     )
     seals = dict[str, tuple[CEntry, Sealed]]()
     for entry in layout.entries:
-        # If several checksums are around one struct, the outer one is named after the struct and
-        # the inner ones after their fields.
+        # If several checksums cover one struct, the outermost is named after the struct, each
+        # inner checksum after its field.
         if isinstance(entry.node, Sealed):
             if layout.name(entry.path, "checksum_ok") not in seals:
                 path = entry.path
@@ -272,9 +274,9 @@ def _join_statements(statements: Iterable[str]) -> str:
 
 
 def _iter_length_checks(layout: CLayout) -> Iterator[str]:
-    """Yield checks that the fields that determine the length exist and have possible values.
+    """Yield C checks of the fields that determine the length, in wire order.
 
-    The checks are in wire order.
+    Each checks that the field exists and that its value is possible.
     """
     longest = layout.message.frame.max_length
     for entry in layout.entries:
@@ -325,8 +327,8 @@ def _iter_covered_spans(
 ) -> Iterator[tuple[SizeFormula, SizeFormula]]:
     """Yield the byte ranges that a checksum covers.
 
-    This is the range that the seal declares, or the whole struct without the fields that hold the
-    checksum.
+    This is the range that the seal declares, or the whole struct without the fields that store
+    the checksum.
     """
     if seal.over is not None:
         first, last = (layout.whole(path) for path in seal.over)
@@ -345,7 +347,7 @@ def _iter_covered_spans(
 
 
 def _format_stored_checksum(held: list[CEntry], order: str) -> str:
-    """Return the C expression of a checksum stored in several fields, low bits first."""
+    """Return the C expression of a checksum that several fields store, low bits first."""
     terms = []
     shift = 0
     for access in held:
@@ -452,7 +454,7 @@ _TAIL = """\
 #endif
 #endif
 """
-#: Endings of the names of whole-frame functions, which are reserved.
+#: Reserved endings: the names of functions that read a whole frame end with them.
 _RESERVED_ENDINGS = (
     "frame_length",
     "is_frame",
@@ -511,7 +513,7 @@ def _iter_definitions(
     """Yield all definitions of a frame type.
 
     Args:
-        taken: C name -> (frame type, path, ending) that has it; new names are added.
+        taken: C name -> the (frame type, path, ending) it belongs to; new names are added.
         algorithms: the name of the C function of each checksum algorithm.
     """
     name = functools.partial(_make_name, taken, prefix, message.name)
@@ -534,7 +536,7 @@ def _iter_definitions(
 def _make_name(
     taken: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str
 ) -> str:
-    """Return a unique C name for a path of a frame type, with an ending."""
+    """Return a unique C name for a path of a frame type, and add it to `taken`."""
     name = "_".join(identifier(part) for part in (prefix, frame, path, ending) if part)
     while taken.setdefault(name, (frame, path, ending)) != (frame, path, ending):
         name += "_"

@@ -33,17 +33,17 @@ _INDICES = "ijklmnoq"
 
 
 def index(depth: int) -> str:
-    """Return the name of an array index by its depth."""
+    """Return the name of the index of the array at this depth."""
     return _INDICES[depth]
 
 
 def parameters(depth: int) -> str:
-    """Return the parameters of a function for an entry inside `depth` arrays."""
+    """Return the parameters of a C function for an entry inside `depth` arrays."""
     return ", ".join(["const uint8_t *p", *(f"size_t {index(level)}" for level in range(depth))])
 
 
 def arguments(depth: int) -> str:
-    """Return the arguments of a call of such a function."""
+    """Return the arguments that match `parameters(depth)`."""
     return ", ".join(["p", *map(index, range(depth))])
 
 
@@ -53,7 +53,7 @@ def identifier(text: str) -> str:
 
 
 def number_type(fields: Sequence[tree.FieldInfo]) -> str:
-    """Return the C type that can hold the values of all these fields."""
+    """Return a C type that can represent the values of all these fields."""
     if any(info.kind == "float" for info in fields):
         if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields):
             return "double"
@@ -97,13 +97,14 @@ class CEntry:
     """A node at one of its positions in the frame.
 
     Attributes:
-        path: path of the node, without indices; for an array that of its axis.
+        path: path of the node, without indices; for an array, the path of its axis.
         node: the node.
-        start, size: in bytes.
+        start: offset of its first byte in the frame.
+        size: size in bytes.
         depth: number of arrays around it.
         conditions: conditions under which it is present.
-        loops: for each of those arrays the C expression of its count.
-        part: the part of a bit block that is read.
+        loops: C expression of the count of each array around it, the outermost first.
+        part: the part of a bit block that is read; None for any other node.
     """
 
     path: str
@@ -117,12 +118,12 @@ class CEntry:
 
     @property
     def where(self) -> str:
-        """The conditions as one; "" for none."""
+        """The C expression that all conditions are true; "" if there is no condition."""
         return " && ".join(condition.text for condition in self.conditions)
 
     @property
     def fields(self) -> list[CEntry]:
-        """An entry for each part of a bit block, else the entry itself."""
+        """One entry for each part of a bit block; for any other node, only this entry."""
         if isinstance(self.node, tree.Block):
             return [replace(self, part=part) for part in self.node.parts]
         return [self]
@@ -153,14 +154,14 @@ class CEntry:
         else:
             raw = word(self.start, node.size, node.order)
         if node.kind == "float":
-            return f"{FLOATS[node.size]}({raw})"
+            return f"{FLOAT_FUNCTIONS[node.size]}({raw})"
         if node.kind == "int":
             return f"lidarspec_signed({raw}, {8 * node.size})"
         return raw
 
     @property
     def span(self) -> tuple[int, SizeFormula]:
-        """The first byte of the word and the end of its last, from the start of the entry."""
+        """The offsets of the word's first byte and of its end, inside the entry."""
         if self.part is None:
             return 0, self.size
         offsets = [segment.byte for segment in self.part.bits.segments]
@@ -168,7 +169,10 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The condition under which it is present, with its indices; "" for always."""
+        """The C condition under which it is present; "" if it is always present.
+
+        For a part of a bit block, it compares the indices with the indices of the part.
+        """
         inside = [
             f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
         ]
@@ -178,7 +182,7 @@ class CEntry:
 def format_size_arguments(node: tree.Node, depth: int) -> str:
     """Return the arguments of a call of a size function inside `depth` arrays.
 
-    If the size is the same for all elements, it is that of the first.
+    If all elements have the same size, the indices are 0.
     """
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
@@ -218,7 +222,7 @@ class CLayout:
         ]
 
     def whole(self, path: str) -> CEntry:
-        """Return the entry of the whole part at a path: an array, or all alternatives."""
+        """Return the entry of a whole array, or of all alternatives, at a path."""
         return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: tree.Formula) -> str:
@@ -242,7 +246,10 @@ class CLayout:
         return f"(size_t)({self.formula(value)})"
 
     def count(self, node: tree.Repeat, depth: int) -> int | str:
-        """Return the number of elements of an array inside `depth` others: a number, or C."""
+        """Return the number of elements of an array inside `depth` other arrays.
+
+        Returns a C expression if the number is not fixed.
+        """
         if isinstance(node.count, int):
             return node.count
         return f"(int64_t){self.name(node.axis, 'count')}({format_size_arguments(node, depth)})"
@@ -265,7 +272,9 @@ class CLayout:
                     ),
                 )
             case tree.Repeat():
-                return self._element(entry, entry.node).times(self.count(entry.node, entry.depth))
+                return self._find_element_size(entry, entry.node).times(
+                    self.count(entry.node, entry.depth)
+                )
             case tree.When() | tree.Select():
                 sizes = self.sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
@@ -280,12 +289,12 @@ class CLayout:
                 )
             case tree.Empty() | tree.Derived():
                 return SizeFormula()
-        return sum((self.extent(below) for below in self._below(entry)), SizeFormula())
+        return sum((self.extent(below) for below in self._iter_members(entry)), SizeFormula())
 
     def extent_name(self, entry: CEntry) -> str:
         """Return the name of the size function of a part with alternatives.
 
-        Alternatives may contain each other, so that several such parts can have the same path.
+        Alternatives may contain alternatives, so that several of these parts can have one path.
         """
         choices = [
             node
@@ -297,10 +306,12 @@ class CLayout:
 
     def sizes(self, entry: CEntry) -> list[tuple[str, SizeFormula]]:
         """Return the sizes of the alternatives of a part, each with its condition."""
-        return [(condition.text, self.extent(below)) for condition, below in self._cases(entry)]
+        return [
+            (condition.text, self.extent(below)) for condition, below in self._list_cases(entry)
+        ]
 
     def _visit(self, entry: CEntry) -> None:
-        """Store an entry and all entries in it."""
+        """Add an entry and all entries inside it to the layout."""
         node = entry.node
         if not isinstance(node, tree.Empty | tree.Derived):
             if isinstance(node, tree.Repeat):
@@ -309,7 +320,7 @@ class CLayout:
                 path = entry.path
             self.entries.append(replace(entry, path=path, size=self.extent(entry)))
         if isinstance(node, tree.Repeat):
-            step = self._element(entry, node).times(f"(int64_t){index(entry.depth)}")
+            step = self._find_element_size(entry, node).times(f"(int64_t){index(entry.depth)}")
             loops = (*entry.loops, str(self.count(node, entry.depth)))
             self._visit(
                 replace(
@@ -321,16 +332,16 @@ class CLayout:
                 )
             )
         elif isinstance(node, tree.When | tree.Select):
-            for condition, below in self._cases(entry):
+            for condition, below in self._list_cases(entry):
                 self._visit(replace(below, conditions=(*entry.conditions, condition)))
         else:
             start = entry.start
-            for below in self._below(entry):
+            for below in self._iter_members(entry):
                 self._visit(replace(below, start=start))
                 start = start + self.extent(below)
 
-    def _below(self, entry: CEntry) -> Iterator[CEntry]:
-        """Yield the members of a struct, all with its own start."""
+    def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
+        """Yield the entries of the members of a struct, each with its own start."""
         node = entry.node
         if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
@@ -340,7 +351,7 @@ class CLayout:
                     entry, node=member, path=".".join(filter(None, (node.path, member.name)))
                 )
 
-    def _element(self, entry: CEntry, node: tree.Repeat) -> SizeFormula:
+    def _find_element_size(self, entry: CEntry, node: tree.Repeat) -> SizeFormula:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
@@ -349,7 +360,7 @@ class CLayout:
             )
         return size
 
-    def _cases(self, entry: CEntry) -> list[tuple[CCondition, CEntry]]:
+    def _list_cases(self, entry: CEntry) -> list[tuple[CCondition, CEntry]]:
         """Return the alternatives of a part, each with its condition."""
         node = entry.node
         is_fixed = not any(
@@ -388,8 +399,8 @@ SI: dict[str, tuple[str, float, float]] = {
     "mA": ("A", 1e-3, 0),
     "kHz": ("Hz", 1e3, 0),
 }
-#: Bytes of a float -> the C function that converts its bits.
-FLOATS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
+#: Size of a float in bytes -> the C function that converts its bits.
+FLOAT_FUNCTIONS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
 def word(start: SizeFormula, size: int, order: str) -> str:
@@ -415,7 +426,7 @@ def _bits(part: tree.Part, start: SizeFormula) -> str:
 
 
 def accesses(layout: CLayout, path: str) -> list[CEntry]:
-    """Return an entry for each way to read a field."""
+    """Return one entry for each alternative that contains a field."""
     return [
         access
         for entry in layout.find_entries(path)
@@ -427,12 +438,12 @@ def accesses(layout: CLayout, path: str) -> list[CEntry]:
 def fields(layout: CLayout) -> Iterator[str]:
     """Yield the functions of all fields in wire order.
 
-    A field in several alternatives comes with the last.
+    The functions of a field in several alternatives follow the last alternative.
     """
     functions = [
-        function for entry in layout.entries for function in dict.fromkeys(_functions(entry))
+        function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
     ]
-    extents = list(_extents(layout))
+    extents = list(_iter_extents(layout))
     yield from (text.partition("\n")[0].partition(" {")[0] + ";" for text in extents)
     for write, path in reversed(dict.fromkeys(reversed(functions))):
         yield from write(layout, path)
@@ -443,22 +454,22 @@ def fields(layout: CLayout) -> Iterator[str]:
 Writer = Callable[[CLayout, str], Iterator[str]]
 
 
-def _functions(entry: CEntry) -> Iterator[tuple[Writer, str]]:
-    """Yield the writers of the functions for an entry, with their paths."""
+def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
+    """Yield (writer, path) for each kind of function that an entry needs."""
     if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
-            yield from ((_inner_count, axis) for axis in _inner(part))
-            yield _field, part.info.path
+            yield from ((_write_inner_count, axis) for axis in _find_inner_axes(part))
+            yield _write_field, part.info.path
     elif isinstance(entry.node, tree.Number) or (
         isinstance(entry.node, tree.Blob) and entry.node.name
     ):
-        yield _field, entry.path
+        yield _write_field, entry.path
     elif isinstance(entry.node, tree.Repeat):
-        yield _count, entry.path
+        yield _write_count, entry.path
 
 
-def _extents(layout: CLayout) -> Iterator[str]:
-    """Yield the size functions of parts with alternatives of several sizes."""
+def _iter_extents(layout: CLayout) -> Iterator[str]:
+    """Yield the size functions of parts with alternatives of different sizes."""
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.sizes(entry)
@@ -467,40 +478,42 @@ def _extents(layout: CLayout) -> Iterator[str]:
                     *((condition, f"(size_t)({size})") for condition, size in sizes[:-1]),
                     ("", f"(size_t)({sizes[-1][1]})"),
                 ]
-                yield _function("size_t", layout.extent_name(entry), entry.depth, ways)
+                yield _format_function("size_t", layout.extent_name(entry), entry.depth, ways)
 
 
-def _inner(part: tree.Part) -> tuple[str, ...]:
-    """Return the arrays inside a bit block that contain a part."""
+def _find_inner_axes(part: tree.Part) -> tuple[str, ...]:
+    """Return the paths of the arrays inside a bit block that contain a part."""
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 
 
-def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
+def _write_inner_count(layout: CLayout, axis: str) -> Iterator[str]:
     """Yield the count function of an array inside a bit block."""
     inside = [
         (access, access.part)
         for entry in layout.entries
         for access in entry.fields
-        if access.part and axis in _inner(access.part)
+        if access.part and axis in _find_inner_axes(access.part)
     ]
     entry, part = inside[0]
-    level = _inner(part).index(axis)
+    level = _find_inner_axes(part).index(axis)
     count = max(part.indices[level] for _, part in inside) + 1
-    yield _function("size_t", layout.name(axis, "count"), entry.depth + level, [("", str(count))])
+    yield _format_function(
+        "size_t", layout.name(axis, "count"), entry.depth + level, [("", str(count))]
+    )
 
 
-def _count(layout: CLayout, axis: str) -> Iterator[str]:
+def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
     arrays = [
         (entry, entry.node.count)
         for entry in layout.entries
         if entry.path == axis and isinstance(entry.node, tree.Repeat)
     ]
     ways = [(entry.where, layout.length(count)) for entry, count in arrays]
-    yield _function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
+    yield _format_function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
 
-def _field(layout: CLayout, path: str) -> Iterator[str]:
-    """Yield the functions of a field: value, presence and scaling, with its labels."""
+def _write_field(layout: CLayout, path: str) -> Iterator[str]:
+    """Yield the functions of a field: its value, presence and conversions to units."""
     ways = accesses(layout, path)
     name = layout.name(path, "")
     first = ways[0]
@@ -517,8 +530,8 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
             for access in ways
             if isinstance(access.node, tree.Blob)
         ]
-        yield _function("size_t", layout.name(path, "size"), depth, sizes)
-        yield _function(
+        yield _format_function("size_t", layout.name(path, "size"), depth, sizes)
+        yield _format_function(
             "const uint8_t *",
             name,
             depth,
@@ -526,26 +539,34 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
         )
     else:
         kind = number_type([access.info for access in ways])
-        yield _function(
+        yield _format_function(
             kind,
             name,
             depth,
-            [(access.condition, f"({kind}){_group(access.expression)}") for access in ways],
+            [(access.condition, f"({kind}){_parenthesize(access.expression)}") for access in ways],
         )
     if any(access.conditions for access in ways):
         places = dict.fromkeys(access.where or "1" for access in ways)
-        yield _function(
+        yield _format_function(
             "int",
             layout.name(path, "present"),
             depth,
             [("", " || ".join(f"({where})" for where in places))],
         )
     if kind and (first.info.scaled or first.info.unit):
-        yield from _scaling(first.info, name, kind)
+        yield from _iter_conversions(first.info, name, kind)
 
 
-def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
-    """Return a C function that returns the first value with a true condition, else 0."""
+def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
+    """Return a C function that returns the first value with a true condition.
+
+    The C function returns 0 if no condition is true.
+
+    Args:
+        kind: the C type of the result.
+        depth: number of arrays around the field.
+        ways: (condition, value) of each alternative; the condition "" is always true.
+    """
     used = " ".join(condition + " " + value for condition, value in ways)
     lines = [
         f"    (void){argument};"
@@ -563,23 +584,23 @@ def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> 
     return "\n".join([head, "{", *lines, "}"])
 
 
-def _group(expression: str) -> str:
+def _parenthesize(expression: str) -> str:
     if " " in expression and not expression.startswith(("lidarspec_", "p[")):
         return f"({expression})"
     return expression
 
 
-def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
-    """Yield the conversions of a raw number to the field's unit and to the SI unit."""
-    yield _conversion(f"{name}_to_{_unit_name(info.unit)}", kind, info.scale, info.offset)
+def _iter_conversions(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
+    """Yield C functions that convert a raw number to the field's unit and to SI."""
+    yield _format_conversion(f"{name}_to_{_unit_name(info.unit)}", kind, info.scale, info.offset)
     if info.unit in SI:
         unit, factor, offset = SI[info.unit]
-        yield _conversion(
+        yield _format_conversion(
             f"{name}_to_{unit}", kind, info.scale * factor, info.offset * factor + offset
         )
 
 
-def _conversion(name: str, kind: str, scale: float, offset: float) -> str:
+def _format_conversion(name: str, kind: str, scale: float, offset: float) -> str:
     text = f"(double)raw * {float(scale)!r}" + (
         f" {'-' if offset < 0 else '+'} {abs(float(offset))!r}" if offset else ""
     )

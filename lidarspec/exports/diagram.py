@@ -5,8 +5,8 @@ A row has four bytes, and each field is a box. A repeated part is drawn once, wi
 A diagram is made in two steps. `_ItemBuilder` converts a frame tree to boxes in wire order
 (`DiagramBox`), and to groups that are repeated or optional (`BoxGroup`). `_Sheet` draws them from
 top to bottom. A box that crosses the end of a row continues in the next row. A group starts a new
-row and has a bracket beside it. A field that is too long, or that has no fixed length, is drawn as
-a cut row.
+row and has a bracket at its right. A field that is too long, or that has no fixed length, is drawn
+as a cut row.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lidarspec.frames.wire_table import (
 )
 from lidarspec.spec import Sensor, tree
 
-#: Prefixes of the names of fields without a meaning, as in manuals.
+#: Prefixes that manuals use in the names of fields without a meaning.
 SPARE_PREFIXES = ("reserved", "unused", "spare", "zeros", "padding")
 
 
@@ -57,7 +57,7 @@ class DiagramBox:
 
 @dataclass(frozen=True)
 class BoxGroup:
-    """Boxes that are repeated together, or optional together.
+    """A group of boxes that are repeated together, or that are optional together.
 
     Attributes:
         label: the count or the condition.
@@ -209,7 +209,10 @@ class _ItemBuilder:
     def _make_run_cell(
         self, node: tree.Block, part: tree.Part, low: int, high: int, start: SizeFormula
     ) -> DiagramBox:
-        """Return the box of a run of bits, with the bit numbers if it is not the whole value."""
+        """Return the box of the bits `low` to `high` of a value.
+
+        The box shows the bit numbers if it is not the whole value.
+        """
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
         if high > low:
@@ -255,35 +258,35 @@ class _ItemBuilder:
 #: Bits in a row.
 ROW_BITS = 32
 #: Width of a bit, in pixels.
-BIT_WIDTH = 22
+BIT_WIDTH_PX = 22
 #: Height of a row, in pixels.
-ROW_HEIGHT = 46
+ROW_HEIGHT_PX = 46
 #: Width of the column of offsets at the left, in pixels.
-LEFT_MARGIN = 104
+LEFT_MARGIN_PX = 104
 #: Width of a level of brackets at the right, in pixels.
-BRACKET_WIDTH = 136
+BRACKET_WIDTH_PX = 136
 #: Margin around the drawing, in pixels.
-MARGIN = 16
+MARGIN_PX = 16
 #: Bits of the longest field that is drawn in full; a longer one is drawn as a cut row.
 MAX_DRAWN_BITS = 128
-#: Letters of the longest offset that is written in one line.
+#: Maximum number of letters of an offset that is written in one line.
 MAX_OFFSET_LETTERS = 13
 #: Fill colour by role.
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
 #: Colour of names.
-INK = "#1c2430"
+NAME_COLOUR = "#1c2430"
 #: Colour of details and offsets.
-FAINT = "#64707f"
+DETAIL_COLOUR = "#64707f"
 #: Colour of lines.
-LINE = "#4a5565"
+LINE_COLOUR = "#4a5565"
 #: Width of a letter as a share of the font size.
 LETTER_ASPECT = 0.61
 #: Font size of names, in pixels.
-NAME_SIZE = 13
+NAME_SIZE_PX = 13
 #: Font size of details, in pixels.
-DETAIL_SIZE = 10.5
+DETAIL_SIZE_PX = 10.5
 #: Smallest font size of names, in pixels.
-MIN_NAME_SIZE = 8
+MIN_NAME_SIZE_PX = 8
 
 
 def svg(sensor: Sensor) -> str:
@@ -323,34 +326,34 @@ class _Sheet:
     """
 
     parts: list[str] = field(default_factory=list)
-    top: float = MARGIN
+    top: float = MARGIN_PX
     used: int = 0
     deepest: int = 0
 
     def title(self, text: str, detail: str) -> None:
         """Draw the name of a frame type, and the byte and bit numbers above its first row."""
-        self.parts.append(_format_text(MARGIN, self.top + 14, text, 15, weight="bold"))
-        self.parts.append(_format_text(MARGIN, self.top + 31, detail, 11.5, fill=FAINT))
+        self.parts.append(_format_text(MARGIN_PX, self.top + 14, text, 15, weight="bold"))
+        self.parts.append(_format_text(MARGIN_PX, self.top + 31, detail, 11.5, fill=DETAIL_COLOUR))
         self.top += 48
         for byte in range(ROW_BITS // 8):
             self.parts.append(
                 _format_text(
-                    LEFT_MARGIN + (8 * byte + 4) * BIT_WIDTH,
+                    LEFT_MARGIN_PX + (8 * byte + 4) * BIT_WIDTH_PX,
                     self.top,
                     f"byte {byte}",
                     10.5,
-                    fill=FAINT,
+                    fill=DETAIL_COLOUR,
                     anchor="middle",
                 )
             )
         for bit in range(ROW_BITS):
             self.parts.append(
                 _format_text(
-                    LEFT_MARGIN + (bit + 0.5) * BIT_WIDTH,
+                    LEFT_MARGIN_PX + (bit + 0.5) * BIT_WIDTH_PX,
                     self.top + 13,
                     str(7 - bit % 8),
                     8.5,
-                    fill=FAINT,
+                    fill=DETAIL_COLOUR,
                     anchor="middle",
                 )
             )
@@ -373,8 +376,10 @@ class _Sheet:
 
     def document(self, title: str) -> str:
         """Return the whole SVG document."""
-        width = LEFT_MARGIN + ROW_BITS * BIT_WIDTH + MARGIN + BRACKET_WIDTH * self.deepest
-        height = self.top - 26 + MARGIN
+        width = (
+            LEFT_MARGIN_PX + ROW_BITS * BIT_WIDTH_PX + MARGIN_PX + BRACKET_WIDTH_PX * self.deepest
+        )
+        height = self.top - 26 + MARGIN_PX
         head = (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}"'
             f' width="{width:g}" height="{height:g}" font-family="Helvetica, Arial, sans-serif">'
@@ -392,26 +397,31 @@ class _Sheet:
 
     def _end_row(self) -> None:
         if self.used:
-            self.top = self.top + ROW_HEIGHT
+            self.top = self.top + ROW_HEIGHT_PX
             self.used = 0
 
     def _draw_group(self, group: BoxGroup, depth: int) -> None:
-        """Draw a group in rows of its own, with a bracket at the right."""
+        """Draw a group from the start of a new row, with a bracket at the right."""
         self._end_row()
-        self.deepest = max(self.deepest, depth + 1 + _depth(group))
+        self.deepest = max(self.deepest, depth + 1 + _find_nesting_depth(group))
         top = self.top
         self.items(group.items, depth)
         self._end_row()
-        x = LEFT_MARGIN + ROW_BITS * BIT_WIDTH + 8 + BRACKET_WIDTH * _depth(group)
+        x = (
+            LEFT_MARGIN_PX
+            + ROW_BITS * BIT_WIDTH_PX
+            + 8
+            + BRACKET_WIDTH_PX * _find_nesting_depth(group)
+        )
         path = f"M{x} {top + 2:g}h6v{self.top - top - 4:g}h-6"
         dashes = ' stroke-dasharray="4 3"' if group.optional else ""
         self.parts.append(
-            f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.4"{dashes}/>'
+            f'<path d="{path}" fill="none" stroke="{LINE_COLOUR}" stroke-width="1.4"{dashes}/>'
         )
         self.parts += _draw_bracket_label(x + 12, (top + self.top) / 2, group.label)
 
     def _draw_box(self, cell: DiagramBox) -> None:
-        """Draw a field as a piece in each row that it covers, with its name in the widest."""
+        """Draw a field as one piece in each row; its name is in the widest piece."""
         pieces: list[Piece] = []
         left = cell.bits
         lead = self.used % 8
@@ -419,7 +429,7 @@ class _Sheet:
             if self.used == 0:
                 self._draw_offset(cell, (lead + cell.bits - left) // 8)
             taken = min(left, ROW_BITS - self.used)
-            pieces.append((LEFT_MARGIN + self.used * BIT_WIDTH, self.top, taken))
+            pieces.append((LEFT_MARGIN_PX + self.used * BIT_WIDTH_PX, self.top, taken))
             self.used = self.used + taken
             left = left - taken
             if self.used == ROW_BITS:
@@ -428,36 +438,39 @@ class _Sheet:
         self.parts += _draw_outline(pieces, cell)
         for index, (x, y, bits) in enumerate(pieces):
             if index == widest:
-                self.parts += _draw_label(x, y, bits * BIT_WIDTH, cell)
+                self.parts += _draw_label(x, y, bits * BIT_WIDTH_PX, cell)
             elif len(pieces) == 2 and not _touches(*pieces):
                 self.parts += _draw_label(
                     x,
                     y,
-                    bits * BIT_WIDTH,
+                    bits * BIT_WIDTH_PX,
                     replace(cell, name=f"({cell.name})", detail=""),
-                    fill=FAINT,
+                    fill=DETAIL_COLOUR,
                 )
 
     def _draw_cut_row(self, cell: DiagramBox) -> None:
-        """Draw a field that is too long, or has no fixed length, as a row with jagged cuts."""
+        """Draw a field as one row with jagged cuts.
+
+        Used if the field is too long to draw in full, or if it has no fixed length.
+        """
         self._end_row()
         self._draw_offset(cell, 0)
-        width = ROW_BITS * BIT_WIDTH
-        self.parts += _draw_outline([(LEFT_MARGIN, self.top, ROW_BITS)], cell)
+        width = ROW_BITS * BIT_WIDTH_PX
+        self.parts += _draw_outline([(LEFT_MARGIN_PX, self.top, ROW_BITS)], cell)
         for share in (0.12, 0.88):
-            x = LEFT_MARGIN + share * width
-            step = ROW_HEIGHT / 3
+            x = LEFT_MARGIN_PX + share * width
+            step = ROW_HEIGHT_PX / 3
             path = f"M{x - 4:g} {self.top:g}l8 {step:g}l-8 {step:g}l8 {step:g}"
-            self.parts.append(f'<path d="{path}" fill="none" stroke="{FAINT}"/>')
-        self.parts += _draw_label(LEFT_MARGIN, self.top, width, cell)
-        self.top = self.top + ROW_HEIGHT
+            self.parts.append(f'<path d="{path}" fill="none" stroke="{DETAIL_COLOUR}"/>')
+        self.parts += _draw_label(LEFT_MARGIN_PX, self.top, width, cell)
+        self.top = self.top + ROW_HEIGHT_PX
         self.used = 0
 
     def _draw_offset(self, cell: DiagramBox, more: int) -> None:
-        """Draw the offset of the current row at its left, a long formula in two lines.
+        """Draw the offset of the current row at its left; a long formula takes two lines.
 
         Args:
-            more: the bytes of the field in the rows before.
+            more: number of bytes of the field in the rows before.
         """
         text = str(cell.offset + SizeFormula(more))
         middle = text.find(" + ", len(text) // 2 - 4)
@@ -466,30 +479,33 @@ class _Sheet:
         else:
             lines = [text[: middle + 2], text[middle + 3 :]]
         for index, line in enumerate(lines):
-            y = self.top + ROW_HEIGHT / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
-            size = min(11, (LEFT_MARGIN - 12) / (LETTER_ASPECT * len(line)))
+            y = self.top + ROW_HEIGHT_PX / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
+            size = min(11, (LEFT_MARGIN_PX - 12) / (LETTER_ASPECT * len(line)))
             self.parts.append(
-                _format_text(LEFT_MARGIN - 8, y, line, size, fill=FAINT, anchor="end")
+                _format_text(LEFT_MARGIN_PX - 8, y, line, size, fill=DETAIL_COLOUR, anchor="end")
             )
 
 
-def _depth(group: BoxGroup) -> int:
-    """Return the depth of the groups nested in a group."""
-    return max((1 + _depth(item) for item in group.items if isinstance(item, BoxGroup)), default=0)
+def _find_nesting_depth(group: BoxGroup) -> int:
+    """Return the number of levels of groups inside a group; 0 for only boxes."""
+    return max(
+        (1 + _find_nesting_depth(item) for item in group.items if isinstance(item, BoxGroup)),
+        default=0,
+    )
 
 
 def _draw_outline(pieces: Sequence[Piece], cell: DiagramBox) -> Iterator[str]:
     """Yield the filled pieces of a box, and their common outline."""
     rects = "".join(
-        f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT_WIDTH}" height="{ROW_HEIGHT}"/>'
+        f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT_WIDTH_PX}" height="{ROW_HEIGHT_PX}"/>'
         for x, y, bits in pieces
     )
     yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.tooltip)}</title>{rects}</g>'
     path = ""
     for index, piece in enumerate(pieces):
         x, y, bits = piece
-        end = x + bits * BIT_WIDTH
-        path += f"M{x:g} {y:g}v{ROW_HEIGHT}M{end:g} {y:g}v{ROW_HEIGHT}"
+        end = x + bits * BIT_WIDTH_PX
+        path += f"M{x:g} {y:g}v{ROW_HEIGHT_PX}M{end:g} {y:g}v{ROW_HEIGHT_PX}"
         before = pieces[index - 1] if index else None
         if index + 1 < len(pieces):
             after = pieces[index + 1]
@@ -501,55 +517,55 @@ def _draw_outline(pieces: Sequence[Piece], cell: DiagramBox) -> Iterator[str]:
             else ""
         )
         path += (
-            f"M{x:g} {y + ROW_HEIGHT:g}H{end:g}"
+            f"M{x:g} {y + ROW_HEIGHT_PX:g}H{end:g}"
             if after is None or not _touches(piece, after)
             else ""
         )
         path += f"M{x:g} {y:g}H{before[0]:g}" if before and before[0] > x else ""
         path += (
-            f"M{_right_edge(after):g} {y + ROW_HEIGHT:g}H{end:g}"
+            f"M{_right_edge(after):g} {y + ROW_HEIGHT_PX:g}H{end:g}"
             if after and _touches(piece, after) and _right_edge(after) < end
             else ""
         )
-    yield f'<path d="{path}" fill="none" stroke="{LINE}"/>'
+    yield f'<path d="{path}" fill="none" stroke="{LINE_COLOUR}"/>'
 
 
 def _right_edge(piece: Piece | None) -> float:
     if piece is None:
         return 0
-    return piece[0] + piece[2] * BIT_WIDTH
+    return piece[0] + piece[2] * BIT_WIDTH_PX
 
 
 def _touches(one: Piece, other: Piece) -> bool:
     """Return whether two pieces touch, one above the other."""
-    return abs(one[1] - other[1]) == ROW_HEIGHT and max(one[0], other[0]) < min(
+    return abs(one[1] - other[1]) == ROW_HEIGHT_PX and max(one[0], other[0]) < min(
         _right_edge(one), _right_edge(other)
     )
 
 
 def _draw_label(
-    x: float, y: float, width: float, cell: DiagramBox, fill: str = INK
+    x: float, y: float, width: float, cell: DiagramBox, fill: str = NAME_COLOUR
 ) -> Iterator[str]:
-    """Yield the name and the detail of a box, as large as there is room.
+    """Yield the name and the detail of a box in the largest font size that fits.
 
-    A name that does not fit in the smallest size is written vertically.
+    A name that does not fit in the smallest font size is written vertically.
     """
     room = width - 5
-    if LETTER_ASPECT * MIN_NAME_SIZE * len(cell.name) > room:
+    if LETTER_ASPECT * MIN_NAME_SIZE_PX * len(cell.name) > room:
         cell = replace(cell, name=cell.name.rpartition(".")[2])
-    size = min(NAME_SIZE, room / (LETTER_ASPECT * len(cell.name)))
+    size = min(NAME_SIZE_PX, room / (LETTER_ASPECT * len(cell.name)))
     middle = x + width / 2
-    if size < MIN_NAME_SIZE and len(cell.name) > 1:
-        tall = min(NAME_SIZE - 2, (ROW_HEIGHT - 4) / (LETTER_ASPECT * len(cell.name)))
-        if tall >= MIN_NAME_SIZE - 1:
+    if size < MIN_NAME_SIZE_PX and len(cell.name) > 1:
+        tall = min(NAME_SIZE_PX - 2, (ROW_HEIGHT_PX - 4) / (LETTER_ASPECT * len(cell.name)))
+        if tall >= MIN_NAME_SIZE_PX - 1:
             text = cell.name
         else:
-            text = cell.name[: int((ROW_HEIGHT - 4) / (LETTER_ASPECT * (MIN_NAME_SIZE - 1)))]
-        tall = max(tall, MIN_NAME_SIZE - 1)
-        turned = f' transform="rotate(-90 {middle:g} {y + ROW_HEIGHT / 2:g})"'
+            text = cell.name[: int((ROW_HEIGHT_PX - 4) / (LETTER_ASPECT * (MIN_NAME_SIZE_PX - 1)))]
+        tall = max(tall, MIN_NAME_SIZE_PX - 1)
+        turned = f' transform="rotate(-90 {middle:g} {y + ROW_HEIGHT_PX / 2:g})"'
         yield _format_text(
             middle,
-            y + ROW_HEIGHT / 2 + tall * 0.35,
+            y + ROW_HEIGHT_PX / 2 + tall * 0.35,
             text,
             tall,
             fill=fill,
@@ -557,10 +573,10 @@ def _draw_label(
             more=turned,
         )
         return
-    has_room = cell.detail and LETTER_ASPECT * DETAIL_SIZE * len(cell.detail) <= room
+    has_room = cell.detail and LETTER_ASPECT * DETAIL_SIZE_PX * len(cell.detail) <= room
     yield _format_text(
         middle,
-        y + ROW_HEIGHT / 2 + (-1 if has_room else size * 0.35),
+        y + ROW_HEIGHT_PX / 2 + (-1 if has_room else size * 0.35),
         cell.name,
         size,
         fill=fill,
@@ -568,20 +584,25 @@ def _draw_label(
     )
     if has_room:
         yield _format_text(
-            middle, y + ROW_HEIGHT / 2 + 13, cell.detail, DETAIL_SIZE, fill=FAINT, anchor="middle"
+            middle,
+            y + ROW_HEIGHT_PX / 2 + 13,
+            cell.detail,
+            DETAIL_SIZE_PX,
+            fill=DETAIL_COLOUR,
+            anchor="middle",
         )
 
 
 def _draw_bracket_label(x: float, y: float, label: str) -> Iterator[str]:
-    """Yield the label of a bracket, in lines that fit beside the bracket."""
+    """Yield the label of a bracket, split into lines that fit at its right."""
     lines = [""]
-    room = (BRACKET_WIDTH - 30) / (LETTER_ASPECT * 12)
+    room = (BRACKET_WIDTH_PX - 30) / (LETTER_ASPECT * 12)
     for word in label.split(" "):
         if lines[-1] and len(lines[-1]) + 1 + len(word) > room:
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
     for index, line in enumerate(lines):
-        size = min(12, (BRACKET_WIDTH - 30) / (LETTER_ASPECT * len(line)))
+        size = min(12, (BRACKET_WIDTH_PX - 30) / (LETTER_ASPECT * len(line)))
         yield _format_text(
             x, y + 4 + 15 * (index - (len(lines) - 1) / 2), line, size, weight="bold"
         )
@@ -593,7 +614,7 @@ def _format_text(
     text: str,
     size: float,
     *,
-    fill: str = INK,
+    fill: str = NAME_COLOUR,
     anchor: str = "",
     weight: str = "",
     more: str = "",

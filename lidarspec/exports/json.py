@@ -19,7 +19,7 @@ from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import Split
 
-#: Increased whenever the meaning of a key changes or a key is removed.
+#: Version of the format; it increases if a key changes its meaning or is removed.
 VERSION = 1
 
 
@@ -68,24 +68,24 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
 
 
 def _scan(rule: Split | None) -> dict[str, Any] | None:
-    """Return the rule by which scans end; None for a sensor without points."""
+    """Return the rule for the end of a scan; None for a sensor without points."""
     if rule is None:
         return None
     return {"rule": type(rule).__name__, **dataclasses.asdict(rule)}
 
 
 def facts(value: object, *names: str) -> dict[str, Any]:
-    """Return some attributes of an object as JSON data, by name."""
+    """Return the attributes `names` of an object as JSON data, by name."""
     own = ((name, getattr(value, name)) for name in names)
-    return {name: _plain(fact) for name, fact in own}
+    return {name: _to_json(fact) for name, fact in own}
 
 
-def _plain(fact: Any) -> Any:
+def _to_json(fact: Any) -> Any:
     """Return a value as JSON data: tuples as lists, mappings as objects, bytes as hex."""
     if isinstance(fact, Mapping):
-        return {name: _plain(value) for name, value in fact.items()}
+        return {name: _to_json(value) for name, value in fact.items()}
     if isinstance(fact, list | tuple):
-        return [_plain(value) for value in fact]
+        return [_to_json(value) for value in fact]
     if isinstance(fact, Count | Address):
         return {"kind": type(fact).__name__.lower(), **vars(fact)}
     if isinstance(fact, bytes | bytearray):
@@ -217,9 +217,9 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts(node: tree.PartSequence) -> dict[str, Any]:
-    """Return a node of parts: the rules for their end, and each kind.
+    """Return the rules for the end of a sequence of parts, and each kind of part.
 
-    `following` is the size in bytes of the next part.
+    The key `following` is the size in bytes of the next part.
     """
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}

@@ -1,12 +1,12 @@
-"""A spec as a Kaitai Struct format, for Kaitai's compiler, web IDE and visualizer.
+"""Export a spec as a Kaitai Struct format for Kaitai's compiler, web IDE and visualizer.
 
 A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in wire
 order (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml` writes the
 document. Formulas refer to a field by its path from the current type (`format_reference`), since
-Kaitai has no absolute paths. Bit blocks become bit-sized integers if one of Kaitai's two bit orders
-yields their parts in a row, else bytes and calculated instances. A field with a scale gets an
-instance with the physical value. Kaitai cannot express checksums, plausibility tests and points:
-checksums are named in the documentation of their fields.
+Kaitai has no absolute paths. A bit block becomes bit-sized integers if one of Kaitai's two bit
+orders yields its parts in a row; otherwise it becomes bytes and calculated instances. A field with
+a scale gets an instance with the physical value. Kaitai cannot express checksums, plausibility
+tests and points: checksums are named in the documentation of their fields.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from lidarspec.spec.fields import slug
 #: A string that needs no quotes in YAML.
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./()<>=+*-]*( [A-Za-z0-9_./()<>=+*;,-]+)*")
 #: Maximum number of allowed values to list.
-LISTED = 16
-_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
+MAX_LISTED_VALUES = 16
+_RESERVED_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
 
 class HexNumber(int):
@@ -39,40 +39,40 @@ class HexNumber(int):
 
 
 def yaml(value: Mapping[str, Any]) -> str:
-    """Return the text of a document."""
-    return "\n".join(_lines(value, "")) + "\n"
+    """Return a document as YAML text."""
+    return "\n".join(_iter_lines(value, "")) + "\n"
 
 
-def _lines(value: Any, indent: str) -> Iterator[str]:
+def _iter_lines(value: Any, indent: str) -> Iterator[str]:
     if isinstance(value, Mapping):
         for key, part in value.items():
-            yield from _entry(f"{indent}{_scalar(key)}:", part, indent + "  ")
+            yield from _iter_entry_lines(f"{indent}{_format_scalar(key)}:", part, indent + "  ")
     else:
         for part in value:
             if isinstance(part, Mapping) and part:
-                first, *rest = _lines(part, indent + "  ")
+                first, *rest = _iter_lines(part, indent + "  ")
                 yield f"{indent}- {first.lstrip()}"
                 yield from rest
             else:
-                yield from _entry(f"{indent}-", part, indent + "  ")
+                yield from _iter_entry_lines(f"{indent}-", part, indent + "  ")
 
 
-def _entry(head: str, part: Any, indent: str) -> Iterator[str]:
+def _iter_entry_lines(head: str, part: Any, indent: str) -> Iterator[str]:
     if (isinstance(part, Mapping) and part) or (
         isinstance(part, list) and any(isinstance(item, Mapping | list) for item in part)
     ):
         yield head
-        yield from _lines(part, indent)
+        yield from _iter_lines(part, indent)
     elif isinstance(part, Mapping):
         yield f"{head} {{}}"
     elif isinstance(part, list):
-        yield f"{head} [{', '.join(_scalar(item) for item in part)}]"
+        yield f"{head} [{', '.join(_format_scalar(item) for item in part)}]"
     else:
-        yield f"{head} {_scalar(part)}"
+        yield f"{head} {_format_scalar(part)}"
 
 
-def _scalar(value: Any) -> str:
-    if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _WORDS:
+def _format_scalar(value: Any) -> str:
+    if isinstance(value, str) and _PLAIN.fullmatch(value) and value.lower() not in _RESERVED_WORDS:
         return value
     if isinstance(value, str | bool):
         return json.dumps(value, ensure_ascii=False)
@@ -90,10 +90,10 @@ Scope = tuple[str | None, ...]
 
 
 def format_reference(scope: Scope, ref: tree.Ref) -> str:
-    """Return a field as an integer, by its path from a type.
+    """Return an integer expression of a field, by its path from a type.
 
     Raises:
-        ExportError: if no type around the expression contains it.
+        ExportError: if no type around the expression contains the field.
     """
     for up, path in enumerate(reversed(scope)):
         if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
@@ -134,24 +134,28 @@ Attribute = dict[str, Any]
 
 #: Maximum bits that Kaitai reads at once, and sizes in bytes of its other integers and of its
 #: floats.
-WIDEST = 64
-INTEGERS = (1, 2, 4, 8)
-FLOATS = (4, 8)
+MAX_BITS = 64
+INTEGER_SIZES = (1, 2, 4, 8)
+FLOAT_SIZES = (4, 8)
 
 
 def block_type(
     block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
 ) -> tuple[list[Attribute], dict[str, Attribute]]:
-    """Return the attributes and instances of a block's type, with their documentation.
+    """Return the attributes and the instances of a block's type.
+
+    Args:
+        doc: returns the documentation of a field.
+
 
     Raises:
         ExportError: for an integer that is too wide for Kaitai.
     """
-    if any(part.bits.width > WIDEST for part in block.parts):
+    if any(part.bits.width > MAX_BITS for part in block.parts):
         raise ExportError(
-            f"{block.info.path}: an integer of more than {WIDEST} bits is not supported"
+            f"{block.info.path}: an integer of more than {MAX_BITS} bits is not supported"
         )
-    ordered = _in_order(block)
+    ordered = _find_bit_order(block)
     if ordered is None:
         calculated = {
             _name(part): {"value": _assemble_part(part, "raw")} | doc(part.info)
@@ -177,16 +181,19 @@ def block_type(
 def inline(
     block: tree.Block, more: Mapping[str, Any]
 ) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """Return the attribute and instances of a block that is one plain integer.
+    """Return the attribute and the instances of a block that is one plain integer.
 
     Returns None for any other block.
+
+    Args:
+        more: further keys of the attribute.
     """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
     part = block.parts[0]
     name = identifier(block.name)
-    ordered = _in_order(block)
-    if ordered is not None and not part.bits.signed and part.bits.width <= WIDEST:
+    ordered = _find_bit_order(block)
+    if ordered is not None and not part.bits.signed and part.bits.width <= MAX_BITS:
         return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _valid(part), {}
     if "repeat" in more:
         return None
@@ -196,11 +203,11 @@ def inline(
 
 
 def as_block(node: tree.Node) -> tree.Node:
-    """Return the node, or an equivalent block for an integer of an unusual size.
+    """Return an integer of an unusual size as a block, any other node unchanged.
 
-    Kaitai has no type for such integers.
+    Kaitai has no type for integers of these sizes.
     """
-    if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGERS:
+    if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGER_SIZES:
         return node
     targets = [
         8 * (byte if node.order == "little" else node.size - 1 - byte) for byte in range(node.size)
@@ -215,9 +222,9 @@ def _name(part: tree.Part) -> str:
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
-def _any_of(info: tree.FieldInfo) -> Attribute:
-    """Return the allowed values of a field, unless there are too many to list."""
-    if info.allowed and len(info.allowed) <= LISTED:
+def _list_allowed_values(info: tree.FieldInfo) -> Attribute:
+    """Return the key with the allowed values of a field; {} if there are too many."""
+    if info.allowed and len(info.allowed) <= MAX_LISTED_VALUES:
         return {"valid": {"any-of": list(info.allowed)}}
     return {}
 
@@ -225,7 +232,7 @@ def _any_of(info: tree.FieldInfo) -> Attribute:
 def _valid(part: tree.Part) -> Attribute:
     if part.info.const is None:
         if part.bits.width > 1:
-            return _any_of(part.info)
+            return _list_allowed_values(part.info)
         return {}
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
 
@@ -237,25 +244,27 @@ def _condition(more: Mapping[str, Any]) -> Attribute:
     return {}
 
 
-def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """Return the parts in the order of one of Kaitai's bit orders, and its suffix.
+def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
+    """Return the parts of a block in a bit order of Kaitai, and the order's suffix.
 
-    Returns None if they do not fill the block in either. "be" reads each byte from its highest bit
-    on and fills integers from the top, "le" does both from the lowest bit on.
+    Returns None if the parts do not fill the block in either order. "be" reads each byte from its
+    highest bit on and fills integers from the top, "le" does both from the lowest bit on.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
     for suffix in ("be", "le"):
-        starts = [_starts(part.bits, suffix) for part in block.parts]
+        starts = [_find_starts(part.bits, suffix) for part in block.parts]
         if all(len(of_part) == 1 for of_part in starts):
-            return sorted(block.parts, key=lambda part: min(_starts(part.bits, suffix))), suffix
+            return sorted(
+                block.parts, key=lambda part: min(_find_starts(part.bits, suffix))
+            ), suffix
     return None
 
 
-def _starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the possible bit positions at which reading begins.
+def _find_starts(bits: BitField, suffix: str) -> set[int]:
+    """Return the bit positions at which Kaitai would begin to read a field's segments.
 
-    It is one number if the bits are consecutive.
+    There is only one position if the bits are consecutive.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -351,14 +360,14 @@ class _KaitaiWriter:
     seals: Mapping[str, tree.Sealed]
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
-        """Return the type of a struct inside the types of `scope`."""
+        """Return the Kaitai type of a struct inside the types of `scope`."""
         kaitai = _KaitaiType()
         for member in node.struct.members:
             self._member(kaitai, member, (*scope, node.struct.path))
         return kaitai.done(node.struct.path)
 
     def _member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
-        """Add a part to a type, with further keys of its attribute."""
+        """Add a member to a type; `more` are further keys of its attribute."""
         node = as_block(node)
         match node:
             case tree.Empty() | tree.Derived():
@@ -410,7 +419,7 @@ class _KaitaiWriter:
     def _parts(
         self, kaitai: _KaitaiType, node: tree.PartSequence, scope: Scope, **more: Any
     ) -> None:
-        """Add parts of one kind; Kaitai has to know a type before it reads it."""
+        """Add parts of one kind; Kaitai must know the type before it reads the parts."""
         if len(node.kinds) > 1:
             raise ExportError(f"{node.axis}: Kaitai cannot distinguish parts by their constants")
         (kind,), name = node.kinds, identifier(node.name)
@@ -436,13 +445,13 @@ class _KaitaiWriter:
     def _add_typed(
         self, kaitai: _KaitaiType, name: str, node: tree.Node, scope: Scope, **more: Any
     ) -> None:
-        """Add an attribute with a type of its own."""
+        """Add an attribute, and a new type for it."""
         name = identifier(name)
         kaitai.types[name] = self._type(node, scope)
         kaitai.seq.append({"id": name, "type": name, **more})
 
     def _type(self, node: tree.Node, scope: Scope) -> Attribute:
-        """Return a type for any part: its own, or one that holds it as `value`."""
+        """Return the type of a struct, or a type with any other node as its `value`."""
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
         kaitai = _KaitaiType()
@@ -501,7 +510,7 @@ class _KaitaiWriter:
             )
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
-        if node.kind == "float" and node.size not in FLOATS:
+        if node.kind == "float" and node.size not in FLOAT_SIZES:
             raise ExportError(
                 f"{node.info.path}: a float of {node.size} bytes; Kaitai supports 4 and 8 bytes"
             )
@@ -510,7 +519,7 @@ class _KaitaiWriter:
         else:
             order = ""
         if node.info.const is None:
-            const = _any_of(node.info)
+            const = _list_allowed_values(node.info)
         else:
             const = {"valid": node.info.const}
         return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
@@ -550,7 +559,7 @@ def _size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _value(node: tree.Node) -> tree.Node:
-    """Return the part of an array or a choice as the only member of a type."""
+    """Return an element of an array or a choice as the only member of a type."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

@@ -1,7 +1,8 @@
 """The start of a sensor's reference page: commands to copy, a program, and installation notes.
 
 The commands follow from the links of the sensor. Notes are Markdown files that a plugin ships as
-`notes/ID.md` beside its modules: wiring, connectors, addresses and settings from the manual.
+`notes/ID.md` in the folder of its modules: wiring, connectors, addresses and settings from the
+manual.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from lidarspec.spec.links import Serial, Tcp, Udp
 
 
 def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
-    """Return (command, purpose) for a shell: the first things to do with a sensor.
+    """Return (command, purpose) of the first shell commands to use with a sensor.
 
     Args:
         source: the SOURCE in the commands; by default a typical one for the links of the sensor.
@@ -57,7 +58,7 @@ def typical_source(sensor: Sensor) -> str:
 
 
 def read_notes(sensor_id: str) -> str:
-    """Return the notes that the plugin of an installed sensor ships, "" if there are none."""
+    """Return the notes on an installed sensor from its plugin; "" if it has no notes."""
     for entry in entry_points(SENSORS):
         if entry.name != sensor_id:
             continue

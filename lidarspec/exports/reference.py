@@ -31,7 +31,7 @@ STATUSES = {
     "capture": "agrees with captures of the device",
     "hardware": "tested with the device",
 }
-#: Rule of a scan -> a description of its end.
+#: Class of a scan rule -> a description of the end of a scan.
 RULES = {
     "OnWrap": "where `{name}` passes {at:g}",
     "OnFlag": "before every packet in which `{name}` is set",
@@ -40,7 +40,7 @@ RULES = {
     "OnRewind": "before every packet in which `{name}` decreases",
 }
 #: Maximum number of channels to list.
-RINGS = 128
+MAX_LISTED_CHANNELS = 128
 
 
 def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
@@ -49,40 +49,40 @@ def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
     Args:
         pictures: frame type -> address of its packet diagram.
     """
-    parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", _quick_start(sensor)]
+    parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", _write_quick_start(sensor)]
     for name, picture in (pictures or {}).items():
         parts.append(f"![{name}: packet diagram]({picture})")
-    parts += [read_notes(sensor.id), "## Facts", "\n".join(_facts(sensor))]
+    parts += [read_notes(sensor.id), "## Facts", "\n".join(_iter_facts(sensor))]
     if sensor.commands:
-        parts += ["## Commands", "\n".join(_commands(sensor))]
+        parts += ["## Commands", "\n".join(_iter_commands(sensor))]
     for name, frame in sensor.frames.items():
-        parts += [*_frame(name, frame)]
-    parts += ["## Geometry", "\n".join(_geometry(sensor))]
+        parts += [*_iter_frame_section(name, frame)]
+    parts += ["## Geometry", "\n".join(_iter_geometry(sensor))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _facts(sensor: Sensor) -> Iterator[str]:
+def _iter_facts(sensor: Sensor) -> Iterator[str]:
     rows = [("id", ", ".join(f"`{name}`" for name in (sensor.id, *sensor.aliases)))]
-    rows += [(f"link `{name}`", _link(link)) for name, link in sensor.links.items()]
+    rows += [(f"link `{name}`", _describe_link(link)) for name, link in sensor.links.items()]
     if sensor.range_limits is not None:
         rows.append(("range", "{:g} m to {:g} m".format(*sensor.range_limits)))
     if sensor.scan is not None:
-        rows.append(("scan", f"ends {_rule(sensor.scan)}"))
-    rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
+        rows.append(("scan", f"ends {_describe_scan_rule(sensor.scan)}"))
+    rows += [("clock", _describe_clock(sensor.clock))] if sensor.clock else []
     rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
     rows += [
         ("verified", f"{sensor.status}: {STATUSES[sensor.status]}"),
         ("source", escape(sensor.source)),
     ]
-    return _table(["", ""], rows)
+    return _iter_table(["", ""], rows)
 
 
-def _link(link: Link) -> str:
+def _describe_link(link: Link) -> str:
     if isinstance(link, Serial):
         bauds = " or ".join(f"{baud:,}".replace(",", " ") for baud in link.bauds)
         return ", ".join(
-            [f"serial, {bauds} baud, 8N1", *_levels({"dtr": link.dtr, "rts": link.rts})]
+            [f"serial, {bauds} baud, 8N1", *_list_levels({"dtr": link.dtr, "rts": link.rts})]
         )
     if isinstance(link, Udp):
         ports = [f"port {' and '.join(str(port) for port in link.ports)}"] * bool(link.ports)
@@ -96,7 +96,7 @@ def _link(link: Link) -> str:
     return kind
 
 
-def _levels(lines: Mapping[str, bool | None]) -> list[str]:
+def _list_levels(lines: Mapping[str, bool | None]) -> list[str]:
     """Return the control lines with their levels."""
     return [
         f"{name.upper()} {'high' if level else 'low'}"
@@ -105,7 +105,7 @@ def _levels(lines: Mapping[str, bool | None]) -> list[str]:
     ]
 
 
-def _rule(scan: Split) -> str:
+def _describe_scan_rule(scan: Split) -> str:
     if isinstance(scan, Every):
         return f"every {scan.seconds:g} s"
     if isinstance(scan, OnFlag) and scan.value is not None:
@@ -113,7 +113,7 @@ def _rule(scan: Split) -> str:
     return RULES[type(scan).__name__].format(**vars(scan))
 
 
-def _clock(clock: Clock) -> str:
+def _describe_clock(clock: Clock) -> str:
     names = [clock.source] if isinstance(clock.source, str) else clock.source
     if callable(names):
         fields = "calculated from the packet"
@@ -128,17 +128,17 @@ def _clock(clock: Clock) -> str:
     )
 
 
-def _commands(sensor: Sensor) -> Iterator[str]:
+def _iter_commands(sensor: Sensor) -> Iterator[str]:
     rows = [
-        (f"`{name}`", _find_request(sensor, name), _answer(command), effect(sensor, name))
+        (f"`{name}`", _find_request(sensor, name), _describe_answer(command), effect(sensor, name))
         for name, command in sensor.commands.items()
     ]
-    return _table(["command", "bytes or arguments", "reply", ""], rows)
+    return _iter_table(["command", "bytes or arguments", "reply", ""], rows)
 
 
 def _find_request(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
-    parts = _levels(command.lines)
+    parts = _list_levels(command.lines)
     if command.frame and command.args:
         args = " and ".join(
             f"`{name}` {format_argument_type(argument.kind, ' to ')}"
@@ -150,14 +150,14 @@ def _find_request(sensor: Sensor, name: str) -> str:
     return ", ".join(parts)
 
 
-def _answer(command: Command) -> str:
+def _describe_answer(command: Command) -> str:
     if command.replies:
         return " or ".join(f"`{name}`" for name in command.replies)
     return "none documented"
 
 
 def effect(sensor: Sensor, name: str) -> str:
-    """Return the effect of a command and when it is sent, in words."""
+    """Describe the effect of a command, and when it is sent."""
     command = sensor.commands[name]
     effects = {
         "starts the data": command.starts,
@@ -172,7 +172,7 @@ def effect(sensor: Sensor, name: str) -> str:
     return "; ".join(text for text, holds in effects.items() if holds)
 
 
-def _quick_start(sensor: Sensor) -> str:
+def _write_quick_start(sensor: Sensor) -> str:
     """Return the commands to copy, with aligned comments, and a program in Python."""
     commands = list_commands(sensor)
     width = max(len(command) for command, _ in commands)
@@ -180,7 +180,7 @@ def _quick_start(sensor: Sensor) -> str:
     return "\n".join(["```console", *lines, "```", "", "```python", write_python(sensor), "```"])
 
 
-def _frame(name: str, frame: Frame) -> Iterator[str]:
+def _iter_frame_section(name: str, frame: Frame) -> Iterator[str]:
     if frame.direction == "out":
         kind = "to the sensor"
     elif frame.data:
@@ -201,11 +201,13 @@ def _frame(name: str, frame: Frame) -> Iterator[str]:
     escaped_rows = [
         [cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows
     ]  # an index is not a link
-    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], escaped_rows))
+    yield "\n".join(
+        _iter_table(["offset", "size", "type", "field", "unit", "meaning"], escaped_rows)
+    )
 
 
-def _geometry(sensor: Sensor) -> Iterator[str]:
-    """Describe the points of each data frame, their axes and fixed directions."""
+def _iter_geometry(sensor: Sensor) -> Iterator[str]:
+    """Yield the section about the points of each data frame: axes and directions."""
     yield (
         "Points are in metres, x forward, y left, z up; the manual's zero direction is +x, and"
         " azimuth counts counter-clockwise."
@@ -214,7 +216,7 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
         x, y, z = sensor.vendor_axes
         yield f"`configure(frame='vendor')` selects the vendor's axes: x {x}, y {y}, z {z}."
     for name, frame in sensor.frames.items():
-        cloud = _cloud(sensor, name) if frame.data else None
+        cloud = _decode_example(sensor, name) if frame.data else None
         if cloud is None:
             continue
         more = [
@@ -236,7 +238,7 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
         yield f"A `{name}` frame has {many}" + (
             f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else "."
         )
-        rows = _rings(cloud)
+        rows = _list_channels(cloud)
         if rows:
             yield (
                 ""
@@ -246,11 +248,11 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
                     " device."
                 )
             )
-            yield from _table(["channel", "elevation"], rows)
+            yield from _iter_table(["channel", "elevation"], rows)
 
 
-def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
-    """Return the points of an example frame, None if it has none."""
+def _decode_example(sensor: Sensor, name: str) -> PointCloud | None:
+    """Return the points of an example frame; None if it has no points."""
     try:
         frames = pack_found([Found(name, 0, sensor.example(name))])
         packets = PacketStream(sensor, name, Counters()).add([frames]).with_points
@@ -259,8 +261,11 @@ def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
         return None
 
 
-def _rings(cloud: PointCloud) -> Sequence[tuple[str, str]]:
-    """Return the elevation of each channel, if it is constant in all points."""
+def _list_channels(cloud: PointCloud) -> Sequence[tuple[str, str]]:
+    """Return (channel, elevation) for each channel.
+
+    Returns an empty list if an elevation varies, or if there are too many channels.
+    """
     if cloud.ring is None:
         return []
     rows = []
@@ -269,12 +274,12 @@ def _rings(cloud: PointCloud) -> Sequence[tuple[str, str]]:
         if not len(angles) or not np.isfinite(angles).all() or np.ptp(angles) > 1e-3:
             return []
         rows.append((str(ring), f"{angles[0] + 0.0:.3f} deg"))
-    if 1 < len(rows) <= RINGS:
+    if 1 < len(rows) <= MAX_LISTED_CHANNELS:
         return rows
     return []
 
 
-def _table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def _iter_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield f"| {' | '.join(headers)} |"
     yield f"|{'---|' * len(headers)}"
     for row in rows:

@@ -1,4 +1,4 @@
-"""A spec as a type stub for editors and type checkers.
+"""Export a spec as a type stub for editors and type checkers.
 
 It has a class for each struct of each frame, and the sensor's own methods. The result of `parse`
 has the fields as attributes, so a frame can be typed by the class of its type:
@@ -41,10 +41,10 @@ from lidarspec.spec.tree import (
     children,
 )
 
-#: The types of arguments of commands.
-TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}
-#: The further parameters of `parse`.
-PARSING = "verify: bool = True, units: bool = False"
+#: Kind of argument of a command -> its Python type.
+ARGUMENT_TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}
+#: The keyword parameters of `parse`.
+PARSE_OPTIONS = "verify: bool = True, units: bool = False"
 
 
 def pyi(sensor: Sensor) -> str:
@@ -87,19 +87,31 @@ from lidarspec import Sensor'''
 
 @dataclass
 class _StubClasses:
-    """The classes written so far, inner ones first, and the names in use."""
+    """The classes of a stub while it is written.
+
+    Attributes:
+        taken: the class names in use.
+        done: the text of each class, inner classes first.
+    """
 
     taken: set[str]
     done: list[str] = field(default_factory=list)
 
-    def add(self, node: Struct | Sealed | Block, name: str, says: str) -> str:
-        """Write the class of a struct or block, and return its name."""
+    def add(self, node: Struct | Sealed | Block, name: str, docstring: str) -> str:
+        """Add the class of a struct or block, and return its name.
+
+        Args:
+            name: the wanted name; a name in use gets a suffix.
+            docstring: the docstring of the class.
+        """
         while name in self.taken:
             name += "_"
         self.taken.add(name)
         lines = [line for member in self._members(node) for line in self._attribute(name, *member)]
         self.done.append(
-            "\n".join([f"class {name}:", f'    """{_quote(says)}"""', "", *(lines or ["    ..."])])
+            "\n".join(
+                [f"class {name}:", f'    """{_quote(docstring)}"""', "", *(lines or ["    ..."])]
+            )
         )
         return name
 
@@ -173,9 +185,9 @@ class _StubClasses:
 
 
 def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
-    """Return the class of the sensor with `parse`, `build`, `example` and `command`."""
+    """Return the class with the sensor's `parse`, `build`, `example` and `command`."""
     parses = "\n".join(
-        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING})'
+        f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSE_OPTIONS})'
         f" -> {name}: ..."
         for frame, name in names.items()
     )
@@ -196,7 +208,7 @@ class {to_class_name(sensor.id)}(Sensor):
 
 {parses}
     @overload
-    def parse(self, data: bytes, frame: str | None = None, *, {PARSING}) -> Any: ...
+    def parse(self, data: bytes, frame: str | None = None, *, {PARSE_OPTIONS}) -> Any: ...
 {builds}
     @overload
     def build(self, _frame: str, _value: Any = None, /, *, units: bool = False, **values: Any) -> bytes: ...
@@ -228,7 +240,8 @@ def _build(message: ExportedFrame) -> str:
 
 def _command(name: str, command: Command) -> str:
     args = "".join(
-        f", {arg}: {TYPES[type(argument.kind)]}" for arg, argument in command.arguments.items()
+        f", {arg}: {ARGUMENT_TYPES[type(argument.kind)]}"
+        for arg, argument in command.arguments.items()
     )
     return (
         f'    @overload\n    def command(self, _name: Literal["{name}"],'

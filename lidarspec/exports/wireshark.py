@@ -1,6 +1,6 @@
 """Write a Wireshark dissector in Lua for a sensor.
 
-A dissector has two parts. ``wireshark.lua``, beside this module, is the same for all sensors: it
+A dissector has two parts. ``wireshark.lua``, in the same folder, is equal for all sensors: it
 finds frames, measures and checks them, and fills Wireshark's tree. This module writes the part
 that depends on the sensor: a Lua table for each node of a frame tree (`_TableWriter`). A table has the
 kind of the node, the Wireshark field that shows it, a `keep` entry if later formulas use its value,
@@ -42,7 +42,7 @@ from lidarspec.spec import (
 )
 from lidarspec.spec.bits import BitField
 
-WIDTH = 140
+MAX_LINE_CHARS = 140
 
 
 class LuaCode(str):
@@ -71,14 +71,14 @@ def formula(value: tree.Formula) -> LuaCode:
     """Return a formula as a number, or as a Lua function of the values of fields."""
     if isinstance(value, int):
         return LuaCode(str(value))
-    return _function(value)
+    return _format_function(value)
 
 
-def _function(value: tree.Formula, missing: str = "") -> LuaCode:
+def _format_function(value: tree.Formula, missing: str = "") -> LuaCode:
     """Return a formula as a Lua function of the field values.
 
     Args:
-        missing: Lua text after each value, such as `" or 0"` for fields that can be missing.
+        missing: Lua text to append to each value, e.g. `" or 0"` for fields that can be missing.
     """
     return LuaCode(
         "function(v) return"
@@ -97,24 +97,26 @@ def lua(value: Any, indent: str = "") -> str:
     deeper = indent + "  "
     if isinstance(value, Mapping):
         entries = [
-            f"{_key(key)} = {lua(item, deeper)}" for key, item in value.items() if item is not None
+            f"{_format_key(key)} = {lua(item, deeper)}"
+            for key, item in value.items()
+            if item is not None
         ]
     else:
         entries = [lua(item, deeper) for item in value]
     line = "{" + ", ".join(entries) + "}"
-    if len(indent) + len(line) <= WIDTH and "\n" not in line:
+    if len(indent) + len(line) <= MAX_LINE_CHARS and "\n" not in line:
         return line
     return "{\n" + "".join(f"{indent}  {entry},\n" for entry in entries) + indent + "}"
 
 
-def _key(key: object) -> str:
+def _format_key(key: object) -> str:
     if isinstance(key, str) and key.isidentifier() and key.isascii():
         return key
     return f"[{lua(key)}]"
 
 
 def quote_lua(text: str | bytes) -> str:
-    """Return a Lua string, with decimal escapes for all but printable ASCII."""
+    """Return a Lua string; all bytes that are not printable ASCII are escaped."""
     data = text.encode() if isinstance(text, str) else text
     return (
         '"'
@@ -127,7 +129,7 @@ def quote_lua(text: str | bytes) -> str:
 
 
 #: An array element with at most this many fields shows their values in its own line.
-SUMMED = 4
+MAX_SUMMED_FIELDS = 4
 Table = dict[str, Any]
 
 
@@ -136,8 +138,8 @@ class _TableWriter:
 
     Attributes:
         prefix: prefix of the names of its fields in Wireshark's filters.
-        kept: paths of the fields that later formulas or checksums use.
-        marked: paths of the first and last part that a checksum covers.
+        kept: paths of the fields that formulas or checksums use.
+        marked: paths of the first and the last part that each checksum covers.
         types: type family of each Wireshark field, by its filter name.
     """
 
@@ -152,9 +154,10 @@ class _TableWriter:
         self.types: dict[str, str] = {}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
-        """Return a node as a table.
+        """Return the table of a node.
 
-        `skip` is its size in bytes if measuring the frame does not require its values, else None.
+        Its entry `skip` is the size of the node in bytes; None if the length of the frame depends
+        on a value in the node.
         """
         match node:
             case tree.Number():
@@ -182,7 +185,7 @@ class _TableWriter:
                 return {
                     "kind": "when",
                     "name": node.name,
-                    "condition": _function(node.condition),
+                    "condition": _format_function(node.condition),
                     "yes": then,
                     "no": otherwise,
                 }
@@ -192,12 +195,16 @@ class _TableWriter:
                 return {
                     "kind": "select",
                     "name": node.name,
-                    "key": _function(node.key),
+                    "key": _format_function(node.key),
                     "cases": cases,
                     "default": default,
                 }
             case tree.Check():
-                return {"kind": "check", "name": node.name, "condition": _function(node.condition)}
+                return {
+                    "kind": "check",
+                    "name": node.name,
+                    "condition": _format_function(node.condition),
+                }
             case tree.Never():
                 return {"kind": "never"}
             case tree.Empty() | tree.Derived() | tree.Opaque():
@@ -223,7 +230,7 @@ class _TableWriter:
             path = node.info.path
         else:
             path = ".".join(filter(None, (node.info.path, name)))
-        new = self._new("BYTES", path, name, node.info.docs, "NONE")
+        new = self._declare_field("BYTES", path, name, node.info.docs, "NONE")
         table: Table = {
             "kind": "bytes",
             "name": name,
@@ -261,7 +268,9 @@ class _TableWriter:
         is_masked = order is not None and part.bits.width < 8 * block.size
         if order is not None and is_masked:
             bits = 8 * block.size
-            mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0)
+            mask = ((1 << part.bits.width) - 1) << (
+                _find_lowest_bit(part.bits, block.size, order) or 0
+            )
         else:
             bits = _width(part.bits.width)
             mask = None
@@ -295,7 +304,7 @@ class _TableWriter:
             for path, value in find_held_formulas(below).items()
         }
         lengths = [
-            {"path": path, "value": _function(value, " or 0")}
+            {"path": path, "value": _format_function(value, " or 0")}
             for path, value in inside.items()
             if node.path == _common_path(path, *(ref.path for ref in tree.refs(value)))
         ]
@@ -315,9 +324,10 @@ class _TableWriter:
         else:
             whole = None
         few = isinstance(node.element, tree.Block) or (
-            isinstance(node.element, tree.Struct) and len(_leaves(node.element)) <= SUMMED
+            isinstance(node.element, tree.Struct)
+            and len(_list_numbers(node.element)) <= MAX_SUMMED_FIELDS
         )
-        summed = (few and bool(_leaves(node.element))) or None
+        summed = (few and bool(_list_numbers(node.element))) or None
         return {
             "kind": "repeat",
             "name": node.name,
@@ -355,7 +365,7 @@ class _TableWriter:
         }
 
     def _number_entries(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
-        """Return the unit, scale, labels and limits of a number, and its Wireshark fields."""
+        """Return the table entries of a number: unit, scale, labels, limits and fields."""
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
             "UINT"
         )
@@ -366,10 +376,12 @@ class _TableWriter:
         else:
             shown = "DEC"
         table: Table = {
-            "field": self._new(kind, info.path, info.name, info.docs, shown, info.labels, mask)
+            "field": self._declare_field(
+                kind, info.path, info.name, info.docs, shown, info.labels, mask
+            )
         }
         if info.scaled:
-            table["physical"] = self._new(
+            table["physical"] = self._declare_field(
                 "DOUBLE",
                 f"{info.path}.physical",
                 info.name,
@@ -388,7 +400,7 @@ class _TableWriter:
             table["allowed"] = [list(run) for run in tree.find_runs(info.allowed)]
         return table | {"keep": self._keep(info.path)}
 
-    def _new(
+    def _declare_field(
         self,
         kind: str,
         path: str,
@@ -398,7 +410,7 @@ class _TableWriter:
         labels: Any = None,
         mask: int | None = None,
     ) -> LuaCode:
-        """Return Lua code that makes a Wireshark field.
+        """Return Lua code that declares a Wireshark field, and remember its type family.
 
         Wireshark requires the same type family for all fields with one name, so a name that is used
         with another family gets "_" appended.
@@ -476,7 +488,7 @@ def _algorithm(algorithm: Checksum) -> Table:
     )
 
 
-def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
+def _list_numbers(node: tree.Node) -> list[tree.Node | tree.Part]:
     """Return the numbers in a node, or [] if it contains arrays or conditional parts."""
     below = list(tree.nodes(node))
     if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):
@@ -508,22 +520,23 @@ def _width(bits: int) -> int:
 
 
 def _word_order(block: tree.Block) -> str | None:
-    """Return the byte order in which each part of a block is contiguous bits of one word.
+    """Return the byte order in which Wireshark can draw the parts of a block as masks.
 
-    Wireshark can draw such parts as masks. Returns None if no byte order fits.
+    In this order, the bits of each part are contiguous in one word. Returns None if no byte order
+    fits.
     """
     orders = (
         order
         for order in ("big", "little")
-        if all(_run(part.bits, block.size, order) is not None for part in block.parts)
+        if all(_find_lowest_bit(part.bits, block.size, order) is not None for part in block.parts)
     )
     if block.size <= 4:
         return next(orders, None)
     return None
 
 
-def _run(bits: BitField, size: int, order: str) -> int | None:
-    """Return the lowest bit of a field within a block read as one word.
+def _find_lowest_bit(bits: BitField, size: int, order: str) -> int | None:
+    """Return the position of the lowest bit of a field in a block read as one word.
 
     Returns None if the bits of the field are not contiguous in that word.
     """
@@ -601,7 +614,7 @@ def dissector(sensor: Sensor) -> str:
         "title": title,
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
         "announcing": {frame.after: True for frame in sensor.frames.values() if frame.after},
-        "places": _patterns(sensor),
+        "places": _list_patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
     head = _HEAD.format(
@@ -630,8 +643,8 @@ def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
     }
 
 
-def _patterns(sensor: Sensor) -> dict[str, list[int]]:
-    """Return the patterns by which frames are found, by Wireshark's table."""
+def _list_patterns(sensor: Sensor) -> dict[str, list[int]]:
+    """Return the ports or link types of the sensor, by the name of Wireshark's table."""
     links = sensor.links.values()
     patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],

@@ -18,7 +18,7 @@ from construct import Bytes, Const, Struct
 import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import EXPORTS, ExportError, UnknownExport, export, select_frame
-from lidarspec.exports.diagram import BIT_WIDTH, LEFT_MARGIN, ROW_BITS
+from lidarspec.exports.diagram import BIT_WIDTH_PX, LEFT_MARGIN_PX, ROW_BITS
 from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Command, Frame
 from tests.broken import sound
@@ -127,10 +127,10 @@ def assert_diagram_is_complete(sensor: Sensor) -> None:
     ]
     for box in boxes:
         assert (
-            LEFT_MARGIN
+            LEFT_MARGIN_PX
             <= float(box.get("x", "0"))
             <= float(box.get("x", "0")) + float(box.get("width", "0"))
-            <= LEFT_MARGIN + ROW_BITS * BIT_WIDTH
+            <= LEFT_MARGIN_PX + ROW_BITS * BIT_WIDTH_PX
         )
 
 
@@ -140,8 +140,8 @@ def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
     for box in root.iter("{http://www.w3.org/2000/svg}rect"):
         if "x" in box.attrib:
             columns = {
-                (float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT_WIDTH)
-                for bit in range(int(float(box.attrib["width"]) / BIT_WIDTH))
+                (float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT_WIDTH_PX)
+                for bit in range(int(float(box.attrib["width"]) / BIT_WIDTH_PX))
             }
             assert not seen & columns
             seen |= columns
