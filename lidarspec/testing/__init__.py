@@ -21,8 +21,8 @@ order:
 * `cloud_assertions`: assertions about point clouds.
 * `vectors`: golden frames from a manual or capture.
 * `strategies`: Hypothesis strategies for authors.
-* `value_ranges`: the values that fit together in one layout.
-* `check`: all of it without pytest, for a name, file, distribution or folder.
+* `value_ranges`: the values that are valid together in one layout.
+* `check`: all checks without pytest, for a name, file, distribution or folder.
 * `pytest_plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
 

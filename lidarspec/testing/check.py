@@ -34,8 +34,8 @@ from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"
-#: Text of an error of the registry -> rule.
-SAID = (
+#: (part of a message of the registry, rule of the error).
+LOADING_MESSAGES = (
     ("unknown hook", "LS002"),
     ("lacks @hookimpl", "LS003"),
     ("another sensor has this id", "LS005"),
@@ -53,12 +53,11 @@ class CheckTarget:
 
     Attributes:
         sensors: the sensors of the target that could be loaded.
-        findings: the reasons why others could not be loaded.
-        files: the modules that declare them.
-        vectors: the golden vectors, next to the modules, or in the source folder of the
-            distribution or its tests.
-        family: the ids of the sensors that share the vectors, those of the file or of the
-            distribution.
+        findings: the reasons why other sensors could not be loaded.
+        files: the modules that declare the sensors.
+        vectors: the file of golden vectors, next to the modules, or in the source folder of the
+            distribution or its tests; None if there is none.
+        family: the ids of the sensors that share the vectors: all of the file or the distribution.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
@@ -81,13 +80,13 @@ def find_target(text: str | Path) -> CheckTarget:
     """
     name = str(text)
     if (Path(name) / "pyproject.toml").is_file():
-        return _folder(Path(name))
+        return _find_folder_target(Path(name))
     file, wanted = split_file_and_id(name)
     if "/" in name or "\\" in name or file.suffix == ".py":
-        return _file(file, wanted)
-    entries = _entries(name)
+        return _find_file_target(file, wanted)
+    entries = _find_entry_points(name)
     if entries:
-        return _distribution(entries)
+        return _find_distribution_target(entries)
     sensor = registry().sensor(name)
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [
@@ -99,17 +98,19 @@ def find_target(text: str | Path) -> CheckTarget:
         if plugin.distribution in {home.distribution for home in homes}
         for one in plugin.sensors
     ]
-    return CheckTarget([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
+    return CheckTarget(
+        [sensor], _check_rivals([sensor]), files, _find_vectors(files), tuple(family)
+    )
 
 
-def _file(file: Path, wanted: str) -> CheckTarget:
-    found_target = CheckTarget(files=[file], vectors=_vectors([file]))
+def _find_file_target(file: Path, wanted: str) -> CheckTarget:
+    found_target = CheckTarget(files=[file], vectors=_find_vectors([file]))
     try:
         found_target.sensors = _load_sensors(import_file(file), str(file))
         found_target.family = tuple(
             sensor.id for sensor in found_target.sensors[1:] and found_target.sensors
         )
-        found_target.findings += _holders(found_target.sensors, file)
+        found_target.findings += _check_taken_ids(found_target.sensors, file)
         if not found_target.sensors:
             raise SpecError(
                 "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor"
@@ -118,7 +119,7 @@ def _file(file: Path, wanted: str) -> CheckTarget:
         raise
     except (Exception, SystemExit) as error:
         found_target.findings.append(describe_loading_error(error, [file]))
-        found_target.files = found_target.files if _readable(file) else []
+        found_target.files = found_target.files if _is_readable(file) else []
         return found_target
     ids = [sensor.id for sensor in found_target.sensors]
     found_target.sensors = [sensor for sensor in found_target.sensors if wanted in ("", sensor.id)]
@@ -127,7 +128,7 @@ def _file(file: Path, wanted: str) -> CheckTarget:
     return found_target
 
 
-def _folder(folder: Path) -> CheckTarget:
+def _find_folder_target(folder: Path) -> CheckTarget:
     """Return the target of the distribution with its source in a folder."""
     file = folder / "pyproject.toml"
     project = read_document(file).get("project")
@@ -137,14 +138,14 @@ def _folder(folder: Path) -> CheckTarget:
         name = None
     if not isinstance(name, str):
         raise SourceError(f"{file} does not name a project")
-    entries = _entries(name)
+    entries = _find_entry_points(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
-    return _distribution(entries)
+    return _find_distribution_target(entries)
 
 
-def _vectors(files: Iterable[Path]) -> Path | None:
-    """Return the file of golden vectors of some modules, None if there is none."""
+def _find_vectors(files: Iterable[Path]) -> Path | None:
+    """Return the file of golden vectors of some modules; None if there is none."""
     beside = dict.fromkeys(file.resolve().parent for file in files)
     sources = [
         home
@@ -156,13 +157,15 @@ def _vectors(files: Iterable[Path]) -> Path | None:
     return next((folder / VECTORS for folder in folders if (folder / VECTORS).is_file()), None)
 
 
-def _entries(distribution: str) -> list[EntryPoint]:
+def _find_entry_points(distribution: str) -> list[EntryPoint]:
     """Return the entry points of a distribution: modules with hooks, and sensors."""
     entries = [*entry_points(GROUP), *entry_points(SENSORS)]
-    return [entry for entry in entries if _normal(entry.distribution) == _normal(distribution)]
+    return [
+        entry for entry in entries if _normalize(entry.distribution) == _normalize(distribution)
+    ]
 
 
-def _distribution(entries: list[EntryPoint]) -> CheckTarget:
+def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
     found_target = CheckTarget()
     for entry in entries:
         try:
@@ -181,25 +184,25 @@ def _distribution(entries: list[EntryPoint]) -> CheckTarget:
             for sensor in sensors
             if sensor.id not in {one.id for one in found_target.sensors}
         ]
-    found_target.vectors = _vectors(found_target.files)
+    found_target.vectors = _find_vectors(found_target.files)
     found_target.family = tuple(sensor.id for sensor in found_target.sensors)
-    names = {_normal(entry.distribution) for entry in entries}
+    names = {_normalize(entry.distribution) for entry in entries}
     failing = [
         plugin
         for plugin in registry().plugins
-        if _normal(plugin.distribution) in names and _strip_markup(plugin.error) == "LS010"
+        if _normalize(plugin.distribution) in names and _strip_markup(plugin.error) == "LS010"
     ]
     found_target.findings += [
         Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing
     ]
-    found_target.findings += _rivals(found_target.sensors)
+    found_target.findings += _check_rivals(found_target.sensors)
     return found_target
 
 
-def _rivals(sensors: list[Sensor]) -> list[Finding]:
-    """Return findings for plugins with the same sensor ids or aliases.
+def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
+    """Return a finding for each id or alias that several plugins use.
 
-    Each names the plugin that owns the id.
+    It names the plugin that owns the id.
     """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
@@ -213,8 +216,8 @@ def _rivals(sensors: list[Sensor]) -> list[Finding]:
     ]
 
 
-def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """Return findings for installed plugins that have the ids of sensors in this file."""
+def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
+    """Return a finding for each sensor of a file with the id of an installed sensor."""
     return [
         Finding(
             "LS005",
@@ -232,7 +235,7 @@ def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
 
 
 def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
-    """Return the sensors of a plugin that is loaded on its own.
+    """Return the sensors of a plugin that is loaded without other plugins.
 
     Its own hooks are applied.
 
@@ -304,7 +307,7 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
 
 
 def _strip_markup(text: str) -> str:
-    return next((code for words, code in SAID if words in text), "")
+    return next((code for words, code in LOADING_MESSAGES if words in text), "")
 
 
 def module_files(value: str) -> list[Path]:
@@ -324,7 +327,7 @@ def module_files(value: str) -> list[Path]:
     return [file]
 
 
-def _readable(file: Path) -> bool:
+def _is_readable(file: Path) -> bool:
     """Return whether a file is valid Python."""
     try:
         compile(file.read_text(encoding="utf-8"), str(file), "exec")
@@ -333,7 +336,7 @@ def _readable(file: Path) -> bool:
     return True
 
 
-def _normal(name: str) -> str:
+def _normalize(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -343,14 +346,14 @@ Spot = tuple[str, int]
 class SourceTexts:
     """The locations of declarations in the source of some modules.
 
-    Fields are found by their names, everything else by kind and name.
+    Fields are found by their paths of names, all other declarations by kind and name.
     """
 
     def __init__(self, trees: Mapping[str, ast.Module]) -> None:
-        self._fields = [
+        self._iter_fields = [
             (chain, (file, line))
             for file, tree in trees.items()
-            for chain, line in _fields(tree, ())
+            for chain, line in _iter_fields(tree, ())
         ]
         self._others: dict[tuple[str, str], Spot] = {}
         for file, tree in trees.items():
@@ -358,32 +361,32 @@ class SourceTexts:
                 self._others.setdefault((kind, name), (file, line))
 
     def locate(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
-        """Return the finding with its file and line, if they can be found."""
+        """Return the finding with its file and line; unchanged if they are not found."""
         if finding.file:
             return finding
-        location = self._spot(finding.path, sensor) or (
+        location = self._find_spot(finding.path, sensor) or (
             self._others.get(("sensor", sensor.id)) if sensor else None
         )
         if location:
             return replace(finding, file=location[0], line=location[1])
         return finding
 
-    def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
+    def _find_spot(self, path: str, sensor: Sensor | None) -> Spot | None:
         path = re.sub(r"\[\d*\]", "", path.rpartition(" ")[2])
         frame, _, below = path.partition(".")
         if frame == "commands":
             return self._others.get(("key", below.partition(".")[0]))
         return (
-            _function(frame, below, sensor)
-            or (self._field(tuple(below.split("."))) if below else None)
+            _find_function(frame, below, sensor)
+            or (self._find_field(tuple(below.split("."))) if below else None)
             or self._others.get(("frame", frame))
         )
 
-    def _field(self, parts: tuple[str, ...]) -> Spot | None:
-        """Return the location of the field with the longest match of the end of the path."""
+    def _find_field(self, parts: tuple[str, ...]) -> Spot | None:
+        """Return the location of the field that matches the most names at the path's end."""
         fitting = [
             (len(chain), location)
-            for chain, location in self._fields
+            for chain, location in self._iter_fields
             if parts[-len(chain) :] == chain
         ]
         if fitting:
@@ -391,7 +394,7 @@ class SourceTexts:
         return None
 
 
-def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
+def _find_function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     """Return the location of a function of a frame type."""
     if sensor is None or frame not in sensor.frames:
         return None
@@ -411,7 +414,7 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield kind, name and line of every possible key, frame type and sensor."""
+    """Yield (kind, name, line) of every possible key, frame type and sensor."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):
@@ -428,15 +431,15 @@ def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
                 yield "sensor", name, node.value.lineno
 
 
-def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Yield each ``"name" / construct`` with its path of names and its line."""
+def _iter_fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Yield (path of names, line) of each ``"name" / construct``."""
     match node:
         case ast.BinOp(op=ast.Div(), left=ast.Constant(value=str(name)), right=right):
             yield (*chain, name), node.lineno
-            yield from _fields(right, (*chain, name))
+            yield from _iter_fields(right, (*chain, name))
         case _:
             for child in ast.iter_child_nodes(node):
-                yield from _fields(child, chain)
+                yield from _iter_fields(child, chain)
 
 
 #: Calls that read the system clock.
@@ -451,19 +454,23 @@ WALL_CLOCKS = frozenset(
         "datetime.datetime.utcnow",
     ]
 )
-BROAD = frozenset({"Exception", "BaseException"})
+BROAD_EXCEPTIONS = frozenset({"Exception", "BaseException"})
 
 
 def check_texts(trees: Mapping[str, ast.Module]) -> list[Finding]:
-    """Return the findings in the source of some modules, by file."""
+    """Return the findings in the source of some modules.
+
+    Args:
+        trees: file name -> its syntax tree.
+    """
     return [
         Finding(code, what, file=file, line=node.lineno)
         for file, tree in trees.items()
-        for code, what, node in _mistakes(tree)
+        for code, what, node in _iter_mistakes(tree)
     ]
 
 
-def _mistakes(
+def _iter_mistakes(
     tree: ast.Module,
 ) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
     expressions = _names_of_this(tree)
@@ -474,8 +481,8 @@ def _mistakes(
     for node in ast.walk(tree):
         match node:
             case ast.ExceptHandler() if (
-                node.type is None or _names(node.type) & BROAD
-            ) and _silent(node.body):
+                node.type is None or _collect_names(node.type) & BROAD_EXCEPTIONS
+            ) and _is_silent(node.body):
                 yield (
                     "LS801",
                     (
@@ -490,9 +497,9 @@ def _mistakes(
                 name in expressions
             ):
                 yield "LS805", ast.unparse(node), node
-            case ast.Expr(value=ast.Call() as call) if _short_write(call, sockets=sockets):
+            case ast.Expr(value=ast.Call() as call) if _is_short_write(call, sockets=sockets):
                 yield "LS803", f"the result of {ast.unparse(call.func)} is not used", node
-        for test in _tests(node):
+        for test in _list_tests(node):
             if _is_expression(test, expressions):
                 yield "LS804", f"Python tests whether `{ast.unparse(test)}` is true", test
 
@@ -510,7 +517,7 @@ def _names_of_this(tree: ast.Module) -> set[str]:
     }
 
 
-def _tests(node: ast.AST) -> list[ast.expr]:
+def _list_tests(node: ast.AST) -> list[ast.expr]:
     """Return the expressions that Python tests for truth at a node."""
     match node:
         case (
@@ -525,15 +532,15 @@ def _tests(node: ast.AST) -> list[ast.expr]:
 
 
 def _is_expression(test: ast.expr, names: set[str]) -> bool:
-    """Return whether a test is an expression made of construct's `this`."""
-    return not isinstance(test, ast.BoolOp | ast.Call) and bool(_names(test) & names)
+    """Return whether a test is an expression of construct's `this`: it is always true."""
+    return not isinstance(test, ast.BoolOp | ast.Call) and bool(_collect_names(test) & names)
 
 
-def _names(tree: ast.AST) -> set[str]:
+def _collect_names(tree: ast.AST) -> set[str]:
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 
-def _silent(body: list[ast.stmt]) -> bool:
+def _is_silent(body: list[ast.stmt]) -> bool:
     """Return whether an exception handler ignores the exception."""
     match body:
         case [ast.Pass() | ast.Continue() | ast.Expr(value=ast.Constant())]:
@@ -543,8 +550,11 @@ def _silent(body: list[ast.stmt]) -> bool:
     return False
 
 
-def _short_write(call: ast.Call, *, sockets: bool) -> bool:
-    """Return whether a call may write only a part, with its return value dropped."""
+def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
+    """Return whether a call may write only a part of its data.
+
+    The caller does not notice, because the source ignores the return value.
+    """
     match call.func:
         case ast.Attribute(value=ast.Name(id="os"), attr="write"):
             return True
@@ -553,10 +563,10 @@ def _short_write(call: ast.Call, *, sockets: bool) -> bool:
     return False
 
 
-#: Rules without which no property can be tested.
-FATAL = frozenset({"LS213", "LS114", "LS115", "LS301"})
-#: Name of the properties that are skipped then.
-ELSE = "everything else"
+#: Rules about faults that prevent all tests of properties.
+FATAL_RULES = frozenset({"LS213", "LS114", "LS115", "LS301"})
+#: Name in a report of all properties that are skipped after a violation of `FATAL_RULES`.
+REMAINING_PROPERTIES = "everything else"
 
 
 #: Called with the current step, the number of finished properties and their total.
@@ -572,8 +582,8 @@ class Report:
         findings: the findings.
         held: the number of properties that hold.
         skipped: property -> the reason why it does not apply.
-        measured: measured values of frames.
-        picture: measured values of points, to compare with the manual.
+        measured: measured values of frames, by description.
+        picture: measured values of points, by description, to compare with the manual.
     """
 
     name: str
@@ -598,18 +608,18 @@ def reports(
     tested: Sequence[Sensor] = (),
     watch: Watch = lambda text, done, total: None,
 ) -> Iterator[Report]:
-    """Yield a report of each sensor of a target, and one of loading errors if any.
+    """Yield a report of each sensor of a target, and a report of any loading errors.
 
     Args:
-        name: the name that was given.
-        examples: examples of each frame type, for each property.
+        name: the checked name, as the user typed it.
+        examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy or function for its raw value, for fields
-            of which no valid value can be derived.
-        vectors: golden vectors; by default those of the target.
-        tested: related models that are tested too: parts that they share with a sensor are not
+            without a valid value that can be derived.
+        vectors: the file of golden vectors; by default the file of the target.
+        tested: related models that are also tested: parts that they share with a sensor are not
             tested again.
-        watch: called with the current step before it begins, the number of finished properties and
-            their total.
+        watch: called before each step with its name, the number of finished properties and the
+            total number of properties.
     """
     trees = {
         str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files
@@ -629,7 +639,7 @@ def reports(
             sensor, examples, strategies or {}, vectors or target.vectors, family, tested
         )
         before = len(PROPERTIES) * index
-        yield _report(
+        yield _make_report(
             subject,
             places,
             mistakes if single else [],
@@ -642,8 +652,8 @@ def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -
     watch(text, before + done, total)
 
 
-def _beside(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
-    """Yield facts to compare with the measured values of a sensor."""
+def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
+    """Yield (name, value) of facts to compare with the measured values of a sensor."""
     sensor = subject.sensor
     missing = lacking(subject)
     if missing:
@@ -660,7 +670,7 @@ def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, ca
     watch(f"{sensor_id}: {case}", done)
 
 
-def _report(
+def _make_report(
     subject: SensorUnderTest,
     places: SourceTexts,
     mistakes: list[Finding],
@@ -687,19 +697,19 @@ def _report(
         findings = one.findings(subject, functools.partial(_watch_case, watch, sensor.id, done))
         report.held += not findings
         report.findings += findings
-        if any(finding.code in FATAL for finding in report.findings):
-            report.skipped[ELSE] = "cannot be tested until the findings are fixed"
+        if any(finding.code in FATAL_RULES for finding in report.findings):
+            report.skipped[REMAINING_PROPERTIES] = "cannot be tested until the findings are fixed"
             break
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
     )[::-1]
     left = list_unacknowledged(
-        distinct, sensor, whole=ELSE not in report.skipped and not subject.tested
+        distinct, sensor, whole=REMAINING_PROPERTIES not in report.skipped and not subject.tested
     )
     report.findings = [places.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {
         **dict(sorted(subject.picture.items())),
-        **dict(_beside(subject)),
+        **dict(_iter_reference_facts(subject)),
     }
     return report

@@ -1,7 +1,7 @@
-"""Assertions about point clouds: conventions of one cloud, equality of two.
+"""Assertions about point clouds: the conventions of a cloud, and the equality of two clouds.
 
-Two evaluations of the same packets round differently, because batches and single packets take
-different paths through NumPy. `assert_same_places` allows for that and for nothing else.
+Two evaluations of the same packets round differently, because NumPy uses different code for
+batches and for single packets. `assert_same_places` accepts only these differences.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from lidarspec.points.cloud import PointCloud
 
 #: Tolerance of coordinates and angles, in units in the last place at the size of the range.
 ULPS = 4
-#: Tolerance of times in seconds; batches begin at different packets.
+#: Tolerance of times of points in seconds: batches count from different packets.
 TIME_TOLERANCE_S = 1e-6
-#: Tolerance of the stamp of a cloud.
+#: Tolerance of the stamp of a cloud in nanoseconds.
 STAMP_TOLERANCE_NS = 1000
 
 
 def assert_well_formed(cloud: PointCloud) -> None:
     """Fail unless the cloud keeps the conventions of types, angles and REP-117.
 
-    Points without a return have no coordinates.
+    REP-117 requires that points without a return have no coordinates.
     """
     valid = cloud.valid
     assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
@@ -85,7 +85,7 @@ def _is_close(
 ) -> bool:
     """Return whether two arrays differ by no more than a tolerance.
 
-    NaN equals NaN, and an infinity itself.
+    NaN equals NaN, and an infinity equals the same infinity.
 
     Args:
         full_circle: the period of angles; 0 compares plain numbers.

@@ -19,23 +19,24 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Nanoseconds of one step of a simulated exchange.
-STEP = 20_000_000
+#: Time between two steps of a simulated exchange in nanoseconds.
+STEP_NS = 20_000_000
 
 
 def arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, Any]:
     """Return a value for each argument of a command.
 
     Args:
-        share: position from 0 to 1 between the lowest and the highest value, or of the length.
+        share: position of a number between its lowest and its highest value, or length of a text
+            as a share of its maximum, from 0 to 1.
     """
     return {
-        key: _value(subject.sensor, name, key, share)
+        key: _make_argument(subject.sensor, name, key, share)
         for key in subject.sensor.commands[name].arguments
     }
 
 
-def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
+def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
     slot = argument_slot(sensor, name, key)
     kind = sensor.commands[name].arguments[key].kind
     match kind:
@@ -51,7 +52,7 @@ def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
 def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
     """Check that a command's frame has its fixed values and its arguments.
 
-    The arguments are read back within half a step, and the frame is built again.
+    The parsed arguments may differ by half a step. The parsed values build the same frame.
     """
     for share in (0.0, 0.37, 1.0):
         try:
@@ -113,7 +114,7 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
 def an_exchange_holds(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str
 ) -> None:
-    """Check that a command has these bytes, and that `answer` is its reply.
+    """Fail unless a command has these bytes, and `answer` is its reply.
 
     Raises:
         Violation: if the bytes differ, or the reply does not match.
@@ -159,7 +160,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
     """Check that the simulated sensor sends the documented reply in time.
 
     Three sets of arguments are tried; one reply is enough. A missing reply is accepted if `answers`
-    depend on the arguments: a sensor need not know those values.
+    depends on the arguments: a sensor need not support the tried values.
     """
     command = subject.sensor.commands[name]
     if command.frame is None or not command.replies:
@@ -206,7 +207,7 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     """Return the reply of a simulated sensor to a command.
 
     Raises:
-        CommandError: if there is no reply, or another one.
+        CommandError: if there is no reply, or a different reply.
     """
     command = subject.sensor.commands[name]
     sensor = subject.sensor
@@ -229,7 +230,7 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     while not pending.done:
         for out in session.outgoing():
             device.receive(out.data, now, out.link)
-        now += STEP
+        now += STEP_NS
         received = [data for arrived, data in device.outgoing(now) if arrived == command.link]
         if received:
             frames = [item for data in received for item in decoder.feed(data)]

@@ -1,7 +1,7 @@
 """Conformance of a sensor as a test for pytest: everything that `lidarspec check` checks.
 
-Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in a test
-of your own. Either way it is one test, and its failure lists all findings.
+Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in your
+own test. In both cases there is one test, and its failure lists all findings.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.check import CheckTarget, Report, find_target, reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
 
-#: The rule about an id that another installed plugin has.
+#: The rule about an id that another installed plugin uses.
 ID_TAKEN = "LS005"
 
 
@@ -30,15 +30,15 @@ def assert_conformance(
 ) -> list[Report]:
     """Fail with every finding of `lidarspec check`; return the reports.
 
-    LS005, an id that another installed plugin has, concerns the environment and is left to `check`.
+    LS005, an id that another installed plugin uses, concerns the environment and is not included.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
         examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
-            `random.Random`, for fields of which no valid value can be derived.
-        vectors: a file of golden vectors; by default those that `check` finds.
-        tested: related models that are tested too: frames and functions that they share with the
+            `random.Random`, for fields without a valid value that can be derived.
+        vectors: a file of golden vectors; by default the file that `check` finds.
+        tested: related models that are also tested: frames and functions that they share with the
             sensor are not tested again.
     """
     __tracebackhide__ = True
@@ -72,9 +72,9 @@ class SensorConformance:
         examples: number of examples of each frame type for each property; the default is 40, or
             LIDARSPEC_EXAMPLES.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
-            `random.Random`, for fields of which no valid value can be derived.
-        vectors: a file of golden vectors, relative to the file of the test; by default those that
-            `lidarspec check` finds.
+            `random.Random`, for fields without a valid value that can be derived.
+        vectors: a file of golden vectors, relative to the file of the test; by default the file
+            that `lidarspec check` finds.
     """
 
     sensor: ClassVar[str | Path | Sensor] = ""

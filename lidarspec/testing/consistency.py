@@ -1,7 +1,7 @@
 """Checks that the parts of a declaration agree: angles, points, clock and times.
 
-Packets are made from the sensor's `sweep`, as far along it as a property needs: the first packets
-seldom cross the full circle, or the time at which the clock wraps.
+Packets are made from the sensor's `sweep`. Some are far along the sweep, because the first packets
+seldom cross the full circle or the time at which the clock wraps.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
 from lidarspec.spec.tree import to_exact
 from lidarspec.testing.findings import require
-from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
+from lidarspec.testing.geometry import MAX_BACK_STEP_RAD, SMALL_CHANGE, make_sweep, read
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Numbers of the packets for the check of the clock: far along the sweep, so that the clock has
-#: wrapped.
+#: Indices along the sweep of the packets for the check of the clock; the last are far enough for
+#: the clock to wrap.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
 #: Number of packets for the check of the times of points.
 TIMED_PACKETS = 64
-#: Maximum spread of the times of one packet's points, in clock steps from packet to packet.
-MOST_STEPS = 30
-#: Number of shifts of a packet's angles over the full circle.
-TURNS = 24
+#: Maximum spread of the times of a packet's points, as a number of clock steps between packets.
+MAX_SPREAD_STEPS = 30
+#: Number of parts of the full circle: a packet's angles are shifted by each multiple of a part.
+SHIFT_COUNT = 24
 
 
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
@@ -70,7 +70,7 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
         f" {step:.3g} s per packet"
     )
     require(
-        step <= 0 or spread <= (len(packets) + MOST_STEPS) * step,
+        step <= 0 or spread <= (len(packets) + MAX_SPREAD_STEPS) * step,
         "LS513",
         message,
         f"{name}.points",
@@ -97,7 +97,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
     full = FULL_TURNS[info.unit]
     radians = 2 * np.pi / full
     still = _read_azimuths(subject, name, values)
-    little = SMALL * info.scale
+    little = SMALL_CHANGE * info.scale
     moved = _angles_between(
         _read_azimuths(subject, name, _turn_angles(values, angles, little, full)), still
     )
@@ -106,10 +106,10 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         or not len(moved)
         or not np.allclose(np.abs(moved), abs(little) * radians, rtol=0.25)
     ):
-        return  # they depend on something else
+        return  # the points do not depend on these angles alone
     sense = float(np.sign(moved[0])) * np.sign(little)
-    for part in range(1, TURNS):
-        shift = round(full * part / TURNS / info.scale) * info.scale
+    for part in range(1, SHIFT_COUNT):
+        shift = round(full * part / SHIFT_COUNT / info.scale) * info.scale
         moved = _angles_between(
             _read_azimuths(subject, name, _turn_angles(values, angles, shift, full)), still
         )
@@ -119,7 +119,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         worst = float(wrong.max(initial=0))
         turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
         require(
-            worst <= BACK,
+            worst <= MAX_BACK_STEP_RAD,
             "LS504",
             f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from its expected direction",
             f"{name}.points",
@@ -165,5 +165,5 @@ def _angles_between(
 
 
 def _fold(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles in radians as those from -pi to pi that mean the same."""
+    """Return the equivalent angles from -pi to pi, in radians."""
     return (angles + np.pi) % (2 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""Checks of a declaration without any bytes of a sensor.
+"""Checks of a declaration that need no bytes from a real sensor.
 
 They concern units, sources, lengths, sync bytes, coverage by checksums, and `plausible`.
 """
@@ -34,7 +34,7 @@ from lidarspec.testing.geometry import field_of, find_fields, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Names of fields that hold a measured value.
-MEASURES = frozenset(
+MEASURE_NAMES = frozenset(
     [
         "distance",
         "range",
@@ -48,31 +48,31 @@ MEASURES = frozenset(
     ]
 )
 #: Maximum share of payload offsets at which a sync pattern may match by chance.
-COMMON = 1 / 200
-#: Number of examples to measure before a frame is simulated for its length.
-FIRST_LENGTHS = 3
-#: Total number of examples to measure.
-LENGTHS = 12
+MAX_SYNC_SHARE = 1 / 200
+#: Number of measured lengths of examples before a frame is simulated.
+FIRST_MEASURED_EXAMPLES = 3
+#: Total number of measured lengths of examples.
+MEASURED_EXAMPLES = 12
 #: Default number of example payloads in which the sync pattern is counted.
 SYNC_EXAMPLES = 12
-#: Bits of constants and checksums up to which a frame is weak: random bytes match one every few
-#: megabytes.
+#: A frame with at most this many bits of constants and checksums is weak: random bytes match it
+#: once in a few megabytes.
 WEAK_BITS = 24
-#: The same for a frame without points, which does not damage a point cloud.
+#: The same limit for a frame without points: a false one does not damage a point cloud.
 WEAK_BITS_WITHOUT_POINTS = 16
-#: The same in datagrams, which have checksums of their own.
+#: The same limit for frames in datagrams: UDP has its own checksum.
 WEAK_BITS_IN_DATAGRAMS = 8
 #: Maximum ratio of `max_length` to the length of the longest random frame.
-FAR = 8
-#: Seconds after which the wrap of a clock no longer matters.
-LONG = 7 * 86_400
-#: Column of points -> units of the fields that it comes from.
-UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
-#: Names of fields that hold the intensity of a return, and of fields that hold a code.
-INTENSITY = re.compile(
+MAX_LENGTH_RATIO = 8
+#: Period in seconds from which the wrap of a clock does not matter.
+LONG_WRAP_S = 7 * 86_400
+#: Column of points -> possible units of its source fields.
+COLUMN_UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
+#: Pattern of the names of fields with the intensity of a return, and of fields with a code.
+INTENSITY_NAMES = re.compile(
     r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?"
 )
-CODE = re.compile(r"(\w+_)?(code|error|fault|status|errno)(_?\d+)?")
+CODE_NAMES = re.compile(r"(\w+_)?(code|error|fault|status|errno)(_?\d+)?")
 PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
 
 Findings = Iterator[tuple[str, str, str]]
@@ -82,14 +82,14 @@ def check_declaration(subject: SensorUnderTest) -> list[Finding]:
     """Return the findings of a declaration."""
     sensor = subject.sensor
     checks: list[Findings] = [
-        _sensor(sensor),
+        _check_sensor(sensor),
         _check_required_fields(sensor),
-        _clock(sensor),
-        _options(sensor),
+        _check_clock(sensor),
+        _check_options(sensor),
     ]
-    checks += [_frame(subject, name, frame) for name, frame in subject.frames.items()]
-    checks += [_points(subject, name) for name in subject.sensor.data_frames]
-    checks += [_reach(subject)]
+    checks += [_check_frame(subject, name, frame) for name, frame in subject.frames.items()]
+    checks += [_check_points(subject, name) for name in subject.sensor.data_frames]
+    checks += [_check_range_limit(subject)]
     findings: list[Finding] = []
     for check in checks:
         try:
@@ -99,7 +99,7 @@ def check_declaration(subject: SensorUnderTest) -> list[Finding]:
     return findings
 
 
-def _sensor(sensor: Sensor) -> Findings:
+def _check_sensor(sensor: Sensor) -> Findings:
     if PLACEHOLDER.fullmatch(sensor.source):
         yield "LS202", f"source is {sensor.source!r}", ""
     for name in ("vendor", "model"):
@@ -116,7 +116,7 @@ def _sensor(sensor: Sensor) -> Findings:
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
-    """Yield the missing fields of scans, clock and counter."""
+    """Yield findings for fields of scans, clock and counter that do not exist."""
     known = {
         path
         for name in sensor.main_frames
@@ -147,7 +147,7 @@ def _check_required_fields(sensor: Sensor) -> Findings:
             yield "LS216", f"no field {path!r}{did_you_mean(path, there)}", place
 
 
-def _clock(sensor: Sensor) -> Findings:
+def _check_clock(sensor: Sensor) -> Findings:
     """Yield a finding if a clock wraps within days and `wraps_at` is missing."""
     clock = sensor.clock
     if (
@@ -168,13 +168,13 @@ def _clock(sensor: Sensor) -> Findings:
         )
         for info in infos
     ]
-    if 0 < sum(spans) < LONG:
+    if 0 < sum(spans) < LONG_WRAP_S:
         what = f"it wraps after {sum(spans):g} s, but wraps_at is not declared"
         yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
 
 
-def _options(sensor: Sensor) -> Findings:
-    """Yield the options that `configure` ignores.
+def _check_options(sensor: Sensor) -> Findings:
+    """Yield findings for options that `configure` ignores.
 
     An option is ignored if it is never read, or if all its choices give the same sensor.
     """
@@ -220,7 +220,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
     return accepted > 1
 
 
-def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
+def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     engine = get_codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
@@ -234,10 +234,10 @@ def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
             name,
         )
     else:
-        yield from _longest(subject, name, frame)
-    yield from _names(subject, name, frame)
+        yield from _check_max_length(subject, name, frame)
+    yield from _check_names(subject, name, frame)
     if frame.plausible is not None:
-        yield from _plausible(subject, name, frame)
+        yield from _check_plausible(subject, name, frame)
     if isinstance(engine, CompiledCodec):
         try:
             candidates = [engine.tree.layout(subject.example(name, seed=seed)) for seed in range(3)]
@@ -246,24 +246,24 @@ def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
         layouts = [layout for layout in candidates if isinstance(layout, Layout)]
         yield from _find_uncovered(name, layouts)
         if frame.direction == "in":
-            yield from _sync(subject, name, frame, engine)
-            yield from _strength(subject, name, frame, layouts)
+            yield from _check_sync(subject, name, frame, engine)
+            yield from _check_strength(subject, name, frame, layouts)
 
 
 def _is_reply(sensor: Sensor, name: str) -> bool:
-    """Return whether a frame type is the reply to a command."""
+    """Return whether a frame type is a reply to a command."""
     return any(name in command.replies for command in sensor.commands.values())
 
 
-def _longest(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
+def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     """Yield a finding if `max_length` is far above the lengths of random frames.
 
-    The decoder waits much longer than needed for a frame with a corrupt length.
+    With this `max_length`, the decoder waits too long for the end of a frame with a corrupt length.
     """
     sizes = list[int]()
     try:
-        for size in _sizes(subject, name):
-            if FAR * size >= frame.max_length:
+        for size in _iter_sizes(subject, name):
+            if MAX_LENGTH_RATIO * size >= frame.max_length:
                 return
             sizes.append(size)
     except LidarSpecError:  # another check reports it
@@ -278,19 +278,22 @@ def _longest(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     )
 
 
-def _sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
+def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of examples and of a simulated frame.
 
-    The simulated frame comes late, because it takes long and is seldom needed.
+    The simulated frame follows the first examples, because it takes long and is seldom needed.
     """
-    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
+    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_MEASURED_EXAMPLES))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
         yield len(frame_simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
-    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS, LENGTHS))
-    yield from _raised_sizes(subject, name)
+    yield from (
+        len(subject.example(name, seed=seed))
+        for seed in range(FIRST_MEASURED_EXAMPLES, MEASURED_EXAMPLES)
+    )
+    yield from _iter_raised_sizes(subject, name)
 
 
-def _raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
+def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of valid frames with one large value in a header field.
 
     The value is the largest that `max_length` allows. Random headers seldom have large counts, and
@@ -307,7 +310,7 @@ def _raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
             raised = {path: partial(return_raw, info.limits[1] >> shift)}
             try:
                 size = make_random_header(engine, source, raised)[0].size
-                if FAR * size < frame.max_length:
+                if MAX_LENGTH_RATIO * size < frame.max_length:
                     break
                 yield len(
                     random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised})
@@ -316,15 +319,15 @@ def _raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
                 continue
 
 
-def _names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    """Yield fields without a unit with names of measured values.
+def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
+    """Yield findings for fields without a unit that are named like measured values.
 
-    `Scaled(..., "")` declares a pure number.
+    `Scaled(..., "")` declares that a field is a pure number.
     """
     pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
     for path, info in get_codec(frame).schema.all_fields.items():
         if (
-            info.name in MEASURES
+            info.name in MEASURE_NAMES
             and info.kind in ("int", "float")
             and not info.unit
             and not info.labels
@@ -355,10 +358,10 @@ def _find_multiplied(subject: SensorUnderTest, name: str) -> set[str]:
 def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     """Return the paths of fields that are declared as pure numbers.
 
-    They are Scaled with an empty unit.
+    These are `Scaled` fields with an empty unit.
 
     Args:
-        with_scale: whether a factor may be declared too, as for the components of a direction.
+        with_scale: include fields with a factor, e.g. the components of a direction.
     """
     return {
         info.path
@@ -368,7 +371,7 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     }
 
 
-def _plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
+def _check_plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     try:
         table = get_codec(frame).table([subject.example(name)])
     except LidarSpecError:
@@ -390,9 +393,9 @@ def _plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
-    """Yield fields of a frame with checksums that none of its checksums covers.
+    """Yield findings for fields that no checksum covers, in a frame with checksums.
 
-    Many checksums begin after the header: fields before all checksums are no findings.
+    Many checksums begin after the header, so that fields before all checksums are not reported.
     """
     reported: set[str] = set()
     for layout in layouts:
@@ -424,7 +427,9 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
                 )
 
 
-def _sync(subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
+def _check_sync(
+    subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCodec
+) -> Findings:
     """Yield a finding if the constant bytes at the start are common in payloads."""
     if subject.sensor.datagrams or frame.confirm > 1:
         return
@@ -444,15 +449,17 @@ def _sync(subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCod
         matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
     share = float(matching.mean())
-    # with few bytes, chance alone gives a larger share
-    chance = COMMON + 4 * (COMMON / len(matching)) ** 0.5
-    share = expected if expected > COMMON else share
-    if expected > COMMON or share > chance:
+    # With few bytes, the measured share is inexact.
+    chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
+    share = expected if expected > MAX_SYNC_SHARE else share
+    if expected > MAX_SYNC_SHARE or share > chance:
         yield "LS204", f"its constants occur at {share:.1%} of the offsets in payloads", name
 
 
-def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
-    """Yield a finding if constants and checksums are too few to reject random bytes."""
+def _check_strength(
+    subject: SensorUnderTest, name: str, frame: Frame, layouts: list[Layout]
+) -> Findings:
+    """Yield a finding if a frame has too few constants and checksums to be recognized."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [
@@ -460,7 +467,7 @@ def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[L
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
-    if weakest <= _weak_bits(subject.sensor, frame):
+    if weakest <= _find_weak_bits(subject.sensor, frame):
         yield (
             "LS206",
             (
@@ -471,8 +478,8 @@ def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[L
         )
 
 
-def _weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the bits of constants and checksums up to which a frame type is weak."""
+def _find_weak_bits(sensor: Sensor, frame: Frame) -> int:
+    """Return the number of checked bits up to which a frame is weak."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:
@@ -480,8 +487,8 @@ def _weak_bits(sensor: Sensor, frame: Frame) -> int:
     return WEAK_BITS_WITHOUT_POINTS
 
 
-def _points(subject: SensorUnderTest, name: str) -> Findings:
-    """Yield the findings of `points`: whether it can be traced, and its source fields."""
+def _check_points(subject: SensorUnderTest, name: str) -> Findings:
+    """Yield findings if `points` cannot be traced or uses unsuitable source fields."""
     try:
         result = trace_points(subject, name)
     except UntraceableError as reason:
@@ -489,21 +496,21 @@ def _points(subject: SensorUnderTest, name: str) -> Findings:
         return
     except Exception:  # another property reports the failure
         return
-    for column, units in UNITS.items():
+    for column, units in COLUMN_UNITS.items():
         if hasattr(result, column):
-            yield from _column(subject, name, getattr(result, column), column, units)
-    yield from _intensity(subject, name, result)
+            yield from _check_column(subject, name, getattr(result, column), column, units)
+    yield from _check_intensity(subject, name, result)
 
 
-def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
-    """Yield a finding if the intensity comes from a field with another name.
+def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
+    """Yield a finding if the intensity comes from a field with an unsuitable name.
 
-    Applies if no column uses the field that is named intensity.
+    Applies if a field is named like an intensity and no column uses it.
     """
     own = [
         field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))
     ]
-    if not own or any(info is None or INTENSITY.search(info.path) for info in own):
+    if not own or any(info is None or INTENSITY_NAMES.search(info.path) for info in own):
         return
     columns = [getattr(result, one.name) for one in fields(result)]
     taken = {
@@ -519,7 +526,7 @@ def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
     ]
     axes = {info.axes for info in ranges if info.axes}
     for path, info in subject.fields(name).items():
-        if INTENSITY.fullmatch(info.name) and info.axes in axes and path not in taken:
+        if INTENSITY_NAMES.fullmatch(info.name) and info.axes in axes and path not in taken:
             others = ", ".join(info.path for info in own if info is not None)
             yield (
                 "LS218",
@@ -529,7 +536,7 @@ def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
             return
 
 
-def _reach(subject: SensorUnderTest) -> Findings:
+def _check_range_limit(subject: SensorUnderTest) -> Findings:
     """Yield a finding if a range limit exceeds the largest value of the range field."""
     limits = subject.sensor.range_limits
     if limits is None:
@@ -566,13 +573,13 @@ def _reach(subject: SensorUnderTest) -> Findings:
         )
 
 
-def _column(
+def _check_column(
     subject: SensorUnderTest, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
-    """Yield a finding if no source field of a column has a unit of its kind."""
+    """Yield a finding if no source field of a column has one of these units."""
     infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
-    if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
+    if column == "range" and measured and all(CODE_NAMES.fullmatch(info.name) for info in measured):
         yield (
             "LS219",
             "the range of points comes from it, but by its name it is a code",

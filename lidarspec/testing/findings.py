@@ -16,7 +16,7 @@ from lidarspec.sensor_operations import Sensor
 
 
 class Rule(NamedTuple):
-    """A rule: the fault in a few words, why it matters, and how to fix it."""
+    """A rule: its code, the fault in a few words, why it matters, and how to fix it."""
 
     code: str
     title: str
@@ -156,9 +156,11 @@ class Finding:
     Attributes:
         code: the code of its rule.
         what: a description of the fault.
-        path: frame, and field below it ("data.points.distance"); "" if it concerns the sensor.
+        path: frame type, or frame type and field ("data.points.distance"); "" if the fault concerns
+            the sensor.
         sensor: the id of the sensor; "" if there is none.
-        file, line: the location in the source; "" and 0 if it is unknown.
+        file: the source file with the fault; "" if it is unknown.
+        line: the line in that file; 0 if it is unknown.
     """
 
     code: str
@@ -230,8 +232,8 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:
-        whole: whether these are all findings; then an acknowledgement without a finding is a
-            finding, too.
+        whole: whether all rules were checked. If they were, an acknowledgement without a finding
+            is reported as a finding.
     """
     given = {
         "": sensor.acknowledged,

@@ -32,18 +32,19 @@ def virtual_port(
 
     Args:
         sensor: an id or a Sensor.
-        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes a free one.
-        link: a symbolic link to the pseudo-terminal, also after it was unplugged and plugged in
-            again; by default one in a temporary folder.
+        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; with TCP port 0, a free port
+            is chosen.
+        link: the name of a symbolic link to the pseudo-terminal, which stays valid if the sensor
+            is unplugged and plugged in; by default in a temporary folder.
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
-        rate: speed relative to real time; inf: as fast as it is read.
+        rate: speed relative to real time; `inf` sends as fast as the reader reads.
         faults: the faults on its links.
-        virtual_time: whether the sensor's time only passes in `advance`.
+        virtual_time: True lets the sensor's time pass only in `advance`.
 
     Yields:
-        An object with a `path` to open, the simulated `device`, whose `heard` has the names of the
-        commands that it received, and the methods `unplug`, `plug`, `jump_clock(seconds)` and, with
+        An object with the attributes `path` (to open) and `device` (`device.heard` lists the
+        received commands), and the methods `unplug`, `plug`, `jump_clock(seconds)` and, with
         virtual time, `advance(seconds)`.
 
     Raises:

@@ -1,9 +1,9 @@
 """Checks of single frames: examples, round trips, edits, damage, types.
 
-construct omits bits, truncates numbers and accepts contradictory values without an error; each of
-these shows when a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
-which shrinks a failure to the field at fault. A damaged frame may raise `WireError`, or pass with a
-changed bit that no checksum covers, which is measured.
+construct omits bits, truncates numbers and accepts contradictory values without an error. Each of
+these faults shows if a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
+which shrinks a failure to the field at fault. A damaged frame may raise `WireError`, or it may be
+accepted if no checksum covers the changed bit. The share of these bits is measured.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.findings import ViolationError, require
-from lidarspec.testing.sensor_under_test import MANY, SensorUnderTest
+from lidarspec.testing.sensor_under_test import MANY_FRAME_TYPES, SensorUnderTest
 
-#: Number of examples, read by plain construct, in which bytes are changed.
+#: Number of examples in which bytes are changed, for frames that plain construct reads.
 CHANGED_EXAMPLES = 3
-#: Number of values that each of their bytes is changed to, by default.
-CHANGES = 8
-#: Number of example frames that edits begin with.
-BASES = 8
+#: Default number of values that each of these bytes is changed to.
+CHANGED_VALUES = 8
+#: Number of example frames that are edited.
+EDITED_EXAMPLES = 8
 #: Maximum number of edits of one frame.
-MOST = 3
+MAX_EDITS = 3
 #: Minimum number of offsets at which a frame is cut short or changed.
-LEAST_SPOTS = 12
+MIN_CUT_OFFSETS = 12
 #: Maximum total bytes of the truncated copies of a long frame.
-CUT_BYTES = 1 << 20
+MAX_CUT_BYTES = 1 << 20
 #: Maximum total bytes of the changed copies of a long frame that plain construct reads.
-CHANGED_BYTES = 300_000
-#: Number of frames with every bit flipped in turn: by default, and at least.
-SAMPLES = 3
-LEAST_SAMPLES = 2
-#: Maximum number of bytes that are checked for the flipped bits of one frame; for a longer one,
-#: some of its bytes are chosen.
-FLIPPED_BYTES = 1 << 23
+MAX_CHANGED_BYTES = 300_000
+#: Default and minimum number of frames in which each bit is flipped in turn.
+FLIPPED_FRAMES = 3
+MIN_FLIPPED_FRAMES = 2
+#: Maximum total bytes of the copies of one frame with a flipped bit; in a longer frame, only bits
+#: of some bytes are flipped.
+MAX_FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
-    """Check that examples of a frame type can be built, parse, repeat and differ.
+    """Check that examples of a frame type are valid and repeatable, and differ.
 
-    None may be longer than declared.
+    No example may be longer than `max_length`.
     """
     frame = subject.sensor.frames[name]
     try:
@@ -100,7 +100,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
         parsed = sensor.parse(data, frame=name)
         for built in (sensor.build(name, parsed), sensor.build(name, **parsed)):
             if built != data:
-                _lost(subject, name, data, built, "LS302")
+                _raise_changed_bytes(subject, name, data, built, "LS302")
             again = sensor.parse(built, frame=name)
             require(
                 same(parsed, again), "LS302", "parsing the built frame gives another value", name
@@ -110,8 +110,8 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
 def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
     """Check that changed bytes survive parsing and building, apart from checksums.
 
-    Applies to frames that plain construct reads: they may contain functions of the author's own,
-    which may lose values.
+    Applies to frames that plain construct reads: they may contain functions of the author that
+    lose values.
     """
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
@@ -132,9 +132,9 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
 def _changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
     """Yield copies of examples with one changed byte each."""
     source = subject.source(f"raw {name}")
-    changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGES), CHANGED_BYTES)
+    changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGED_VALUES), MAX_CHANGED_BYTES)
     offset_count = subject.limit_to_bytes(
-        name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CHANGED_BYTES
+        name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CHANGED_BYTES
     )
     for seed in range(subject.limit_to_bytes(name, CHANGED_EXAMPLES)):
         example = subject.example(name, seed=seed)
@@ -159,7 +159,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
 def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
     """Check that a frame is refused if a field differs from its `Rebuild`.
 
-    Such a frame would be built as a different one.
+    Building the parsed values would give a different frame.
     """
     sensor = subject.sensor
     engine = get_codec(subject.sensor.frames[name])
@@ -191,7 +191,7 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
 
 
 def is_cut(before: Any, after: Any) -> bool:
-    """Return whether a number came back one step too low."""
+    """Return whether a number is one step lower after it was built and parsed."""
     if (
         not isinstance(before, int | float)
         or not isinstance(after, int | float)
@@ -204,7 +204,7 @@ def is_cut(before: Any, after: Any) -> bool:
 
 
 def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame built from its physical values has the original bytes."""
+    """Check that building a frame from its physical values gives the original bytes."""
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
         values = material.physical(subject.sensor, name, data)
@@ -213,7 +213,7 @@ def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) ->
         else:
             built = subject.sensor.build(name, values, units=True)
         if built != data:
-            _lost(subject, name, data, built, "LS304")
+            _raise_changed_bytes(subject, name, data, built, "LS304")
 
 
 def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
@@ -243,8 +243,10 @@ def same(one: Any, other: Any) -> bool:
     )
 
 
-def _lost(subject: SensorUnderTest, name: str, data: bytes, built: bytes, code: str) -> None:
-    """Raise the violation for bytes that changed, with the field in which they differ."""
+def _raise_changed_bytes(
+    subject: SensorUnderTest, name: str, data: bytes, built: bytes, code: str
+) -> None:
+    """Raise a violation that names the field in which two frames differ."""
     offset = next(
         (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
         min(len(data), len(built)),
@@ -272,7 +274,7 @@ def _lost(subject: SensorUnderTest, name: str, data: bytes, built: bytes, code: 
 
 
 def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a parsed frame: (path with indices, value)."""
+    """Yield (path with indices, value) for each value of a parsed frame."""
     if isinstance(parsed, dict):
         for key, value in parsed.items():
             yield from leaves(value, f"{path}.{key}" if path else key)
@@ -284,7 +286,7 @@ def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def acceptable(subject: SensorUnderTest, name: str, values: Any) -> bytes | None:
-    """Return the frame with these values; None if they contradict each other."""
+    """Build the frame with these values; return None if they contradict each other."""
     try:
         return subject.sensor.build(name, values)
     except UsageError:
@@ -300,7 +302,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
     number = len(subject.seeds(name))
     bases = [
         sensor.parse(subject.example(name, seed=base), frame=name)
-        for base in range(min(BASES, number))
+        for base in range(min(EDITED_EXAMPLES, number))
     ]
     if not any(
         has_free_values(fields.get(path))
@@ -309,7 +311,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
     ):
         return
     values = {
-        path: _values(info, subject.strategies.get(f"{name}.{path}"), st)
+        path: _make_value_strategy(info, subject.strategies.get(f"{name}.{path}"), st)
         for path, info in fields.items()
         if has_free_values(info)
     }
@@ -329,13 +331,13 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
         spots = list(material.integers(parsed))
         places = [place for place, (_, _, path) in enumerate(spots) if path in values]
         edits = []
-        for _ in range(data.draw(st.integers(1, MOST)) if places else 0):
+        for _ in range(data.draw(st.integers(1, MAX_EDITS)) if places else 0):
             place = places[data.draw(st.integers(0, len(places) - 1))]
             holder, key, path = spots[place]
             holder[key] = data.draw(values[path])
             edits.append(place)
         if edits:
-            _check(subject, name, parsed, spots, edits)
+            _check_edit(subject, name, parsed, spots, edits)
 
     try:
         check_edited()
@@ -343,7 +345,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
         raise ViolationError(found.code, found.what, found.path) from None
 
 
-def _check(
+def _check_edit(
     subject: SensorUnderTest, name: str, parsed: Any, spots: list[Any], edits: list[int]
 ) -> None:
     """Check that the edited integers of a frame are read back."""
@@ -375,8 +377,8 @@ def _check(
     )
 
 
-def _values(info: FieldInfo, own: Any, st: Any) -> Any:
-    """Return a strategy for a field's raw value: the author's, or one of its range."""
+def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
+    """Return the author's strategy for a field's raw value, or one for its range."""
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
@@ -402,7 +404,7 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
     """Check that a frame that is cut short raises `WireError` with its offset."""
     data = subject.example(name, seed=2)
     offset_count = subject.limit_to_bytes(
-        name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES
+        name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CUT_BYTES
     )
     for end in material.pick_offsets(len(data), subject.source("cut"), offset_count):
         try:
@@ -423,13 +425,13 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that a mutated frame parses or raises `WireError`.
+    """Check that a damaged frame can be parsed or raises `WireError`.
 
-    Parsing without verification may raise nothing else, either.
+    This also applies to parsing without verification.
     """
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
-    types = (name, None) if len(sensor.frames) <= MANY else (name,)
+    types = (name, None) if len(sensor.frames) <= MANY_FRAME_TYPES else (name,)
     for seed in subject.seeds(name, share=4):
         data = material.mutate(subject.example(name, seed=seed % 8), source)
         for kind, verify in itertools.product(types, (True, False)):
@@ -442,9 +444,9 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str
 
 
 def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
-    """Check that every flipped bit under a checksum makes the frame invalid.
+    """Check that flipping any bit that a checksum covers makes the frame invalid.
 
-    The share of other flipped bits that pass is measured.
+    The share of other bits that can be flipped in a valid frame is measured.
     """
     engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
@@ -452,7 +454,9 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
     source = subject.source(f"flipped bits of {name}")
     tried = passed = 0
     sealed = False
-    for seed in range(subject.limit_to_bytes(name, subject.scale_rounds(SAMPLES, LEAST_SAMPLES))):
+    for seed in range(
+        subject.limit_to_bytes(name, subject.scale_rounds(FLIPPED_FRAMES, MIN_FLIPPED_FRAMES))
+    ):
         data = subject.example(name, seed=seed)
         layout = engine.tree.layout(data)
         assert isinstance(layout, Layout)
@@ -460,7 +464,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
         if any(int(seal.load_stored(row)[0]) in seal.absent for seal in layout.seals):
             continue
         sealed = bool(layout.seals)
-        offsets = _flipped_offsets(layout, len(data), source)
+        offsets = _choose_flipped_offsets(layout, len(data), source)
         passing = find_changes(subject.sensor.frames[name], data, ["flipped bit"], offsets=offsets)
         tried += 8 * len(offsets)
         passed += len(passing)
@@ -489,12 +493,12 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
         )
 
 
-def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
-    """Return the offsets of the bytes to flip bits in.
+def _choose_flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
+    """Return the offsets of the bytes in which bits are flipped.
 
-    These are all bytes, or for a long frame one of each field and some random ones.
+    For a long frame, these are one byte of each field and some random bytes; otherwise all bytes.
     """
-    number = FLIPPED_BYTES // (8 * length)
+    number = MAX_FLIPPED_BYTES // (8 * length)
     if number >= length:
         return range(length)
     fields = [start for start, _ in layout.places.values()]

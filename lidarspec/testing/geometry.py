@@ -1,12 +1,18 @@
 """Checks of a sensor's points that are possible without its manual.
 
-Four kinds of frames are used. Examples: clouds keep the conventions, and tracing `points` shows the
-source fields of each column. Packets along the sensor's `sweep`: directions are radians, have
-one sense from beam to beam, cross the full circle without a jump, and exist for a single point;
-clock and counter increase. Frames with an angle that is changed by a few steps: the sense in which
-the points turn agrees with the vendor's axes. Packets simulated in a room: the decoded points lie
-on its walls, by a geometry of this module's own (`distance_outside`), not the simulator's. Measured
-values are reported (`SensorUnderTest.picture`), to be compared with the manual.
+Four kinds of frames are used:
+
+* Examples: clouds keep the conventions, and tracing `points` shows the source fields of each
+  column.
+* Packets along the sensor's `sweep`: directions are in radians, change in one sense from beam to
+  beam, cross the full circle without a jump, and exist for a single point; clock and counter
+  increase.
+* Frames with an angle that is changed by a few steps: the points turn in the sense of the vendor's
+  axes.
+* Packets simulated in a room: the decoded points lie on its walls. The walls are computed by
+  `distance_outside`, not by the simulator.
+
+Measured values are reported (`SensorUnderTest.picture`), to be compared with the manual.
 """
 
 from __future__ import annotations
@@ -46,44 +52,45 @@ from lidarspec.testing.frames import acceptable
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Number of packets along the sweep for the check of directions.
-PACKETS = 400
+SWEEP_PACKETS = 400
 #: Number of packets in a simulated room: for short frames, and for frames longer than
 #: `LONG_FRAME_BYTES`.
 SCENE_PACKETS = 200
 LONG_SCENE_PACKETS = 50
 LONG_FRAME_BYTES = 1500
-#: Maximum total bytes of packets along the sweep, for counters (which wrap), and in the room.
-SWEEP_BYTES = 1 << 22
-COUNTER_BYTES = 1 << 24
-SCENE_BYTES = 1 << 21
-#: Minimum number of packets, for frames of any length.
-LEAST_PACKETS = 8
-#: Radians beyond which an azimuth along a sweep must be in degrees.
-TURNS = 4 * np.pi
-#: Radians beyond which the azimuth of a random frame must be in degrees.
-DRAWN = 15 * np.pi
+#: Maximum total bytes of packets along the sweep, of packets for the check of counters (which have
+#: to wrap), and of packets in the room.
+MAX_SWEEP_BYTES = 1 << 22
+MAX_COUNTER_BYTES = 1 << 24
+MAX_SCENE_BYTES = 1 << 21
+#: Minimum number of packets, even if they exceed the maximum total bytes.
+MIN_PACKETS = 8
+#: An azimuth along a sweep above this value in radians must be in degrees.
+MAX_SWEEP_AZIMUTH_RAD = 4 * np.pi
+#: The azimuth of a random frame above this value in radians must be in degrees.
+MAX_RANDOM_AZIMUTH_RAD = 15 * np.pi
 #: Minimum share of steps in one direction if a sensor rotates.
-ONE_WAY = 0.8
-#: Maximum step against the direction, in radians.
-BACK = np.deg2rad(1.5)
-#: The same in medians of all steps.
-MEDIANS = 4
-#: Raw steps by which an angle is changed to see if the points move with it.
-SMALL = 4
-#: Number of examples that are tried until one has points, by default.
-BASES = 8
-#: Radians from point to point above which a sensor rotates.
-SEEN = 1e-5
-#: Minimum component along one of two axes for a direction to belong to that axis.
-ALONG = 0.9
-#: Metres by which float32 moves a point off its surface.
-EXACT = 2e-6
-#: Metres of half a step that a header or a code word may widen.
-UNTOLD = 0.004
+MIN_ONE_WAY_SHARE = 0.8
+#: Maximum step of the azimuth against its direction, in radians.
+MAX_BACK_STEP_RAD = np.deg2rad(1.5)
+#: The same limit as a multiple of the median step; the larger limit applies.
+MAX_BACK_STEP_MEDIANS = 4
+#: Difference in raw units by which an angle is changed, to see if the points move with it.
+SMALL_CHANGE = 4
+#: Default number of examples that are tried until one has points.
+TRIED_EXAMPLES = 8
+#: A sensor with a larger median step of the azimuth, in radians, rotates.
+MIN_ROTATION_STEP_RAD = 1e-5
+#: Minimum component of a direction along an axis to count as the direction of that axis.
+MIN_AXIS_COMPONENT = 0.9
+#: Rounding error of a point in float32, in metres.
+FLOAT32_ERROR_M = 2e-6
+#: Minimum tolerance of a distance in metres: a header or a code word may enlarge the step.
+MIN_HALF_STEP_M = 0.004
 
 
 def make_sweep(
-    subject: SensorUnderTest, name: str, packets: int, total: int = SWEEP_BYTES
+    subject: SensorUnderTest, name: str, packets: int, total: int = MAX_SWEEP_BYTES
 ) -> list[bytes]:
     """Return the first packets along the sensor's `sweep`.
 
@@ -101,7 +108,7 @@ def make_sweep(
         maker = FrameMaker(subject.sensor, name)
         if not made:
             made.append(maker.frame(sweep(0)))
-        packets = min(packets, max(total // len(made[0]), LEAST_PACKETS))
+        packets = min(packets, max(total // len(made[0]), MIN_PACKETS))
         if len(made) < packets:
             made += maker.seal(maker.table([sweep(number) for number in range(len(made), packets)]))
     except LidarSpecError:
@@ -182,8 +189,8 @@ def directions(
 ) -> list[NDArray[np.float64]] | None:
     """Return azimuths and elevations from `points` before folding, without padding.
 
-    For Cartesian points these are the directions that are declared for the simulation; None if
-    there are none.
+    For Cartesian points, these are the directions that are declared for the simulation; None if
+    no directions are declared.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -208,7 +215,7 @@ def directions(
 
 
 def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np.float64]] | None:
-    """Return the simulated directions of the first frames, None if there are none."""
+    """Return the declared directions of the first frames; None if there are none."""
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
@@ -222,8 +229,8 @@ def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np
 def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
     """Check that clouds keep the conventions, and that `points` does not fail.
 
-    The conventions are float32 metres and radians, azimuth in [-pi, pi), and no coordinates without
-    a return.
+    The conventions are: metres and radians in float32, azimuth in [-pi, pi), and no coordinates of
+    points without a return.
     """
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
@@ -244,7 +251,7 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     """Check that no direction is so large that it must be in degrees."""
     along = make_sweep(subject, name, 64)
     if not along and any(info.kind == "float" for info in subject.fields(name).values()):
-        return  # which may hold any number
+        return  # a float may have any value
     frames = along or [subject.example(name, seed=seed) for seed in range(16)]
     angles = directions(subject, name, read(subject, name, frames))
     if angles is None:
@@ -252,7 +259,10 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in angles)
     where = f"{name}.{'directions' if subject.sensor.simulation_of(name).directions else 'points'}"
     require(
-        azimuth <= (TURNS if along else DRAWN), "LS502", f"an azimuth of {azimuth:.4g} rad", where
+        azimuth <= (MAX_SWEEP_AZIMUTH_RAD if along else MAX_RANDOM_AZIMUTH_RAD),
+        "LS502",
+        f"an azimuth of {azimuth:.4g} rad",
+        where,
     )
     require(
         not along or elevation <= np.pi / 2 + 1e-6,
@@ -307,22 +317,24 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
 def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> None:
     """Check that an angle of exactly 360 degrees gives the same points as 0.
 
-    Applies if such a frame is plausible.
+    Applies if a frame with 360 degrees is plausible.
     """
-    for path, info in _angles_of_points(subject, name).items():
-        full = _full_circle(info)
+    for path, info in _find_point_angles(subject, name).items():
+        full = _find_full_circle(info)
         if full is None:
             continue
         try:
-            # the full circle comes first, since few frames can carry it
-            clouds = _with_values(subject, name, path, (full[1], full[0], full[0] + SMALL))
+            # The full circle is set first, because few frames can represent it.
+            clouds = _decode_with_values(
+                subject, name, path, (full[1], full[0], full[0] + SMALL_CHANGE)
+            )
         except SpecError as error:
             raise ViolationError(
                 "LS505",
                 f"{path} of {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}",
                 f"{name}.{path}",
             ) from error
-        if not clouds or not _turn(info, clouds[1], clouds[2]):
+        if not clouds or not _find_turn_sense(info, clouds[1], clouds[2]):
             continue
         circle, nought, _ = clouds
         apart = np.nanmax(
@@ -340,15 +352,16 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
 def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
     """Check that points turn with the angle as the vendor's axes declare.
 
-    Golden vectors with points in two quadrants prove the sense better. It is reported in any case.
+    Golden vectors with points in two quadrants prove the sense better. The sense is always
+    reported.
     """
-    for path, info in _angles_of_points(subject, name).items():
-        zero = _zero(info)
+    for path, info in _find_point_angles(subject, name).items():
+        zero = _find_zero(info)
         if zero is None:
             clouds = []
         else:
-            clouds = _with_values(subject, name, path, (zero, zero + SMALL))
-        sense = _turn(info, *clouds) if clouds else 0
+            clouds = _decode_with_values(subject, name, path, (zero, zero + SMALL_CHANGE))
+        sense = _find_turn_sense(info, *clouds) if clouds else 0
         if not sense:
             continue
         first = float(clouds[0].azimuth[np.isfinite(clouds[0].azimuth)][0])
@@ -376,7 +389,7 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
     turning = round(float(np.cross(x, y)[2]))
-    if max(along) < ALONG:
+    if max(along) < MIN_AXIS_COMPONENT:
         return 0
     if along[0] > along[1]:
         return turning
@@ -391,7 +404,9 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     frames = make_sweep(
         subject,
         name,
-        PACKETS if subject.sensor.frames[name].max_length <= material.SHORT else PACKETS // 4,
+        SWEEP_PACKETS
+        if subject.sensor.frames[name].max_length <= material.MAX_SHORT_BYTES
+        else SWEEP_PACKETS // 4,
     )
     if not frames:
         return
@@ -413,14 +428,16 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
             continue
         median = float(np.median(steps[moving]))
         turning = "counter-clockwise" if median > 0 else "clockwise"
-        if abs(median) > SEEN:
+        if abs(median) > MIN_ROTATION_STEP_RAD:
             subject.picture.setdefault(
                 f"{name}: step",
                 f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep",
             )
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
-        back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
-        if one_way < ONE_WAY:
+        back = steps * np.sign(median) < -max(
+            MAX_BACK_STEP_RAD, MAX_BACK_STEP_MEDIANS * abs(median)
+        )
+        if one_way < MIN_ONE_WAY_SHARE:
             message = (
                 f"only {one_way:.0%} of the steps have the same direction, but scans end at its"
                 " wrap"
@@ -441,14 +458,17 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that along the sweep no packet is lost, late or doubled, or back in time."""
+    """Check that along the sweep no packet counts as lost, late or doubled.
+
+    The clock may not run backwards.
+    """
     if name != subject.sensor.data_frame:
         return
     frames = make_sweep(
         subject,
         name,
         700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260,
-        COUNTER_BYTES,
+        MAX_COUNTER_BYTES,
     )
     if not frames:
         return
@@ -478,8 +498,8 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
         )
 
 
-def _zero(info: FieldInfo) -> int | None:
-    """Return the raw value nearest to a zero angle; None if there is none."""
+def _find_zero(info: FieldInfo) -> int | None:
+    """Return the raw value nearest to a zero angle; None if it is out of range."""
     if (
         info.kind != "int"
         or info.const is not None
@@ -488,16 +508,16 @@ def _zero(info: FieldInfo) -> int | None:
     ):
         return None
     raw = round(-info.offset / info.scale)
-    if info.limits[0] <= raw <= info.limits[1] - SMALL:
+    if info.limits[0] <= raw <= info.limits[1] - SMALL_CHANGE:
         return raw
     return None
 
 
-def _angles_of_points(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
+def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
     """Return the angles of a frame type that may turn its points, by path.
 
-    These are the ones that `points` uses, and optional ones, which the traced example may lack;
-    all of them if `points` cannot be traced.
+    These are the angles that `points` uses, and optional angles, because the traced example may
+    lack them. If `points` cannot be traced, these are all angles.
     """
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
@@ -511,9 +531,12 @@ def _angles_of_points(subject: SensorUnderTest, name: str) -> dict[str, FieldInf
     return {path: info for path, info in angles.items() if info.optional or path in sources}
 
 
-def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
-    """Return the raw values of 0 and of the full circle; None if the field lacks one."""
-    zero = _zero(info)
+def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
+    """Return the raw values of 0 and of the full circle.
+
+    Returns None if the field cannot have both values.
+    """
+    zero = _find_zero(info)
     if zero is not None:
         circle = (FULL_TURNS[info.unit] - info.offset) / info.scale
     else:
@@ -529,23 +552,23 @@ def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
     return None
 
 
-def _with_values(
+def _decode_with_values(
     subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
     """Return the points of an example with each of these values in a field.
 
-    Returns an empty list if no example can hold all of them with the same number of points.
+    Returns an empty list if no example has the same number of points with all values.
 
     Raises:
         SpecError: if `points` fails.
     """
-    for seed in range(1, 1 + subject.scale_rounds(BASES, least=4)):
+    for seed in range(1, 1 + subject.scale_rounds(TRIED_EXAMPLES, least=4)):
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
         if all(own != path for _, _, own in material.integers(parsed)):
             continue
         frames = list(
             itertools.takewhile(
-                bool, (_with(subject, name, path, value, parsed) for value in values)
+                bool, (_set_value(subject, name, path, value, parsed) for value in values)
             )
         )
         if len(frames) < len(values):
@@ -564,24 +587,24 @@ def _with_values(
     return []
 
 
-def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
+def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     """Return the sense in which points turn with a field.
 
     1 is counter-clockwise, -1 clockwise; 0 if they do not turn, as for a rate or an elevation.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
-        SMALL * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
+        SMALL_CHANGE * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
     )
     if 0.5 < abs(most) < 1.5:
         return int(np.sign(most))
     return 0
 
 
-def _with(subject: SensorUnderTest, name: str, path: str, value: int, parsed: Any) -> bytes:
-    """Return the frame with every element of one field set; changes `parsed`.
+def _set_value(subject: SensorUnderTest, name: str, path: str, value: int, parsed: Any) -> bytes:
+    """Set every element of a field in `parsed`, and return the frame.
 
-    Returns no bytes if no frame can hold the value.
+    Returns b"" if the frame is not valid with this value.
     """
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
@@ -596,7 +619,7 @@ def _with(subject: SensorUnderTest, name: str, path: str, value: int, parsed: An
 def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances in metres, (n,), of points, (n, 3), to surfaces of a room.
 
-    Does not use the simulator's geometry.
+    The geometry is independent of the simulator.
     """
     distances = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
@@ -610,16 +633,19 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half a step of the coarsest range field in metres, at least `UNTOLD`."""
+    """Return half a step of the coarsest range field in metres.
+
+    It is at least `MIN_HALF_STEP_M`.
+    """
     fields = subject.fields(name).values()
     metres = [
         abs(info.scale) * float(factor(info.unit, "m") or 0)
         for info in fields
         if factor(info.unit, "m") is not None
     ]
-    if max(metres, default=0) > UNTOLD:
-        return max([UNTOLD, *metres]) / 2
-    return UNTOLD
+    if max(metres, default=0) > MIN_HALF_STEP_M:
+        return max([MIN_HALF_STEP_M, *metres]) / 2
+    return MIN_HALF_STEP_M
 
 
 def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
@@ -632,7 +658,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         length = len(made.block(0, 1, room).frames[0])
         packets = min(
             LONG_SCENE_PACKETS if is_long else SCENE_PACKETS,
-            max(SCENE_BYTES // length, LEAST_PACKETS),
+            max(MAX_SCENE_BYTES // length, MIN_PACKETS),
         )
         block = made.block(5, packets, room)
     except UsageError:
@@ -662,8 +688,8 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     if subject.sensor.simulation_of(name).directions:
         each = np.sqrt(3)
     else:
-        each = 1  # coordinates are rounded one by one
-    near_enough = worst < half_step(subject, name) * each + EXACT
+        each = 1  # each coordinate is rounded separately
+    near_enough = worst < half_step(subject, name) * each + FLOAT32_ERROR_M
     require(
         near_enough,
         "LS507",
@@ -673,7 +699,9 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     assert subject.sensor.range_limits is not None  # as of every sensor with points
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:count][valid]
-    inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)
+    inside = not len(ranges) or (
+        ranges.min() >= near - MIN_HALF_STEP_M and ranges.max() <= far + MIN_HALF_STEP_M
+    )
     require(
         inside,
         "LS507",

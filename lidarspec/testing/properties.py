@@ -54,19 +54,19 @@ def _no_device(subject: SensorUnderTest) -> str:
 
 @dataclass(frozen=True)
 class Property:
-    """A property that must hold.
+    """A property that every sensor must have.
 
     Attributes:
-        function: takes the subject, and a name if it is tested for each frame, data frame, command
-            or vector.
-        each: "sensor", "frame", "data", "command" or "vector".
-        rule: the rule of a plain assertion in it.
-        lacks: returns the reason why it does not apply to a sensor, "" if it does.
+        function: raises an exception if the property does not hold. Its arguments are the subject,
+            and a name if the property is tested for each frame, data frame, command or vector.
+        each: the unit of a test: "sensor", "frame", "data", "command" or "vector".
+        rule: the rule that a plain `AssertionError` of the function violates.
+        lacks: returns the reason why the property does not apply to a sensor; "" if it applies.
         unless: rules that describe the fault better; if one of them is violated, the property is
             not tested.
-        depends_on: attributes of a sensor that decide the result; if a related model that is tested
-            too has equal ones, the property is not tested again. If empty, it is tested for each
-            sensor.
+        depends_on: attributes of a sensor that decide the result. If a related model that is also
+            tested has equal attributes, the property is not tested again. If empty, it is tested
+            for each sensor.
     """
 
     function: Callable[..., None]
@@ -97,7 +97,7 @@ class Property:
         return [(name,) for name in names[self.each]]
 
     def _is_tested_elsewhere(self, subject: SensorUnderTest) -> bool:
-        """Return whether a related model that is tested too gives the same result."""
+        """Return whether a related model that is also tested gives the same result."""
         if not self.depends_on:
             return False
         wanted = [getattr(subject.sensor, name) for name in self.depends_on]
@@ -126,7 +126,9 @@ class Property:
                 )
             except AssertionError as error:
                 code = "LS414" if "Traceback" in str(error) else self.rule
-                findings.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))
+                findings.append(
+                    Finding(code, _find_main_line(error), ".".join(case), subject.sensor.id)
+                )
             except SpecError as error:
                 place = ".".join(case)
                 path = error.path if error.path.startswith(place) else place
@@ -138,11 +140,11 @@ class Property:
         return findings
 
 
-#: Rules that are violated by a plugin that fails on valid frames.
-FAILS = ("LS213", "LS214", "LS215", "LS414")
+#: Rules that a plugin violates if it raises an exception for valid frames.
+FAILING_RULES = ("LS213", "LS214", "LS215", "LS414")
 
 #: Attributes that decide the result of decoding a stream.
-READING = (
+DECODING_ATTRIBUTES = (
     "frames",
     "datagrams",
     "main_frames",
@@ -186,77 +188,83 @@ PROPERTIES = (
         lacks=vectors.lacking,
         unless=("LS702", "LS703", "LS707"),
     ),
-    Property(geometry.clouds_keep_the_conventions, "data", "LS501", depends_on=READING),
-    Property(geometry.directions_are_radians, "data", "LS502", unless=FAILS),
+    Property(geometry.clouds_keep_the_conventions, "data", "LS501", depends_on=DECODING_ATTRIBUTES),
+    Property(geometry.directions_are_radians, "data", "LS502", unless=FAILING_RULES),
     Property(
         geometry.a_single_point_has_a_direction,
         "data",
         "LS503",
-        unless=FAILS,
-        depends_on=READING,
+        unless=FAILING_RULES,
+        depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
         geometry.the_full_circle_is_the_same_as_none,
         "data",
         "LS505",
-        unless=(*FAILS, "LS503"),
-        depends_on=READING,
+        unless=(*FAILING_RULES, "LS503"),
+        depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
         geometry.the_points_turn_as_the_axes_do,
         "data",
         "LS511",
-        unless=(*FAILS, "LS502"),
-        depends_on=(*READING, "vendor_axes"),
+        unless=(*FAILING_RULES, "LS502"),
+        depends_on=(*DECODING_ATTRIBUTES, "vendor_axes"),
     ),
     Property(
-        geometry.angles_are_in_order, "data", "LS506", lacks=_no_sweep, unless=(*FAILS, "LS502")
+        geometry.angles_are_in_order,
+        "data",
+        "LS506",
+        lacks=_no_sweep,
+        unless=(*FAILING_RULES, "LS502"),
     ),
-    Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILS),
+    Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILING_RULES),
     Property(
         consistency.turned_angles_turn_the_points,
         "data",
         "LS504",
         lacks=_no_sweep,
-        unless=(*FAILS, "LS502", "LS504", "LS506"),
+        unless=(*FAILING_RULES, "LS502", "LS504", "LS506"),
     ),
     Property(
         consistency.the_clock_stays_below_its_wrap,
         "data",
         "LS512",
         lacks=_no_sweep,
-        unless=(*FAILS, "LS509"),
+        unless=(*FAILING_RULES, "LS509"),
     ),
     Property(
         consistency.times_of_points_fit_the_clock,
         "data",
         "LS513",
         lacks=_no_sweep,
-        unless=(*FAILS, "LS509"),
+        unless=(*FAILING_RULES, "LS509"),
     ),
     Property(
         streams.the_same_bytes_give_the_same_points,
         "sensor",
         "LS415",
         lacks=_no_points,
-        unless=FAILS,
-        depends_on=READING,
+        unless=FAILING_RULES,
+        depends_on=DECODING_ATTRIBUTES,
     ),
-    Property(streams.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=READING),
+    Property(
+        streams.a_clean_input_loses_nothing, "sensor", "LS401", depends_on=DECODING_ATTRIBUTES
+    ),
     Property(
         streams.scans_do_not_depend_on_batches,
         "sensor",
         "LS404",
         lacks=_no_points,
-        unless=(*FAILS, "LS415"),
-        depends_on=READING,
+        unless=(*FAILING_RULES, "LS415"),
+        depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
         geometry.a_simulated_scene_comes_back,
         "data",
         "LS507",
         lacks=_no_sweep,
-        unless=("LS201", "LS218", *FAILS, "LS502", "LS415", "LS503"),
+        unless=("LS201", "LS218", *FAILING_RULES, "LS502", "LS415", "LS503"),
     ),
     Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
     Property(commands.arguments_are_held_to_their_ranges, "command", "LS602", lacks=_no_commands),
@@ -266,13 +274,13 @@ PROPERTIES = (
         "command",
         "LS604",
         lacks=_no_device,
-        unless=(*FAILS, "LS201", "LS508", "LS601", "LS603"),
+        unless=(*FAILING_RULES, "LS201", "LS508", "LS601", "LS603"),
     ),
 )
 
 
-def _gist(error: BaseException) -> str:
-    """Return the most informative line of an error."""
+def _find_main_line(error: BaseException) -> str:
+    """Return the most informative line of the message of an error."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     if lines:
         if "Traceback" in str(error):
@@ -290,12 +298,12 @@ def _rule_of(error: SpecError) -> str:
 def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
     """Return the finding for an undocumented exception.
 
-    Its location is the plugin's own line if the exception was raised there.
+    If the exception was raised in the plugin, the location is that line.
     """
     locations = [
         location
         for location in traceback.extract_tb(error.__traceback__)
-        if not _ours(location.filename)
+        if not _is_library_file(location.filename)
     ]
     location = locations[-1] if locations else None
     text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
@@ -309,7 +317,7 @@ def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> 
     )
 
 
-def _ours(file: str) -> bool:
+def _is_library_file(file: str) -> bool:
     """Return whether a file belongs to the engine or one of its libraries."""
     package = Path(__file__).resolve().parents[1]
     return package in Path(file).parents or any(

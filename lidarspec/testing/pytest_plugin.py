@@ -70,9 +70,9 @@ def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Serve
 
 @pytest.fixture
 def bare_registry() -> Iterator[Registry]:
-    """Replace the registry of this environment by an empty one.
+    """Replace the registry by an empty registry until the test ends.
 
-    No installed plugin is visible; `add` adds one.
+    Installed plugins are not visible; `add` adds a plugin.
     """
     from lidarspec.plugins import Registry, use_registry
 

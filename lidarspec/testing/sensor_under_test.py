@@ -1,7 +1,7 @@
 """A sensor under test, with its examples, their edits and truncated copies.
 
-A `SensorUnderTest` has the sensor, its examples (drawn by the author's own strategies if there are
-any) and measured values. All random values are seeded, so that a failure can be repeated.
+A `SensorUnderTest` has the sensor, its examples (drawn by the author's strategies if there are any)
+and measured values. All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -19,41 +19,44 @@ from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
 #: Maximum length in bytes of a frame that is cut at every byte.
-SHORT = 300
-#: Number of random offsets at which a longer frame is cut, besides both ends.
-SPOTS = 50
+MAX_SHORT_BYTES = 300
+#: Number of random offsets at which a longer frame is cut, in addition to both ends.
+CUT_OFFSETS = 50
 
 
 def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
-    """Return frames as the data link delivers them: datagrams, or one run of bytes."""
+    """Return frames as the data link delivers them: a list of datagrams, or bytes."""
     parts = [data for _, data in frames]
     if sensor.datagrams:
         return parts
     return b"".join(parts)
 
 
-def pick_offsets(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
-    """Return offsets at which to cut: all of few, else both ends and random ones."""
-    if length <= SHORT * spots // SPOTS:
+def pick_offsets(length: int, source: random.Random, spots: int = CUT_OFFSETS) -> list[int]:
+    """Return offsets at which a frame is cut.
+
+    These are all offsets of a short frame, or the ends and `spots` random offsets of a long frame.
+    """
+    if length <= MAX_SHORT_BYTES * spots // CUT_OFFSETS:
         return list(range(length))
     ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
     return sorted({*ends, *source.sample(range(length), min(spots, length))})
 
 
 #: Sizes in bytes of the chunks that a stream is cut into, and their mean.
-CHUNKS = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
-MEAN_CHUNK = sum(CHUNKS) / len(CHUNKS)
+CHUNK_SIZES = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
+MEAN_CHUNK_SIZE = sum(CHUNK_SIZES) / len(CHUNK_SIZES)
 
 
 def cut_randomly(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
-    """Yield the bytes in chunks of random sizes, including empty ones.
+    """Yield the bytes in chunks of random sizes, including empty chunks.
 
     Args:
-        scale: factor of the sizes.
+        scale: factor by which the sizes are multiplied.
     """
     start = 0
     while start < len(data):
-        size = source.choice(CHUNKS) * scale
+        size = source.choice(CHUNK_SIZES) * scale
         yield data[start : start + size]
         start += size
 
@@ -66,9 +69,9 @@ def mutate(
     Bytes are changed, dropped, doubled, inserted, or overwritten.
 
     Args:
-        words: byte strings that are inserted or written over as a whole, such as values at the edge
-            of a range, or pieces of other inputs.
-        spots: offsets for half of the changes, such as those of fields; by default all are random.
+        words: byte strings that are inserted or overwrite other bytes, e.g. values at the edge of a
+            range, or pieces of other inputs.
+        spots: offsets for half of the changes, e.g. of fields; by default all offsets are random.
     """
     mutated = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
@@ -96,7 +99,7 @@ def mutate(
 def integers(
     parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
 ) -> Iterator[tuple[Any, Any, str]]:
-    """Yield the integers of a parsed frame: (container, key in it, field path).
+    """Yield (container, key in it, field path) for each integer of a parsed frame.
 
     Args:
         kinds: the types of the values.
@@ -118,9 +121,9 @@ def integers(
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """Return a parsed frame with its scaled numbers in units.
+    """Parse a frame with its scaled numbers in units.
 
-    Returns None if a number is too wide to be exact as a float.
+    Returns None if a number is too large for an exact float.
     """
     fields = get_codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
@@ -141,7 +144,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
 
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
-    """Return the fields of a frame that hold a checksum, which callers do not set."""
+    """Return the paths of the fields of a frame that store a checksum."""
     engine = get_codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
     if layout is None or engine.schema.parts:
@@ -157,23 +160,24 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     }
 
 
-#: Default number of examples of each frame type for each property; numbers of rounds refer to it.
+#: Default number of examples of each frame type for each property. All numbers of rounds are given
+#: for this default.
 USUAL_EXAMPLES = 40
 #: Default number of rounds of a conversation.
 USUAL_ROUNDS = 3
 #: Minimum number of rounds of a conversation.
-LEAST_ROUNDS = 2
+MIN_ROUNDS = 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
 #: Number of frame types above which fewer examples of each are used.
-MANY = 8
+MANY_FRAME_TYPES = 8
 #: Maximum total bytes of the examples of one frame type that a property uses.
-EXAMPLE_BYTES = 300_000
+MAX_EXAMPLE_BYTES = 300_000
 #: Number of bytes after which no further round of a conversation begins.
 CONVERSATION_BYTES = 500_000
 #: Number of examples that measure the length of frames.
 MEASURED_SEEDS = 3
 #: Number of values that are drawn from a hypothesis strategy.
-POOL = 60
+POOL_SIZE = 60
 
 
 @dataclass(eq=False)
@@ -186,15 +190,15 @@ class SensorUnderTest:
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`.
         vectors: the file of golden vectors, None if there is none.
-        family: the ids of the sensors that share that file; empty if it belongs to this sensor
-            alone.
-        tested: related models that are tested too; frame types that they share are not tested
-            separately again.
-        measured: measured values of frames as text, by what they describe.
-        picture: measured values of points, likewise, to be compared with the manual.
-        traced: the result of `points` for traced columns of each data frame that could be traced.
-        placed: data frames with golden vectors that place points in two quadrants.
-        swept: packets along the `sweep` of each data frame, as far as a property needed them.
+        family: the ids of the sensors that share that file; empty if the file belongs to this
+            sensor alone.
+        tested: related models that are also tested; frame types that this sensor shares with them
+            are not tested again.
+        measured: measured values of frames as text, by description.
+        picture: measured values of points as text, by description, to compare with the manual.
+        traced: data frame -> the result of `points` for traced columns, if it can be traced.
+        placed: data frames with golden vectors that prove points in two quadrants.
+        swept: data frame -> packets along its `sweep` that a property has needed so far.
     """
 
     sensor: Sensor
@@ -215,7 +219,7 @@ class SensorUnderTest:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that are tested separately."""
+        """The frame types that no related model tests."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -223,10 +227,10 @@ class SensorUnderTest:
 
     @property
     def commands(self) -> list[str]:
-        """The commands that are tested separately.
+        """The commands that no related model tests.
 
-        A command is left out if a related model that is tested too has the same one, with the same
-        frames, links and answers.
+        A command is omitted if a related model that is also tested has the same command with the
+        same frames, links and answers.
         """
         return [
             name
@@ -239,32 +243,33 @@ class SensorUnderTest:
         return get_codec(self.sensor.frames[frame]).schema.all_fields
 
     def source(self, purpose: str = "") -> random.Random:
-        """Return a random generator for one purpose, the same in every run."""
+        """Return a random generator for a purpose; it repeats its numbers in every run."""
         return random.Random(f"{self.sensor.id} {purpose}")
 
     def seeds(self, name: str, share: float = 1.0) -> range:
         """Return the seeds of the examples of a frame type that are used.
 
-        There are fewer for long frames, since each field takes time, and if the sensor has many
-        frame types.
+        There are fewer seeds for long frames, because each field takes time, and if the sensor has
+        many frame types.
         """
-        few = 8 if self.sensor.frames[name].max_length > SHORT else 1
-        few *= 2 if len(self.sensor.frames) > MANY else 1
+        few = 8 if self.sensor.frames[name].max_length > MAX_SHORT_BYTES else 1
+        few *= 2 if len(self.sensor.frames) > MANY_FRAME_TYPES else 1
         return range(self.limit_to_bytes(name, max(int(self.examples * share) // few, 3)))
 
     def limit_to_bytes(
-        self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1
+        self, name: str, number: int, total: int = MAX_EXAMPLE_BYTES, least: int = 1
     ) -> int:
-        """Return how many of `number` frames of a type to use.
+        """Return the number of frames of a type to use, at most `number`.
 
         Args:
-            total: maximum number of their bytes.
-            least: minimum number of frames.
+            number: the wanted number of frames.
+            total: maximum total bytes of these frames.
+            least: minimum number of frames, even if they exceed `total`.
         """
         return min(number, max(total // self.length(name), least))
 
     def length(self, name: str) -> int:
-        """Return the length in bytes of the longest of a few examples of a type."""
+        """Return the maximum length in bytes of a few examples of a type."""
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
@@ -274,7 +279,7 @@ class SensorUnderTest:
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """Return the bytes of a valid frame with seeded content.
 
-        It is drawn by the author's strategies if there are any.
+        It has values of the author's strategies if there are any.
         """
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)
@@ -303,12 +308,12 @@ class SensorUnderTest:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Return frames of all incoming types in a possible order, as (type, bytes).
 
-        Each has the frames before it that it needs to be accepted.
+        Before each frame are the frames without which the decoder would not accept it.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0
         for turn in range(
-            self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds
+            self.scale_rounds(USUAL_ROUNDS, MIN_ROUNDS) if rounds is None else rounds
         ):
             if size > CONVERSATION_BYTES:
                 break
@@ -320,7 +325,7 @@ class SensorUnderTest:
                     number = 1
                 first = (
                     seed * 1000 + turn * number
-                )  # the lowest seeds, since other properties use their examples as well
+                )  # the lowest seeds, because other properties use the same examples
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
                 frames += [
@@ -362,7 +367,7 @@ def _make_pool(strategy: Any) -> Callable[[random.Random], int]:
         "suppress_health_check": list(HealthCheck),
     }
 
-    @settings(max_examples=POOL, derandomize=True, phases=[Phase.generate], **quiet)
+    @settings(max_examples=POOL_SIZE, derandomize=True, phases=[Phase.generate], **quiet)
     @given(strategy)
     def collect(value: int) -> None:
         pool.append(value)

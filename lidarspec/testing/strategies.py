@@ -6,15 +6,14 @@
     @given(values("acme-x1", "data"))
     def test_distances_are_positive(value): ...
 
-Each field is a draw of its own, so that a failure is reported with the smallest value of each
+Each field is drawn separately, so that a failure is reported with the smallest value of each
 field. Fields that decide the layout (counts, lengths, keys of a `Switch`) are drawn first, then the
-fields that the layout has, within the ranges that the struct and `plausible` accept
-(`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in.
+other fields of the layout, within the ranges that the struct and `plausible` accept
+(`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. A long array is
+filled with one drawn value and has a few exceptions.
 
-Of a long array, one value that fills it and a few exceptions are drawn.
-
-Frames that construct reads alone, and frames with parts, are drawn by walking their struct. If
-hardly any values fit together, the frame is one of a few examples.
+Frames without layouts, which only construct can read, and frames with parts are drawn by walking
+their struct. If values are seldom valid together, the frame is one of a few examples.
 """
 
 from __future__ import annotations
@@ -58,24 +57,24 @@ __all__ = ["commands", "frames", "scans", "streams", "values"]
 
 #: Field path -> a strategy of its raw value.
 Fields = Mapping[str, SearchStrategy[Any]]
-#: Arrays with more elements are drawn as one value that fills them, and exceptions.
+#: Maximum number of elements of an array that are drawn separately; a longer array is filled with
+#: one value and has at most `MAX_EXCEPTIONS` exceptions.
 MAX_SINGLE_DRAWS = 12
 MAX_EXCEPTIONS = 6
-#: Highest of the low numbers that are drawn more often: counts and keys are mostly low.
+#: Numbers up to these limits are drawn more often, because counts and keys are mostly low.
 LOW_NUMBERS = (8, 40)
 #: Number of tries to draw a frame without a layout in one example.
 TRIES = 4
 
-#: Maximum length of arguments of bytes whose field has no fixed size.
+#: Maximum length in bytes of an argument if its field has no fixed size.
 MAX_OCTETS = 16
-#: Maximum number of runs of frames in a stream, and length of the noise between two of them.
+#: Maximum number of runs of frames in a stream, and maximum length of the noise between two runs.
 MAX_RUNS = 6
 MAX_NOISE_BYTES = 16
-#: Number of packets in which a complete scan is searched: at first, and at most.
+#: Number of packets in which a complete scan is searched: at first, and the maximum.
 FIRST_PACKETS = 16
 MAX_PACKETS = 8192
-#: The scene of a scan: the maximum distance of a wall in metres, the maximum number of boxes, and
-#: of scans since power-on.
+#: Limits of a scan: distance of a wall in metres, number of boxes, number of scans since power-on.
 MAX_WALL_M = 6
 MAX_BOXES = 2
 MAX_SCANS = 3
@@ -110,8 +109,8 @@ def values(
 ) -> SearchStrategy[dict[str, Any]]:
     """Return a strategy for the values of valid frames, as plain dicts and lists.
 
-    They are what `Sensor.parse` returns for the frame and what `Sensor.build` takes: raw values of
-    all fields, with constants, counts and checksums.
+    `Sensor.parse` returns these values for the frame, and `Sensor.build` accepts them: raw values
+    of all fields, with constants, counts and checksums.
 
     Args:
         sensor: an id or a Sensor.
@@ -137,7 +136,7 @@ def _parsed_values(
 def commands(sensor: str | Sensor, name: str | None = None) -> SearchStrategy[Command]:
     """Return a strategy for commands with arguments within their ranges.
 
-    Each is a pair (name, arguments) for ``sensor.command(name, **arguments)`` and
+    Each value is a pair (name, arguments) for ``sensor.command(name, **arguments)`` and
     ``device.send(name, **arguments)``. Numbers are in the unit of their field.
 
     Args:
@@ -189,7 +188,7 @@ def _argument_values(slot: ArgumentSlot, kind: Taken) -> SearchStrategy[Any]:
 def _physical_values(
     draw: DrawFn, info: FieldInfo, raw: SearchStrategy[int], low: float, high: float
 ) -> float:
-    """Draw a raw value, and return it in the unit of its field."""
+    """Draw a raw value, and return the value in the unit of its field."""
     physical: float = info.physical(draw(raw))
     return min(max(physical, low), high)
 
@@ -202,16 +201,17 @@ def _addresses(draw: DrawFn, version: Literal[4, 6]) -> str:
 def streams(
     sensor: str | Sensor, *, noise: bool | SearchStrategy[bytes] = False
 ) -> SearchStrategy[Any]:
-    """Return a strategy for input that `Sensor.decode`, `split` and `scans` take.
+    """Return a strategy for input that `Sensor.decode`, `split` and `scans` accept.
 
     It consists of valid frames of all incoming types: bytes, or a list of datagrams if the sensor
-    sends datagrams. A frame that is only valid after another one follows it, and weak frames are
-    runs that are long enough. Without noise, every byte belongs to a frame.
+    sends datagrams. A frame that is only valid after another frame follows that frame, and weak
+    frames are in runs that are long enough to be accepted. Without noise, every byte belongs to a
+    frame.
 
     Args:
         sensor: an id or a Sensor.
         noise: True inserts random bytes and truncated frames, as datagrams if the sensor sends
-            datagrams. A strategy inserts its own bytes.
+            datagrams. A strategy inserts the bytes that it draws.
     """
     resolved = _resolve(sensor)
     runs = [_run(resolved, name) for name in resolved.incoming]
@@ -273,7 +273,7 @@ def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
 
 @functools.lru_cache(maxsize=64)
 def _packets_per_scan(sensor: Sensor) -> int:
-    """Return the number of packets from power-on to the end of the first complete scan."""
+    """Return the number of packets from power-on until the first complete scan ends."""
     count = FIRST_PACKETS
     while count <= MAX_PACKETS:
         packets = simulate(sensor, count)
@@ -304,7 +304,7 @@ def _scans(draw: DrawFn, sensor: Sensor, packets: int, lost: int) -> Scan:
 
 @st.composite
 def _boxes(draw: DrawFn) -> Box:
-    """Draw a box of up to a metre beside the sensor, in tenths of metres."""
+    """Draw a box of up to 1 m near the sensor; all lengths are multiples of 0.1 m."""
     low = [draw(st.integers(2, 10 * MAX_WALL_M)) / 10 for _ in range(2)]
     size = [draw(st.integers(1, 10)) / 10 for _ in range(2)]
     sides = [draw(st.sampled_from((1, -1))) for _ in range(2)]
@@ -316,7 +316,10 @@ def _boxes(draw: DrawFn) -> Box:
 
 
 def _delivery(sensor: Sensor, packets: list[bytes]) -> Any:
-    """Return data frames as the data link delivers them, after the frame that announces them."""
+    """Return data frames as the data link delivers them.
+
+    If data frames are only valid after another frame, that frame is the first.
+    """
     announced = [make_opening_frame(sensor), *packets]
     if sensor.datagrams:
         return [data for data in announced if data]
@@ -360,7 +363,7 @@ def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -
 
 @st.composite
 def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header:
-    """Draw the fields that the layout depends on, in the order in which it asks for them."""
+    """Draw the fields that the layout depends on, in the order of their use."""
     declared = sensor.frames[frame]
     header: dict[str, int] = {}
     asked = ""
@@ -375,7 +378,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
             else:
                 header[asked] = draw(_header_values(sensor, frame, info))
         except (TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
-            # The last value is at fault: with the values before it, the layout asked on.
+            # The last value is at fault: the values before it led to a further field.
             if not header.get(asked):
                 return draw(st.sampled_from(known_headers(sensor, frame)))
             header[asked] = int(header[asked] / 2)
@@ -400,7 +403,7 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
 
 
 def _element(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
-    """Return a strategy for the raw value of a field, or of one of its elements or bytes."""
+    """Return a strategy for the raw value of a field, of an element, or of a byte."""
     if info.path in fields:
         return fields[info.path]
     if info.kind == "float":
@@ -434,7 +437,10 @@ def _draw_leaf(draw: DrawFn, leaf: Leaf, element: SearchStrategy[Any]) -> NDArra
 
 
 def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[Any]:
-    """Draw the elements of an array; of a long one, a value that fills it and exceptions."""
+    """Draw the elements of an array.
+
+    A long array is filled with one value and has a few exceptions.
+    """
     if count <= MAX_SINGLE_DRAWS:
         return [draw_one() for _ in range(count)]
     drawn = [draw_one()] * count
@@ -494,7 +500,7 @@ class _DrawnNumbers(random.Random):
 
 @functools.lru_cache(maxsize=1024)
 def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
-    """Return a strategy for numbers that may be counts."""
+    """Return a strategy for numbers that may be counts: low numbers are more frequent."""
     ranges = [(max(low, 0), min(high, top)) for top in LOW_NUMBERS]
     return st.one_of(*(st.integers(*ends) for ends in ranges), st.integers(low, high))
 

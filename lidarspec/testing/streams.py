@@ -1,8 +1,8 @@
-"""Properties of a sensor's streams: no frame is lost, results repeat, scans keep their cuts.
+"""Properties of a sensor's streams: no lost frame, repeatable results, equal scans in batches.
 
-The frame types of a sensor may hide each other, and its functions (`plausible`, `points`, `clock`)
-may depend on more than the frame that they are given: on memory, on chance, or on the other packets
-of a batch. The engine itself is proved by lidarspec's own tests.
+A frame of one type may be mistaken for another type. The functions of a sensor (`plausible`,
+`points`, `clock`) may depend on more than their arguments: on memory, on chance, or on the other
+packets of a batch. The tests of lidarspec prove the engine itself.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from lidarspec.testing.cloud_assertions import assert_same_places, assert_well_f
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have
-#: points.
+#: Number of rounds of a conversation if a shorter conversation has no scan: few random frames of
+#: some sensors have points.
 MORE_ROUNDS = 12
-#: Packets that come at a time when scans are cut again.
+#: Numbers of packets that arrive at a time if scans are cut again.
 BATCH_SIZES = (1, 3)
 
 
 def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
-    """Check that frames back to back are found unchanged, with every byte."""
+    """Check that frames without gaps are found unchanged, and that no byte is left."""
     sent = subject.conversation()
     data = material.make_input(subject.sensor, sent)
     received = [(item.frame, item.data) for item in subject.sensor.split(data)]
@@ -43,7 +43,7 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
 
 
 def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> ViolationError:
-    """Return the violation for the first frame that is not found as it was sent."""
+    """Return the violation for the first frame that is lost or changed."""
     equal = 0
     for one, other in zip(sent, received, strict=False):
         if one != other:
@@ -61,7 +61,7 @@ def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> V
 def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
     """Check that decoding the same bytes twice gives the same points.
 
-    `points` is called for each run: the plan of a traced function would not call it again.
+    `points` is called in both runs: the plan of a traced function would not call it again.
     """
     data = material.make_input(subject.sensor, subject.conversation(rounds=1))
     one = evaluate_plainly(subject.sensor.decode(data).with_points).cloud

@@ -1,10 +1,10 @@
 """The valid values of the fields of one layout, for strategies that draw them field by field.
 
-Frames can break the conditions of a struct and the sensor's `plausible`. Both are functions that
-only accept or refuse a whole frame. So one valid frame is searched first, the *base*. Then each
-field is varied alone in it: the range of a field reaches from its base value to the first value
-that is refused, found by bisection. Values from these ranges mostly fit together. If they do not,
-`LayoutRanges.repair` takes as many of them as the base allows.
+Frames can violate the conditions of a struct and the sensor's `plausible`. Both are functions that
+accept or refuse a whole frame. Therefore one valid frame, the *base*, is searched first. Then each
+field is varied alone in the base: the range of a field extends from its base value to the first
+value that is refused, found by bisection. Values from these ranges are mostly valid together. If
+they are not, `LayoutRanges.repair` keeps as many of them as the base allows.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from lidarspec.framing.results import VALID
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: Number of tries to find a valid frame with a header, which may have none.
+#: Number of tries to find a valid frame with a given header; there may be none.
 TRIES = 5
-#: Raw values of a field, (1, ...) as its arrays are.
+#: Raw values of a field in one frame, (1, *shape of its arrays).
 Values = NDArray[Any]
-#: Maximum number of bytes of the frames that are tried at a time.
+#: Maximum total bytes of the frames that are tried at a time.
 BATCH_BYTES = 1 << 22
 
 
@@ -49,8 +49,8 @@ class LayoutRanges:
 
     Attributes:
         layout: the layout.
-        free: the fields to draw: those that the header, constants, lengths and checksums do not
-            decide.
+        free: the fields to draw: all fields that the header, constants, lengths and checksums do
+            not determine.
     """
 
     def __init__(
@@ -76,22 +76,24 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return the struct with these values, or with the closest ones that are valid.
+        """Return the struct with these values; values that are not valid are replaced.
+
+        Returns None if no valid struct has the values of the fixed fields.
 
         Args:
-            fixed: the fields that keep their values; None is returned if no struct has them.
+            fixed: the fields that keep their values.
         """
-        row = self._rows([values])
-        if self._valid(row)[0]:
+        row = self._make_rows([values])
+        if self._check_rows(row)[0]:
             return row.tobytes()
         kept = {path: value for path, value in values.items() if path in fixed}
-        if kept and not self._valid(self._rows([kept]))[0]:
-            others = self._with_base_of(kept)
+        if kept and not self._check_rows(self._make_rows([kept]))[0]:
+            others = self._rebase(kept)
             return None if others is None else others.make_struct(values, ())
-        return self._rows([self.repair(values, kept)]).tobytes()
+        return self._make_rows([self.repair(values, kept)]).tobytes()
 
-    def _with_base_of(self, values: Mapping[str, Values]) -> LayoutRanges | None:
-        """Return ranges whose base has these values, None if no valid struct is found."""
+    def _rebase(self, values: Mapping[str, Values]) -> LayoutRanges | None:
+        """Return ranges with a base that has these values; None if none is found."""
         fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
         for path, value in values.items():
             elements = itertools.cycle(value.flat)
@@ -104,25 +106,26 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and those of the others that are valid together with them.
+        """Return the fixed values, and all other values that are valid together with them.
 
-        The base has values for the rest. A field in an array keeps the elements that are valid.
+        Fields without a value in the result keep the value of the base. A field in an array keeps
+        its valid elements.
         """
         kept = dict(fixed)
         for leaf in self.free:
             path = leaf.info.path
             if path not in values or path in kept:
                 continue
-            if self._valid(self._rows([{**kept, path: values[path]}]))[0]:
+            if self._check_rows(self._make_rows([{**kept, path: values[path]}]))[0]:
                 kept[path] = values[path]
             elif leaf.shape:
                 mixed = self._mix(kept, leaf, values[path])
-                if self._valid(self._rows([{**kept, path: mixed}]))[0]:
+                if self._check_rows(self._make_rows([{**kept, path: mixed}]))[0]:
                     kept[path] = mixed
         return kept
 
     def _mix(self, kept: Mapping[str, Values], leaf: Leaf, values: Values) -> Values:
-        """Return the elements of an array that are valid one by one, the others as in the base."""
+        """Replace each element of an array that is not valid by the element of the base."""
         base = leaf.load(self._base)
         mixed = base.copy()
         tried = []
@@ -130,17 +133,17 @@ class LayoutRanges:
             one = base.copy()
             one.flat[index] = values.flat[index]
             tried.append({**kept, leaf.info.path: one})
-        for index, is_valid in enumerate(self._each_valid(tried)):
+        for index, is_valid in enumerate(self._iter_valid(tried)):
             if is_valid:
                 mixed.flat[index] = values.flat[index]
         return mixed
 
     @functools.cached_property
     def ranges(self) -> Mapping[str, tuple[int, int]]:
-        """The lowest and the highest raw value of each free field of integers or bytes, by path."""
+        """Path of each free field of integers or bytes -> its lowest and highest raw value."""
         if not self._has_rules:
             return {
-                leaf.info.path: _limits(leaf)
+                leaf.info.path: _find_limits(leaf)
                 for leaf in self.free
                 if leaf.info.kind in ("int", "bytes")
             }
@@ -149,8 +152,9 @@ class LayoutRanges:
             for leaf in self.free
             if leaf.info.kind in ("int", "bytes") and leaf.info.allowed is None
         ]
-        # A small value may only be valid beside other small ones, and a large one beside large
-        # ones, so that the base is varied as it was found and with small values.
+        # A small value may only be valid together with small values of other fields, and a large
+        # value with large values. Therefore two bases are varied: the found base, and a base with
+        # small values.
         ends = [self._find_ranges(bounded)]
         if self._shrink_base(bounded):
             ends.append(self._find_ranges(bounded))
@@ -163,23 +167,27 @@ class LayoutRanges:
     def _find_ranges(self, leaves: Sequence[Leaf]) -> dict[str, tuple[int, int]]:
         """Return the range of each field with the other fields as in the base."""
         starts = {leaf.info.path: int(leaf.load(self._base).flat[0]) for leaf in leaves}
-        lowest = {leaf.info.path: (starts[leaf.info.path], _limits(leaf)[0]) for leaf in leaves}
-        highest = {leaf.info.path: (starts[leaf.info.path], _limits(leaf)[1]) for leaf in leaves}
-        low = find_ends(lowest, self._take)
-        high = find_ends(highest, self._take)
+        lowest = {
+            leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[0]) for leaf in leaves
+        }
+        highest = {
+            leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[1]) for leaf in leaves
+        }
+        low = find_ends(lowest, self._accept)
+        high = find_ends(highest, self._accept)
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Bring each field of the base as close to 0 as possible; return whether any changed."""
+        """Bring each field of the base as near to 0 as possible; return if any changed."""
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
             start = int(leaf.load(self._base).flat[0])
-            found = find_ends({path: (start, 0)}, self._take)[path]
-            (is_valid,) = self._take([(path, found)])
+            found = find_ends({path: (start, 0)}, self._accept)[path]
+            (is_valid,) = self._accept([(path, found)])
             if is_valid:
                 values = np.broadcast_to(np.array(found, leaf.info.dtype), (1, *leaf.shape))
-                self._base = self._rows([{path: values}])
+                self._base = self._make_rows([{path: values}])
         return bool((self._base != before).any())
 
     @property
@@ -190,23 +198,23 @@ class LayoutRanges:
             declared.plausible is not None or declared.wire is not None or self.layout.conditions
         )
 
-    def _take(self, values: Sequence[tuple[str, int]]) -> list[bool]:
+    def _accept(self, values: Sequence[tuple[str, int]]) -> list[bool]:
         """Return for each (path, value) whether the base is valid with it in all elements."""
         tried = []
         for path, value in values:
             leaf = self.layout.leaves[path]
             full = np.broadcast_to(np.array(value, leaf.info.dtype), (1, *leaf.shape))
             tried.append({path: full})
-        return list(self._each_valid(tried))
+        return list(self._iter_valid(tried))
 
-    def _each_valid(self, tried: list[dict[str, Values]]) -> Iterator[bool]:
+    def _iter_valid(self, tried: list[dict[str, Values]]) -> Iterator[bool]:
         """Yield for each set of values whether the base is valid with it."""
         step = max(BATCH_BYTES // self.layout.size, 1)
         for start in range(0, len(tried), step):
-            yield from self._valid(self._rows(tried[start : start + step])).tolist()
+            yield from self._check_rows(self._make_rows(tried[start : start + step])).tolist()
 
-    def _rows(self, values: list[Any]) -> NDArray[np.uint8]:
-        """Return the base with each of these sets of values, one a row, with checksums."""
+    def _make_rows(self, values: list[Any]) -> NDArray[np.uint8]:
+        """Return copies of the base with these sets of values and checksums, (n, size)."""
         rows = np.repeat(self._base, len(values), 0)
         for index, own in enumerate(values):
             for path, raw in own.items():
@@ -216,7 +224,7 @@ class LayoutRanges:
         self.layout.seal(rows)
         return rows
 
-    def _valid(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def _check_rows(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Return for each row whether it is valid, (n,)."""
         return _are_valid(self._sensor, self._frame, self.layout, rows)
 
@@ -225,10 +233,10 @@ def find_ends(
     wanted: Mapping[str, tuple[int, int]],
     take: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
-    """Return the last valid value of each field on the way from a valid value to another one.
+    """Return the last valid value of each field on the way to a wanted value.
 
     Args:
-        wanted: path -> a valid value, and the end of the way.
+        wanted: path -> (valid value, wanted value).
         take: returns for each (path, value) whether it is valid.
     """
     valid = {path: start for path, (start, _) in wanted.items()}
@@ -254,12 +262,13 @@ def find_ends(
                 refused[path] = middle
 
 
-#: Number of random frames whose headers are known to be valid, or that are valid themselves.
+#: Number of random frames from which valid headers are collected, and of valid frames without
+#: layouts that are collected.
 KNOWN_HEADERS = 16
 KNOWN_FRAMES = 4
 #: Number of tries for each frame without layouts.
-WALKS = 300
-#: Number of frames without layouts of which one is valid if such frames are often valid.
+MAX_WALKS = 300
+#: Number of random frames without layouts that are tried to see if they are often valid.
 SINGLE_WALKS = 10
 
 
@@ -267,7 +276,7 @@ SINGLE_WALKS = 10
 def ranges_of(
     sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
 ) -> LayoutRanges | None:
-    """Return the ranges of the frames with a header; None if no valid one is found.
+    """Return the ranges of the frames with a header; None if no valid frame is found.
 
     Args:
         frame: a type with layouts and without parts.
@@ -294,7 +303,7 @@ def ranges_of(
 
 @functools.lru_cache(maxsize=1024)
 def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]]:
-    """Return the headers of a few random frames, each once, the shortest frame first.
+    """Return the distinct headers of a few random frames, the shortest frame first.
 
     Raises:
         SpecError: if no random frame is plausible.
@@ -328,7 +337,7 @@ def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
 def _are_valid(
     sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
-    """Return for each struct whether it is valid and can be written in the form of its type."""
+    """Return for each struct whether it is valid and has a wire form, (n,)."""
     mask = valid_mask(sensor, frame, layout, rows)
     declared = sensor.frames[frame]
     if declared.wire is not None:
@@ -340,17 +349,20 @@ def _are_valid(
 
 @functools.lru_cache(maxsize=1024)
 def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
-    """Return a few valid frames without layouts, the shortest one first; none if none is found."""
+    """Return a few valid frames without layouts, the shortest frame first.
+
+    Returns an empty list if none is found.
+    """
     found: set[bytes] = set()
     with contextlib.suppress(SpecError):
         for seed in range(KNOWN_FRAMES):
-            found.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=WALKS))
+            found.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=MAX_WALKS))
     return sorted(found, key=lambda data: (len(data), data))
 
 
 @functools.lru_cache(maxsize=1024)
 def is_often_valid(sensor: Sensor, frame: str) -> bool:
-    """Return whether some of a few random frames without layouts are valid."""
+    """Return whether any of a few random frames without layouts is valid."""
     return any(_is_walk_valid(sensor, frame, seed) for seed in range(SINGLE_WALKS))
 
 
@@ -364,10 +376,10 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
-    """Return the lowest and the highest raw value of integer fields of a frame without layouts.
+    """Return the lowest and highest raw value of integer fields, without layouts.
 
-    They are found by changing one valid frame. Fields that decide what follows, such as counts,
-    are left out, and fields that can have no other value in that frame.
+    They are found by changing one valid frame. Fields that decide the following fields, such as
+    counts, and fields that have only one valid value in that frame are omitted.
     """
     if sensor.frames[frame].plausible is None:
         return {}
@@ -385,51 +397,51 @@ def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]
         and info.const is None
         and info.rebuilt is None
         and path not in deciding
-        and (values := list(_values_at(base, path.split("."))))
+        and (values := list(_iter_values_at(base, path.split("."))))
     }
 
     def take(tried: Sequence[tuple[str, int]]) -> list[bool]:
-        return [_builds(sensor, frame, _with_value(base, path, value)) for path, value in tried]
+        return [_can_build(sensor, frame, _with_value(base, path, value)) for path, value in tried]
 
     low = find_ends({path: (raw, info.limits[0]) for path, (info, raw) in bounded.items()}, take)
     high = find_ends({path: (raw, info.limits[1]) for path, (info, raw) in bounded.items()}, take)
     return {path: (low[path], high[path]) for path in bounded if low[path] < high[path]}
 
 
-def _values_at(parsed: Any, names: Sequence[str]) -> Iterator[int]:
+def _iter_values_at(parsed: Any, names: Sequence[str]) -> Iterator[int]:
     """Yield the integers of a field of a parsed frame, in all elements of its arrays."""
     if isinstance(parsed, list):
         for element in parsed:
-            yield from _values_at(element, names)
+            yield from _iter_values_at(element, names)
     elif names and isinstance(parsed, dict):
-        yield from _values_at(parsed.get(names[0]), names[1:])
+        yield from _iter_values_at(parsed.get(names[0]), names[1:])
     elif not names and isinstance(parsed, int | str):
         yield int(parsed)
 
 
 def _with_value(parsed: Any, path: str, value: int) -> Any:
-    """Return a copy of a parsed frame with another value of a field, in all elements."""
+    """Return a copy of a parsed frame with a value in all elements of a field."""
     changed = copy.deepcopy(parsed)
     *parents, name = path.split(".")
-    for holder in _holders(changed, parents):
+    for holder in _iter_holders(changed, parents):
         if name in holder:
             is_array = isinstance(holder[name], list)
             holder[name] = [value] * len(holder[name]) if is_array else value
     return changed
 
 
-def _holders(parsed: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _iter_holders(parsed: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield the mappings at a path of a parsed frame."""
     if isinstance(parsed, list):
         for element in parsed:
-            yield from _holders(element, names)
+            yield from _iter_holders(element, names)
     elif isinstance(parsed, dict) and names:
-        yield from _holders(parsed.get(names[0]), names[1:])
+        yield from _iter_holders(parsed.get(names[0]), names[1:])
     elif isinstance(parsed, dict):
         yield parsed
 
 
-def _builds(sensor: Sensor, frame: str, values: Any) -> bool:
+def _can_build(sensor: Sensor, frame: str, values: Any) -> bool:
     """Return whether values build a valid frame."""
     try:
         data = build(sensor, frame, values, {})
@@ -440,7 +452,7 @@ def _builds(sensor: Sensor, frame: str, values: Any) -> bool:
     return bool(status[0] == VALID)
 
 
-def _limits(leaf: Leaf) -> tuple[int, int]:
+def _find_limits(leaf: Leaf) -> tuple[int, int]:
     if leaf.info.kind == "bytes":
         return 0, 255
     return leaf.info.limits

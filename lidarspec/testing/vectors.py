@@ -7,10 +7,10 @@
 
 `values` are raw integers, `units` physical values in the fields' units, `points` columns of single
 points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further column). All
-three may be omitted: then the bytes have to be such a frame, and to be built again. `sensor` is the
-id, or a list of ids, of the sensors of an entry; it may be omitted if the file belongs to one
-sensor alone. An entry with `command` is the frame of a command with `args`, by name in units;
-`reply` is its reply.
+three may be omitted: then the bytes must be a frame of this type, and building the parsed values
+must give the same bytes. `sensor` is the id, or a list of ids, of the sensors of an entry; it may
+be omitted if the file belongs to one sensor alone. An entry with `command` is the frame of a
+command with `args`, by name in units; `reply` is its reply.
 
 Gaps in the vectors are checked as well: a status without vectors, and data fields without a value.
 """
@@ -36,25 +36,25 @@ from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.sensor_under_test import SHORT, SensorUnderTest, seals
+from lidarspec.testing.sensor_under_test import MAX_SHORT_BYTES, SensorUnderTest, seals
 from lidarspec.transports.hex_text import parse_hex
 from lidarspec.trusted_files import read_document
 
-#: Tolerance of points in metres and radians, as manuals print them.
-NEAR = 2e-4
-#: Number of examples with layouts to search for checksums.
+#: Tolerance of points in metres and radians: manuals print rounded values.
+POINT_TOLERANCE = 2e-4
+#: Number of examples with layouts that are searched for fields with checksums.
 LAYOUT_EXAMPLES = 8
-#: Names of fields that hold a checksum.
-CHECK = re.compile(
+#: Pattern of the names of fields that store a checksum.
+CHECKSUM_NAMES = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
 )
 #: Beginning of the remark on a checksum that cannot be checked, because it is not documented.
 NOT_CHECKED = "not checked"
-#: Bits of evidence above which a field of any other name must be a checksum: one of 4096 wrong
-#: guesses reaches it.
-PROVEN = 12
-#: Names of fields without a meaning, for which no vector is needed.
-IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
+#: Bits of evidence from which a field with any name must be a checksum: one of 4096 wrong guesses
+#: reaches this limit.
+PROOF_BITS = 12
+#: Pattern of the names of fields without a meaning, which need no vector.
+SPARE_NAMES = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 #: A number larger than any field.
 _HUGE = 1 << 65
 
@@ -99,10 +99,10 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
-    """Check that each golden vector has its values, its points, and is built again.
+    """Check that each golden vector has its values and points, and can be built again.
 
     Args:
-        only: the key of one vector; by default all are checked, up to the first failure.
+        only: the key of one vector; by default all vectors are checked, up to the first failure.
     """
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
@@ -113,7 +113,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
         data = parse_hex(vector["hex"])
         name = vector["frame"]
         parsed = _parse_vector(subject, name, data, place)
-        _values(subject, name, data, parsed, vector, place)
+        _compare_values(subject, name, data, parsed, vector, place)
         require(
             subject.sensor.build(name, parsed) == data,
             "LS302",
@@ -134,7 +134,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
                 f"{place} {vector['command']}",
             )
         if vector.get("points"):
-            _points(subject, name, data, vector["points"], place)
+            _compare_points(subject, name, data, vector["points"], place)
 
 
 def lacking(subject: SensorUnderTest) -> str:
@@ -164,9 +164,10 @@ def places(subject: SensorUnderTest) -> list[str]:
 
 
 def the_status_is_proven(subject: SensorUnderTest) -> None:
-    """Check that a sensor with the status "vectors" has some.
+    """Check that a sensor with the status "vectors" has golden vectors.
 
-    A capture may be too large, or not ours to publish: the `source` of the sensor names it.
+    A capture may be too large, or its license may not allow publication: then the `source` of the
+    sensor names it.
     """
     missing = lacking(subject)
     status = subject.sensor.status
@@ -174,7 +175,7 @@ def the_status_is_proven(subject: SensorUnderTest) -> None:
 
 
 def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:
-    """Check that each field of a data frame with vectors has a nonzero value in one."""
+    """Check that each field of a data frame has a nonzero value in a vector, if any."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     if not vectors:
         return
@@ -191,7 +192,9 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
         if info.const is None and info.kind in ("int", "float")
     ]
     required = [
-        path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])
+        path
+        for path in free
+        if path not in sealing and not SPARE_NAMES.search(path.rpartition(".")[2])
     ]
     problems = {"no vector has a value of": [path for path in required if path not in pinned]}
     problems["all vectors have 0 for"] = [path for path in required if pinned.get(path) is False]
@@ -200,7 +203,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
 
 
 def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
-    """Check that the vectors place points in two quadrants and within the range."""
+    """Check that the vectors have points in two quadrants and within the range."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     placed = [
         point
@@ -227,7 +230,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     assert subject.sensor.range_limits is not None  # as of every sensor with points
     far = subject.sensor.range_limits[1]
     require(
-        not len(ranges) or ranges.max() <= far * (1 + NEAR),
+        not len(ranges) or ranges.max() <= far * (1 + POINT_TOLERANCE),
         "LS713",
         f"{ranges.max(initial=0):.4g} m, but range_limits end at {far:g} m",
         name,
@@ -242,8 +245,8 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     """Check that no field outside a `Checksummed` is a checksum.
 
-    A checksum is recognised by its name, or by a search over the vectors. A field may have a remark
-    that it is not checked, unless the search finds its algorithm.
+    A checksum is recognized by its name, or by a search in the vectors. A field with a remark that
+    it is not checked is accepted, unless the search finds its algorithm.
     """
     sealing = _sealing_fields(subject, name)
     free = [
@@ -252,7 +255,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
         if info.const is None and path not in sealing
     ]
     fields = subject.fields(name)
-    named = [path for path in free if CHECK.fullmatch(fields[path].name)]
+    named = [path for path in free if CHECKSUM_NAMES.fullmatch(fields[path].name)]
     try:
         frames = [
             parse_hex(vector["hex"])
@@ -264,10 +267,10 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     is_told = isinstance(
         get_codec(subject.sensor.frames[name]), CompiledCodec
     )  # otherwise the offset of a checksum has no field
-    for match in _common(frames) if is_told and not sealing else []:
-        path = _standing(subject, name, match, frames[0])
-        if path in (named or free) and (named or match.evidence_bits >= PROVEN):
-            fits = f"{_in_words(match, len(frames[0]))} fits every vector"
+    for match in _find_common_matches(frames) if is_told and not sealing else []:
+        path = _find_checksum_field(subject, name, match, frames[0])
+        if path in (named or free) and (named or match.evidence_bits >= PROOF_BITS):
+            fits = f"{_describe_match(match, len(frames[0]))} fits every vector"
             raise ViolationError(
                 "LS212", f"{fits}, but no Checksummed verifies it", f"{name}.{path}"
             )
@@ -281,7 +284,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
 
 
 def _sealing_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields that hold a checksum in any of several examples.
+    """Return the fields that store a checksum in any of several examples.
 
     A header may remove a part together with its checksum.
     """
@@ -295,13 +298,13 @@ def _sealing_fields(subject: SensorUnderTest, name: str) -> set[str]:
     )
 
 
-def _fitting(
+def _find_matches(
     subject: SensorUnderTest, name: str, path: str, frames: list[bytes], frame: bytes
 ) -> list[ChecksumMatch]:
     """Return the checksums that match frames and lie in the field at `path`.
 
-    If some are of the library, those that need a class of their own are left out: they match only
-    because these do.
+    If a checksum of the library matches, checksums that need a new class are omitted: they match
+    only because the other matches.
     """
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
@@ -313,13 +316,13 @@ def _fitting(
     else:
         leaf = None
 
-    def stands(place: ChecksumPlace) -> bool:
+    def is_in_field(place: ChecksumPlace) -> bool:
         return leaf is None or (place.start(len(frame)), 8 * place.size) == (
             leaf.offset,
             leaf.info.bits,
         )
 
-    matches = search(frames, is_possible_place=stands)
+    matches = search(frames, is_possible_place=is_in_field)
     return [match for match in matches if not _needs_class(match)] or matches
 
 
@@ -327,7 +330,7 @@ def _needs_class(match: ChecksumMatch) -> bool:
     return needs_class(match.algorithm)
 
 
-def _in_words(match: ChecksumMatch, length: int) -> str:
+def _describe_match(match: ChecksumMatch, length: int) -> str:
     """Describe a checksum, its coverage, and the byte order of its field."""
     if match.place.size > 1:
         order = f", in a field that is {match.order}-endian,"
@@ -340,12 +343,12 @@ def _in_words(match: ChecksumMatch, length: int) -> str:
     return f"{algorithm} over {match.span.describe(match.place, length)}{order}"
 
 
-def _common(frames: list[bytes]) -> list[ChecksumMatch]:
+def _find_common_matches(frames: list[bytes]) -> list[ChecksumMatch]:
     """Return the checksums that match all frames.
 
-    Long frames are searched one by one, at the usual offsets only.
+    Long frames are searched separately, at the usual offsets only.
     """
-    if max(map(len, frames), default=0) <= SHORT:
+    if max(map(len, frames), default=0) <= MAX_SHORT_BYTES:
         return search(frames)
     first, *others = [
         {(match.source, match.place, match.span): match for match in search([frame])}
@@ -358,8 +361,10 @@ def _common(frames: list[bytes]) -> list[ChecksumMatch]:
     ]
 
 
-def _standing(subject: SensorUnderTest, name: str, match: ChecksumMatch, frame: bytes) -> str:
-    """Return the field that holds a checksum; "" if it cannot be determined."""
+def _find_checksum_field(
+    subject: SensorUnderTest, name: str, match: ChecksumMatch, frame: bytes
+) -> str:
+    """Return the field that stores a checksum; "" if it cannot be determined."""
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         layout = engine.tree.layout(frame)
@@ -426,7 +431,7 @@ def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
     for key, value in vector.items():
         expected, fits = KEYS[key]
         require(fits(value), "LS702", f"{key}: expected {expected}, got {shown(value)}", place)
-    if not _is_of(subject, vector, place):
+    if not _belongs_to(subject, vector, place):
         return False
     if "command" in vector:
         command = subject.sensor.commands.get(vector["command"])
@@ -447,11 +452,12 @@ def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
     return True
 
 
-def _is_of(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> bool:
+def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> bool:
     """Return whether an entry belongs to the sensor.
 
     Raises:
-        Violation: if it names no sensor of several, or an unknown one.
+        Violation: if several sensors share the file and the entry names none, or if it names an
+            unknown sensor.
     """
     named = vector.get("sensor", [])
     family = subject.family
@@ -472,7 +478,11 @@ def _is_of(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> b
 
 
 def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) -> Any:
-    """Return the parsed vector; a wrong checksum is reported with those that match."""
+    """Return the parsed vector.
+
+    Raises:
+        Violation: if it cannot be parsed; for a wrong checksum, with the checksums that match.
+    """
     try:
         return subject.sensor.parse(data, frame=name)
     except WireError as error:
@@ -480,8 +490,8 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) 
             raise ViolationError("LS707", error.reason, f"{place} {name}.{error.path}") from error
         same = [parse_hex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [
-            _in_words(match, len(data))
-            for match in _fitting(subject, name, error.path, same, data)[:2]
+            _describe_match(match, len(data))
+            for match in _find_matches(subject, name, error.path, same, data)[:2]
         ]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise ViolationError(
@@ -491,7 +501,7 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) 
         raise ViolationError("LS707", str(error), f"{place} {name}") from error
 
 
-def _values(
+def _compare_values(
     subject: SensorUnderTest,
     name: str,
     data: bytes,
@@ -532,14 +542,14 @@ def _values(
         else:
             expected = value
         raise ViolationError(
-            _reading(info, raw, expected),
+            _find_value_rule(info, raw, expected),
             f"parsed {plain}, expected {value}",
             f"{place} {name}.{path}",
         )
 
 
-def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
-    """Return the rule of a wrong integer: byte order, sign, or another value."""
+def _find_value_rule(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
+    """Return the rule that a wrong integer violates: byte order, sign, or value."""
     if info is None or info.kind != "int" or not isinstance(wanted, int) or not info.bits:
         return "LS706"
     top = 1 << info.bits
@@ -552,7 +562,7 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
     return "LS706"
 
 
-def _points(
+def _compare_points(
     subject: SensorUnderTest,
     name: str,
     data: bytes,
@@ -582,10 +592,11 @@ def _points(
         wrong = [
             column
             for column, value in columns.items()
-            if not np.isclose(got[column], value, rtol=NEAR, atol=NEAR)
+            if not np.isclose(got[column], value, rtol=POINT_TOLERANCE, atol=POINT_TOLERANCE)
         ]
         mirrored = all(
-            column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR)
+            column in ("y", "azimuth")
+            and np.isclose(got[column], -columns[column], atol=POINT_TOLERANCE)
             for column in wrong
         )
         message = ", ".join(

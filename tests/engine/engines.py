@@ -55,7 +55,7 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
     subject = SensorUnderTest(sensor)
     for name in sensor.incoming:
         frame = sensor.frames[name]
-        if frame.max_length > material.SHORT or not is_compiled(frame):
+        if frame.max_length > material.MAX_SHORT_BYTES or not is_compiled(frame):
             continue
         fields = get_codec(frame).schema.fields
         source = subject.source(f"edges {name}")

@@ -202,7 +202,7 @@ def test_work_with_a_long_frame_is_limited_in_bytes(
         assert surveyed <= 3 * FLIPPED_BYTES + 8 * LONG
         return survey(self, data, *rest)
 
-    monkeypatch.setattr(frames, "FLIPPED_BYTES", FLIPPED_BYTES, raising=False)
+    monkeypatch.setattr(frames, "MAX_FLIPPED_BYTES", FLIPPED_BYTES, raising=False)
     monkeypatch.setattr(Sensor, "parse", counting_parse)
     monkeypatch.setattr(CompiledCodec, "survey", counting_survey)
     check.function(SensorUnderTest(sensor), "picture")
