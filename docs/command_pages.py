@@ -21,7 +21,7 @@ from pathlib import Path
 import click
 
 from lidarspec import __version__
-from lidarspec.cli.root import SPOKEN, VERBS, main as root
+from lidarspec.cli.root import COMMON_OPTIONS, VERBS, main as root
 
 DOCS = Path(__file__).parent
 PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
@@ -64,7 +64,7 @@ def options(verb: str) -> list[tuple[str, str]]:
     own = (
         param
         for param in context(verb).command.params
-        if isinstance(param, click.Option) and param not in SPOKEN
+        if isinstance(param, click.Option) and param not in COMMON_OPTIONS
     )
     records = (param.get_help_record(context(verb)) for param in own)
     return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]

@@ -10,7 +10,7 @@ the next command. Modules in reading order:
   failures as one message and an exit code.
 * `listing`: the lines of an explanation, in colours.
 * `sensors`, `frames`, `build`: the installed sensors, the fields of a frame, a frame from values.
-* `read`, `view`: a live sensor as rows, figures or a picture.
+* `read`, `view`: a live sensor as rows, statistics or a picture.
 * `recordings`: record a source into a file, and replay it.
 * `convert`, `info`, `plot`: convert files, describe their contents, draw them.
 * `sim`: a simulated sensor on a port or in a file.

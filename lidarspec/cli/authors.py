@@ -31,7 +31,7 @@ from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
 #: Maximum number of bytes of a capture that are analysed.
-MOST = 1 << 22
+MAX_CAPTURE_BYTES = 1 << 22
 
 
 @click.command()
@@ -115,7 +115,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:
-        for chunk in read_beginning(opened, MOST):
+        for chunk in read_beginning(opened, MAX_CAPTURE_BYTES):
             groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(
                 chunk
             )

@@ -28,9 +28,9 @@ from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 
-#: Timeout for the reply to bytes of --hex, and the silence that ends it, in seconds.
-ANSWERED = 1.0
-QUIET = 0.2
+#: Timeout for the reply to the bytes of --hex, and the silence that ends the reply, in seconds.
+REPLY_TIMEOUT_S = 1.0
+REPLY_SILENCE_S = 0.2
 
 
 @click.command()
@@ -117,15 +117,15 @@ def send(
     """
     if (command is None) == (digits is None):
         raise UsageError("send requires either the name of a command, or bytes: --hex 'a5 50'")
-    data = b"" if digits is None else _bytes(digits)
+    data = b"" if digits is None else _parse_hex(digits)
     answer = _AnswerLog()
     record = (lambda _: answer) if digits is not None and is_live(source) else None
     with open_device(source, sensor_id, start=False, record=record) as device:
         device.leave_on()
         if command is None:
-            _write(device, source, data, answer, timeout, as_json=as_json, output=output)
+            _write_bytes(device, source, data, answer, timeout, as_json=as_json, output=output)
             return
-        reply = _send(device, source, command, assignments, timeout)
+        reply = _send_command(device, source, command, assignments, timeout)
         sensor = device.sensor
     if as_json:
         emit_json(_reply_to_dict(sensor, reply), output)
@@ -138,7 +138,7 @@ def send(
         emit(f"{sensor.id} {reply.command}: {result}{shown}", output)
 
 
-def _bytes(digits: str) -> bytes:
+def _parse_hex(digits: str) -> bytes:
     try:
         return parse_hex(digits)
     except ValueError as error:
@@ -158,7 +158,7 @@ class _AnswerLog:
             self.chunks.append(chunk)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Ignore events: lost data is missing in the answer."""
+        """Ignore events."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -166,7 +166,7 @@ class _AnswerLog:
     def after(self, number: int, seconds: float) -> list[Chunk]:
         """Return the chunks from index `number` on.
 
-        Waits until nothing has arrived for `QUIET` seconds, at most `seconds`.
+        Waits until nothing has arrived for `REPLY_SILENCE_S` seconds, at most `seconds`.
         """
         end = time.monotonic() + seconds
         count = number
@@ -174,12 +174,12 @@ class _AnswerLog:
         while (now := time.monotonic()) < min(end, quiet):
             if len(self.chunks) > count:
                 count = len(self.chunks)
-                quiet = now + QUIET
-            time.sleep(QUIET / 10)
+                quiet = now + REPLY_SILENCE_S
+            time.sleep(REPLY_SILENCE_S / 10)
         return self.chunks[number:]
 
 
-def _write(
+def _write_bytes(
     device: Device,
     source: str,
     data: bytes,
@@ -189,13 +189,13 @@ def _write(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Send bytes, and explain the reply; data frames are only counted."""
+    """Send bytes, and print an explanation of the reply; data frames are only counted."""
     _refuse_file(device, source)
     sensor = device.sensor
     before = len(answer.chunks)
     device.write(data)
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
-    chunks = answer.after(before, ANSWERED if timeout is None else timeout)
+    chunks = answer.after(before, REPLY_TIMEOUT_S if timeout is None else timeout)
     if chunks:
         pieces = list(iter_pieces(sensor, chunks, datagrams=sensor.datagrams))
     else:
@@ -203,7 +203,7 @@ def _write(
     rest = [piece for piece in pieces if piece.frame not in sensor.data_frames]
     if len(rest) < len(
         pieces
-    ):  # data frames continue: the incomplete pieces at both ends belong to them
+    ):  # other data frames: the incomplete pieces at both ends are parts of data frames
         note(f"{len(pieces) - len(rest)} data frames received meanwhile")
         rest = [piece for piece in rest if piece.is_valid or piece not in (pieces[0], pieces[-1])]
     parts = [
@@ -221,7 +221,7 @@ def _write(
         note("no reply received")
 
 
-def _send(
+def _send_command(
     device: Device, source: str, command: str, assignments: Sequence[str], timeout: float | None
 ) -> Reply:
     sensor = device.sensor

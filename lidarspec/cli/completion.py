@@ -89,7 +89,10 @@ def attach(command: click.Command) -> None:
 def _complete_word(
     list_names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
 ) -> list[CompletionItem]:
-    """Return the possible values that begin with a word, or let the shell complete files."""
+    """Return the possible values that begin with a word.
+
+    If files are possible and no value begins with the word, the shell completes files.
+    """
     items = [
         CompletionItem(name)
         for name in list_names(ctx, incomplete)

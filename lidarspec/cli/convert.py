@@ -53,7 +53,7 @@ _PACKET_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
 
 @dataclass
 class _Counts:
-    """The number of scans and points that were written, also shown as progress."""
+    """The numbers of written scans and points, which are also shown as progress."""
 
     device: Device
     target: str
@@ -68,7 +68,7 @@ class _Counts:
     def count(
         self, scans: Iterable[Scan], progress: Progress, *, every_point: bool
     ) -> Iterator[Scan]:
-        """Yield the scans, and count them."""
+        """Yield the scans, count them, and show the progress."""
         for scan in scans:
             self.scans += 1
             self.units = self.units or scan.points.units
@@ -246,7 +246,7 @@ def convert(
 
 
 def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
-    """Write IMU samples; return the facts for the summary."""
+    """Write IMU samples; return the entries of the summary."""
     samples = join_samples(list(device.imu()))[:count]
     if not len(samples):
         raise _no_data_error(device, target)
@@ -256,11 +256,14 @@ def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]
 
 
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
-    """Return the frame types to write: the requested one, else all of a device without points.
+    """Return the frame types to write.
+
+    These are the requested frame type, or all frame types of a device without points.
+
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
-        UsageError: if the file holds one type only, and none is requested.
+        UsageError: if the format allows a single frame type, and no type is requested.
     """
     sensor = device.sensor
     known = sensor.incoming
@@ -284,7 +287,7 @@ def _write_frames(
     selection: Selection,
     count: int | None,
 ) -> dict[str, Any]:
-    """Write the fields of frames; return the facts for the summary."""
+    """Write the fields of frames; return the entries of the summary."""
     batches = _select_frames(device, frames, selection, count)
     first = next(batches, None)
     if first is None:
@@ -297,7 +300,7 @@ def _write_frames(
 def _select_frames(
     device: Device, frames: Sequence[str], selection: Selection, count: int | None
 ) -> Iterator[dict[str, Packets]]:
-    """Yield the selected frames in batches, none of them empty."""
+    """Yield the selected frames in batches; empty batches are omitted."""
     slices = {frame: TimeSlice(selection.times) for frame in frames}
     left = math.inf if count is None else count
     for arrived in device.packets_by_frame(frames):
@@ -318,7 +321,7 @@ def _select_frames(
 def _write_packets(
     source: str, target: str, sensor_id: str | Sensor | None, times: Times, *, as_json: bool
 ) -> None:
-    """Write packets as they were received."""
+    """Write packets as they were received, and print a summary."""
     if is_live(source):
         raise suggest(
             UsageError(f"{source} is not a file"),
@@ -341,7 +344,7 @@ def _write_packets(
                     file.wait_for_room()
                     file.write(chunk)
                     progress(lambda: f"{target}: {file.records} packets", opened.progress)
-        except WriteError as error:  # its text names the temporary file
+        except WriteError as error:  # its message names the temporary file
             raise WriteError(target, error.reason, "nothing was written") from None
         if not file.records:
             raise suggest(
@@ -363,7 +366,7 @@ def _write_points(
     organized: bool,
     with_packets: bool,
 ) -> dict[str, Any]:
-    """Write the points of scans; return the facts for the summary."""
+    """Write the points of scans; return the entries of the summary."""
     counts = _Counts(device, target)
     with (
         Progress(size) as progress,
@@ -385,7 +388,7 @@ def _write_points(
 
 @contextlib.contextmanager
 def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
-    """Open a file a second time for its packets; yield None if they are not wanted."""
+    """Open a file a second time for its packets; yield None if `wanted` is false."""
     if not wanted:
         yield None
         return
@@ -402,7 +405,7 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
 def _follow_batch(
     records: Iterable[tuple[batch.Record, bool]], folder: str, file_count: int, *, as_json: bool
 ) -> None:
-    """Report the progress and the result of a batch; exit with 1 if a piece has failed."""
+    """Print the progress and the result of a batch; exit with 1 if a piece failed."""
     totals: Counter[str] = Counter()
     failed: list[batch.Record] = []
     done_before = 0
@@ -437,7 +440,7 @@ def _follow_batch(
 
 
 def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -> str:
-    # The number of pieces is only of interest if a file was cut.
+    # The number of pieces is only printed if a file was cut.
     names = [name for name in totals if name != "pieces" or totals[name] > totals["files"]]
     parts = [", ".join(f"{totals[name]} {name}" for name in names) or "nothing"]
     if done_before:
@@ -460,7 +463,7 @@ def _detect_sensor(source: str, target: str) -> Sensor:
 def _no_data_error(device: Device, target: str) -> Exception:
     """Return the error that explains why a file gave no data.
 
-    It is empty, damaged, from another sensor, or from no lidar at all.
+    The file is empty or damaged, or its data is from another sensor or not from a lidar.
     """
     sensor = device.sensor
     stats = device.stats

@@ -55,13 +55,13 @@ def report(error: Exception, verb: str) -> int:
         note(f"a bug in lidarspec: {type(error).__name__}: {error}")
         note("  next: repeat with LIDARSPEC_DEBUG=1, and report the output")
         return code
-    message = _message(error)
+    message = _format_message(error)
     note(message)
     if _lacks_sensors(error):
         note(f"  {no_sensors_text()}")
         return code
     if not errors.suggestion(error):
-        errors.suggest(error, _following(error, command, verb))
+        errors.suggest(error, _find_next_command(error, command, verb))
     for remark in error.__notes__:
         note(f"  {remark}")
     return code
@@ -82,7 +82,7 @@ def _lacks_sensors(error: Exception) -> bool:
     return not sensors()
 
 
-def _message(error: Exception) -> str:
+def _format_message(error: Exception) -> str:
     if isinstance(error, click.ClickException):
         return error.format_message()
     if isinstance(error, OSError) and error.filename is not None:
@@ -94,7 +94,7 @@ def _message(error: Exception) -> str:
     return str(error)
 
 
-def _following(error: Exception, command: str, verb: str) -> str:
+def _find_next_command(error: Exception, command: str, verb: str) -> str:
     """Return the next command.
 
     For an unknown sensor it is `lidarspec plugins` if a plugin fails to load, as that plugin may

@@ -53,13 +53,13 @@ from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, lis
 from lidarspec.transports.protocol import no_bytes
 
 #: Bits of evidence below which a match may be chance.
-WEAK = 12
+WEAK_BITS = 12
 #: Maximum number of matches to print.
-PRINTED = 4
+MAX_PRINTED_MATCHES = 4
 HEX = (".hex", ".txt")
-LONGEST = 1 << 16
+MAX_DATAGRAM_BYTES = 1 << 16
 #: Maximum number of checksums to print for unknown bytes.
-TOLD = 2
+MAX_PRINTED_CHECKSUMS = 2
 
 
 @click.command()
@@ -71,15 +71,16 @@ def ports(as_json: bool, output: str | None) -> None:
     if as_json:
         listed = [{**vars(port), "users": [vars(user) for user in port.users]} for port in serial]
         emit_json(
-            {"serial": listed, "udp": [_udp(port, users) for port, users in udp.items()]}, output
+            {"serial": listed, "udp": [_udp_to_dict(port, users) for port, users in udp.items()]},
+            output,
         )
         return
     rows = [
-        [port.path, port.description or "serial port", _state(port), port.lasting]
+        [port.path, port.description or "serial port", _describe_port(port), port.lasting]
         for port in serial
     ]
     rows += [
-        [f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""]
+        [f"udp://:{port}", ", ".join(_find_senders(port)), _describe_udp_port(users), ""]
         for port, users in udp.items()
     ]
     emit(table(["port", "description", "state", "stable name"], rows, output), output)
@@ -92,7 +93,7 @@ def ports(as_json: bool, output: str | None) -> None:
     )
 
 
-def _senders(port: int) -> list[str]:
+def _find_senders(port: int) -> list[str]:
     """Return the installed sensors that send data to a UDP port."""
     return [
         sensor.id
@@ -101,7 +102,7 @@ def _senders(port: int) -> list[str]:
     ]
 
 
-def _state(port: SerialPort) -> str:
+def _describe_port(port: SerialPort) -> str:
     if not port.allowed:
         return "no permission: lidarspec doctor"
     if port.users:
@@ -109,16 +110,16 @@ def _state(port: SerialPort) -> str:
     return "free"
 
 
-def _udp_state(users: tuple[PortUser, ...] | None) -> str:
+def _describe_udp_port(users: tuple[PortUser, ...] | None) -> str:
     if users is None:
         return "free"
     return f"in use by {', '.join(map(str, users)) or 'another user'}"
 
 
-def _udp(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any]:
+def _udp_to_dict(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any]:
     return {
         "port": port,
-        "sensors": _senders(port),
+        "sensors": _find_senders(port),
         "free": users is None,
         "users": [vars(user) for user in users or ()],
     }
@@ -150,7 +151,7 @@ def crc(
     their length with --period. More frames give a more certain result; a dozen is enough. Only the
     beginning of a long file is read.
     """
-    frames = _frames(words, period, offset)
+    frames = _parse_frames(words, period, offset)
     matches = search(frames)
     if as_json:
         emit_json(
@@ -158,9 +159,9 @@ def crc(
         )
     elif matches:
         shown = [match for match in matches if match.is_ambiguous == matches[0].is_ambiguous][
-            :PRINTED
+            :MAX_PRINTED_MATCHES
         ]
-        emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
+        emit("\n\n".join(_describe_match(match, len(frames[0])) for match in shown), output)
     if not matches:
         note(
             f"no checksum found in {len(frames)} frame{'s' * (len(frames) != 1)}: check that each"
@@ -168,11 +169,11 @@ def crc(
             " complete and begins at its first byte"
         )
         raise click.exceptions.Exit(FINDINGS)
-    if matches[0].evidence_bits < WEAK:
+    if matches[0].evidence_bits < WEAK_BITS:
         note("the match may be chance: give more frames")
 
 
-def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
+def _parse_frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
     if len(words) == 1 and (words[0] == "-" or os.path.exists(words[0])):
         return _read_frames(words[0], period, offset)
     whole = read(words).data
@@ -196,7 +197,9 @@ def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     else:
         sample_bytes = read([path])
         chunks = tuple(chunk for chunk in sample_bytes.chunks if chunk)
-        datagrams = path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < LONGEST
+        datagrams = (
+            path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < MAX_DATAGRAM_BYTES
+        )
     if period is not None:
         return split_frames(b"".join(chunks), period, offset)
     if datagrams and path.endswith(HEX):
@@ -230,13 +233,13 @@ def match_to_dict(match: ChecksumMatch) -> dict[str, Any]:
     }
 
 
-def _text(match: ChecksumMatch, length: int) -> str:
+def _describe_match(match: ChecksumMatch, length: int) -> str:
     if match.place.size > 1:
         order = f", {match.order}-endian"
     else:
         order = ""
     name = f" ({match.name})" if match.name else ""
-    if match.evidence_bits >= WEAK:
+    if match.evidence_bits >= WEAK_BITS:
         chance = f"1 in {match.odds} by chance"
     else:
         chance = "may be chance"
@@ -316,16 +319,16 @@ def detect(
         emit(_detected_text(found_verdicts, output), output)
     elif unknown is not None:
         emit(_structure_text(unknown), output)
-    for line in _conclusions(source, found_verdicts, unknown, start=start):
+    for line in _iter_conclusions(source, found_verdicts, unknown, start=start):
         note(line)
     if not any(one.candidates for one in fitting):
-        raise click.exceptions.Exit(_code(source, found_verdicts))
+        raise click.exceptions.Exit(_find_exit_code(source, found_verdicts))
 
 
-def _code(source: str | None, verdicts: Sequence[Verdict]) -> int:
+def _find_exit_code(source: str | None, verdicts: Sequence[Verdict]) -> int:
     """Return the exit code if no sensor fits.
 
-    It is `DEVICE` if every live source was silent, else `NO_DATA`.
+    It is `DEVICE` if every live source was silent; otherwise `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(one.sample.size for one in verdicts)
@@ -351,7 +354,7 @@ def _detect_source(
 
 
 def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
-    """Listen to all ports at the same time, and yield a verdict for each."""
+    """Listen to all ports at the same time, and yield a verdict for each port."""
     serial = [port.path for port in list_serial_ports()]
     udp = list_udp_ports()
     note(
@@ -400,7 +403,7 @@ def _detected_text(verdicts: Sequence[Verdict], output: str | None) -> str:
                 verdict_of = "perhaps"
             rows.append(
                 [
-                    _place(verdict.sample),
+                    _describe_place(verdict.sample),
                     score.sensor.id,
                     verdict_of,
                     f"{score.share:.1%}",
@@ -410,7 +413,7 @@ def _detected_text(verdicts: Sequence[Verdict], output: str | None) -> str:
             )
         verdict_of = "perhaps" if alike else "yes"
         rows += [
-            [_place(verdict.sample), f"{name}, not installed", verdict_of, "", "", why]
+            [_describe_place(verdict.sample), f"{name}, not installed", verdict_of, "", "", why]
             for name, why in verdict.others.items()
         ]
     return table(
@@ -418,14 +421,14 @@ def _detected_text(verdicts: Sequence[Verdict], output: str | None) -> str:
     )
 
 
-def _place(sample: SampleBytes) -> str:
+def _describe_place(sample: SampleBytes) -> str:
     where = sample.source + (f" from {sample.sender}" if sample.sender else "")
     if sample.baud is not None:
         return f"{where} at {sample.baud} baud"
     return where
 
 
-def _conclusions(
+def _iter_conclusions(
     source: str | None, verdicts: Sequence[Verdict], unknown: FrameStructure | None, *, start: bool
 ) -> Iterator[str]:
     missing = _find_uninstalled(verdicts)
@@ -437,11 +440,11 @@ def _conclusions(
             yield f"{verdict.sample.failure}"
         elif verdict.sensor is not None:
             options = format_sensor_options(verdict.sensor)
-            yield f"next: lidarspec {_verb(verdict)} {_format_source(verdict)} {options}"
+            yield f"next: lidarspec {_find_verb(verdict)} {_format_source(verdict)} {options}"
         elif verdict.candidates:
             yield (
-                f"{_place(verdict.sample)}: {', '.join(list_candidates(verdict))} send the same"
-                " frames, which do not identify the model: choose one"
+                f"{_describe_place(verdict.sample)}: {', '.join(list_candidates(verdict))} send the"
+                " same frames, which do not identify the model: choose one"
             )
             if files := [
                 name
@@ -450,9 +453,9 @@ def _conclusions(
             ]:
                 yield (f"the packets do not contain beam angles: pass -O {files[0]}=FILE")
             options = format_sensor_options(verdict.candidates[0].sensor)
-            yield f"next: lidarspec {_verb(verdict)} {_format_source(verdict)} {options}"
+            yield f"next: lidarspec {_find_verb(verdict)} {_format_source(verdict)} {options}"
         elif verdict.others:
-            yield f"{_place(verdict.sample)}: {describe_unsupported_models(verdict)}"
+            yield f"{_describe_place(verdict.sample)}: {describe_unsupported_models(verdict)}"
             relative = next(iter(verdict.others))
             known_sensor = find_known_sensor(relative)
             if known_sensor is not None:
@@ -464,7 +467,7 @@ def _conclusions(
         return
     size = sum(verdict.sample.size for verdict in verdicts)
     for verdict in (faulty := [verdict for verdict in verdicts if verdict.fault]):
-        yield f"{_place(verdict.sample)}: {verdict.fault}"
+        yield f"{_describe_place(verdict.sample)}: {verdict.fault}"
         yield f"next: lidarspec crc {quote(verdict.sample.source)}"
     if faulty:
         return
@@ -482,7 +485,7 @@ def _conclusions(
         else:
             structure_note = "; no repeated structure found"
         yield f"{size} bytes{kind} without a frame of an installed sensor{structure_note}"
-        yield f"next: {_following(source, unknown)}"
+        yield f"next: {_find_next_command(source, unknown)}"
         return
     if source is not None and live_address(source) is None:
         yield from [no_bytes(source, ())] * (
@@ -505,7 +508,7 @@ def _conclusions(
 
 
 def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return the sensors that are not installed and may have sent most of the bytes.
+    """Return the known sensors that are not installed and may have sent most bytes.
 
     Returns an empty list if an installed sensor fits.
     """
@@ -519,7 +522,7 @@ def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
     return []
 
 
-def _verb(verdict: Verdict) -> str:
+def _find_verb(verdict: Verdict) -> str:
     verb = "view"
     if verdict.candidates:
         verb = verb_to_show(verdict.candidates[0].sensor)
@@ -528,7 +531,7 @@ def _verb(verdict: Verdict) -> str:
     return verb
 
 
-def _following(source: str | None, unknown: FrameStructure | None) -> str:
+def _find_next_command(source: str | None, unknown: FrameStructure | None) -> str:
     """Return the next command for bytes that fit no sensor."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
@@ -605,7 +608,7 @@ def _structure_text(structure: FrameStructure) -> str:
         f"  sync      {structure.sync.hex(' ') or 'unknown'}",
         f"  length    {length}: {len(structure.frames)} frames, {structure.share:.0%} of the bytes",
     ]
-    for match in structure.checksums[:TOLD]:
+    for match in structure.checksums[:MAX_PRINTED_CHECKSUMS]:
         if "\n" not in match.source:
             checksum = match.source
         else:

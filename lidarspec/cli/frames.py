@@ -1,4 +1,4 @@
-"""`parse` and `explain`: print the frames in some bytes, or every byte of them."""
+"""`parse` and `explain`: print the fields of frames, or explain every byte of frames."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def parse(
     --slice selects by arrival time; offsets then count from the beginning of the slice.
     """
     with open_input(words, selection.times) as (sample, chunks):
-        sensor, fits = _sensor(sample, sensor_id)
+        sensor, fits = _find_sensor(sample, sensor_id)
         wanted = FrameSelection(sensor, count=count)
         selected = wanted.frames(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
         first = next(selected, None)
@@ -58,22 +58,22 @@ def parse(
             emit_json_list(
                 {"sensor": sensor.id, "fits": fits},
                 "frames",
-                (_fields(sensor, piece) for piece in frames),
+                (_frame_to_dict(sensor, piece) for piece in frames),
                 output,
             )
         else:
-            emit_parts(_tables(sensor, frames, output), output)
+            emit_parts(_iter_tables(sensor, frames, output), output)
         if wanted.unframed:
             note(f"{wanted.unframed} bytes outside frames; lidarspec explain shows them")
 
 
-def _fields(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
+def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
     """Return a frame as a JSON object."""
     facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
     return {**facts, "fields": plain(sensor.parse(piece.data, piece.frame))}
 
 
-def _tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
+def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
         field_values = values(piece.data, sensor, piece.frame).values()
         rows = [
@@ -82,7 +82,7 @@ def _tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) ->
         ]
         yield (
             "\n" * bool(index)
-            + _title(sensor, piece, piece.frame)
+            + _format_title(sensor, piece, piece.frame)
             + "\n"
             + table(["field", "raw", "value"], rows, output)
         )
@@ -144,7 +144,7 @@ def explain(
             "--at and --bytes cannot be combined: use --at for a byte, --bytes for a range"
         )
     with open_input(words, selection.times) as (sample, chunks):
-        sensor, fits = _sensor(sample, sensor_id, damaged=True)
+        sensor, fits = _find_sensor(sample, sensor_id, damaged=True)
         if not sample.data:
             raise no_frame_error(sensor, sample)
         pieces = iter_pieces(sensor, chunks, datagrams=sample.datagrams, frame=frame)
@@ -173,12 +173,12 @@ def listing(
 
     Args:
       at: the offset of a byte; the title names its field.
-      every: draw the bits of every element of an array.
+      every: draw the bits of every element of an array, not only of the first.
       verdicts: add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
-        title = TextSpan(_title(sensor, piece, part.frame), "title")
+        title = TextSpan(_format_title(sensor, piece, part.frame), "title")
         if at is None:
             place = ""
         else:
@@ -203,11 +203,11 @@ def listing(
 
 
 class FrameSelection:
-    """Selects the pieces of an input to show, and counts the others.
+    """Selects the pieces of an input to show, and counts all pieces.
 
     Args:
         frame: show only this frame type.
-        count: maximum number of frames; with `bad`, of damaged ones.
+        count: maximum number of frames; with `bad`, of damaged frames.
         bad: show only damaged pieces.
         at, stretch: show only the byte at this offset, or these bytes, as "FROM:TO".
 
@@ -229,11 +229,11 @@ class FrameSelection:
         at: int | None = None,
         stretch: str | None = None,
     ) -> None:
-        self._sensor = sensor
+        self._find_sensor = sensor
         self._frame = frame
         self._count = math.inf if count is None else count
         self._bad = bad
-        stretched: tuple[float, float] = _stretch(stretch) if at is None else (at, at + 1)
+        stretched: tuple[float, float] = _parse_stretch(stretch) if at is None else (at, at + 1)
         self._from, self._to = stretched
         self._fault: WireError | None = None
         self._shown = 0
@@ -267,14 +267,14 @@ class FrameSelection:
             self.valid += piece.is_valid and not is_other
             if is_other or (self._bad and piece.is_valid) or piece.end <= self._from:
                 continue
-            yield from self._within(piece)
+            yield from self._iter_within(piece)
             if (self.damaged if self._bad else self.valid) >= self._count:
                 return
         self._ended = True
 
-    def _within(self, piece: InputPiece) -> Iterator[tuple[InputPiece, Explanation]]:
+    def _iter_within(self, piece: InputPiece) -> Iterator[tuple[InputPiece, Explanation]]:
         try:
-            for part, what in explain_piece(self._sensor, piece, self._frame):
+            for part, what in explain_piece(self._find_sensor, piece, self._frame):
                 if self._bad and what.is_filler:
                     continue
                 if self._frame not in (None, what.frame):
@@ -291,7 +291,7 @@ class FrameSelection:
                     if self._bad and self.damaged >= self._count:
                         return
         except WireError as fault:
-            raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
+            raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
         """Print the counts of an input that was shown.
@@ -310,19 +310,20 @@ class FrameSelection:
                 else:
                     others = ""
                 raise WireError(
-                    f"no {self._frame} frame in {sample.source}{others}", sensor=self._sensor.id
+                    f"no {self._frame} frame in {sample.source}{others}",
+                    sensor=self._find_sensor.id,
                 )
             raise (
-                no_frame_error(self._sensor, sample)
+                no_frame_error(self._find_sensor, sample)
                 if self._fault is None
-                else suggest(self._fault, f"lidarspec show {self._sensor.id}")
+                else suggest(self._fault, f"lidarspec show {self._find_sensor.id}")
             )
         if self._bad or self.others or ((self.damaged or self.unframed) and self._shown > 1):
-            note(", ".join(self._counts()))
+            note(", ".join(self._iter_counts()))
         if self._bad and (self.damaged or self.unframed):
             raise click.exceptions.Exit(FINDINGS)
 
-    def _counts(self) -> Iterator[str]:
+    def _iter_counts(self) -> Iterator[str]:
         yield f"{self.valid} frame{'s' * (self.valid != 1)}"
         yield f"{self.damaged} damaged"
         yield f"{self.unframed} byte{'s' * (self.unframed != 1)} outside frames"
@@ -330,8 +331,8 @@ class FrameSelection:
             yield f"{self.others} of other types omitted"
 
 
-def _stretch(text: str | None) -> tuple[float, float]:
-    """Return the first offset and the end of "FROM:TO"."""
+def _parse_stretch(text: str | None) -> tuple[float, float]:
+    """Return the first offset and the end of "FROM:TO"; an empty end is infinity."""
     first, colon, last = (text or ":").partition(":")
     try:
         start = int(first or "0", 0)
@@ -354,7 +355,7 @@ def _compare(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print the differences between the first frame of the input and another frame."""
+    """Print the differences between the first frame of the input and the frame `diff`."""
     frames = (
         piece
         for piece in pieces
@@ -397,10 +398,10 @@ def _compare(
         )
 
 
-def _sensor(
+def _find_sensor(
     sample: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
-    """Return the sensor that is named or fits the bytes, and the ids of all that fit."""
+    """Return the named sensor or a fitting sensor, and the ids of all fitting sensors."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
     from lidarspec.detect.identification import (
@@ -422,7 +423,7 @@ def _sensor(
     return named_sensor(fault.sensor), []
 
 
-def _title(sensor: Sensor, piece: InputPiece, frame: str) -> str:
+def _format_title(sensor: Sensor, piece: InputPiece, frame: str) -> str:
     where = f" at byte {piece.offset}" if piece.offset else ""
     return (
         f"{sensor.id} {frame or 'skipped'}{where}, {len(piece.data)}"

@@ -1,4 +1,4 @@
-"""Read the input of commands, and make the error if it contains no frame.
+"""Read the input of verbs, and explain why it contains no frame.
 
 The input is hexadecimal text, a file, standard input or a configured device.
 
@@ -54,15 +54,15 @@ if TYPE_CHECKING:
     from lidarspec.transports.files import FileTransport
 
 #: Maximum length of hexadecimal text that is copied into the suggested command.
-REPEATED = 400
+MAX_REPEATED_CHARS = 400
 #: Maximum length of other input that is quoted in a message.
-QUOTED = 64
+MAX_QUOTED_CHARS = 64
 #: Maximum number of bytes that `read` returns.
-MOST = 1 << 20
+MAX_INPUT_BYTES = 1 << 20
 #: Timeout for the first frame of a device, in seconds.
-PATIENCE = 10.0
+FIRST_FRAME_TIMEOUT_S = 10.0
 #: Polling interval for a source that sends nothing, in seconds.
-LOOK = 0.1
+POLL_S = 0.1
 
 
 @contextlib.contextmanager
@@ -84,13 +84,15 @@ def open_input(
     """
     text = " ".join(words)
     if text == "-" or (len(words) == 1 and _is_file(text)):
-        reading = _file(text, times)
+        reading = _open_file(text, times)
     else:
         try:
             if not (data := parse_hex(text)):
                 raise ValueError("no digits found")
             reading = _read_beginning(
-                text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
+                text if len(text) <= MAX_REPEATED_CHARS else "-",
+                iter([Chunk(data)]),
+                datagrams=False,
             )
         except ValueError as error:
             from lidarspec.device.named_devices import find_device
@@ -111,13 +113,13 @@ def _is_file(text: str) -> bool:
 
 
 @contextlib.contextmanager
-def _file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
+def _open_file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     from lidarspec.transports.files import FileTransport
     from lidarspec.transports.open_url import open_transport
 
     with contextlib.closing(open_transport(path)) as file:
         if path == "-" and type(file) is FileTransport:
-            chunks = _standard_input(file)
+            chunks = _iter_standard_input(file)
         else:
             chunks = iter_received(file, times, path)
         with _read_beginning(
@@ -146,7 +148,7 @@ def _read_rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
         yield from chunks
 
 
-def _standard_input(file: FileTransport) -> Iterator[Chunk]:
+def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
     """Yield the bytes of standard input as they arrive; hexadecimal text is converted."""
     head = sys.stdin.buffer.read(MAX_SAMPLE_BYTES)
     stdin = sys.stdin.buffer
@@ -166,14 +168,18 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
 
 
 def read(words: Sequence[str]) -> SampleBytes:
-    """Return the first `MOST` bytes of the input that command-line arguments name.
+    """Return the first bytes of the input that command-line arguments name.
+
+    There are at most `MAX_INPUT_BYTES`.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
     """
     with open_input(words) as (sample, chunks):
-        return replace(sample, chunks=tuple(chunk.data for chunk in take_leading(chunks, MOST)))
+        return replace(
+            sample, chunks=tuple(chunk.data for chunk in take_leading(chunks, MAX_INPUT_BYTES))
+        )
 
 
 def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
@@ -188,19 +194,19 @@ def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
         )
     if len(words) == 1 and re.search(r"[/\\.]", text):
         return SourceError(f"{text}: no such file")
-    return UsageError(f"{text[:QUOTED]!r} is neither a file nor hexadecimal: {error}")
+    return UsageError(f"{text[:MAX_QUOTED_CHARS]!r} is neither a file nor hexadecimal: {error}")
 
 
 def refuse_overwriting(
     target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True
 ) -> None:
-    """Raise an error if an output file is also an input, or exists and `force` is off.
+    """Raise an error if an output file is also an input, or exists without `force`.
 
     Files are compared by identity, not by name.
 
     Args:
         target: the output file or files.
-        inputs: SOURCEs and file names; sensors, whose options may be file names.
+        inputs: SOURCEs and file names; also sensors, because their options may be file names.
         force: allow existing files that are not inputs.
 
     Raises:
@@ -285,7 +291,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
 def nearest_fault_error(sample: SampleBytes) -> WireError:
     """Return the error for input that no sensor fits.
 
-    It is the error of the sensor that parsed most of the input, or a general one.
+    It is the error of the sensor that parsed most of the input, or a general error.
     """
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -302,7 +308,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
             text = "no frame of an installed sensor"
         if sample.is_text:
             text = f"{sample.source} is text: {text}"
-        error = suggest_installation(WireError(text, data=sample.data[:QUOTED]), sample)
+        error = suggest_installation(WireError(text, data=sample.data[:MAX_QUOTED_CHARS]), sample)
         return suggest(error, "lidarspec sensors")
     return suggest(best, f"lidarspec explain {quote(sample.source)} -s {best.sensor}")
 
@@ -325,7 +331,7 @@ def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
 def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Return the error for a source without a scan.
 
-    The cause is an exception of the plugin, a file without data frames, a device that sends
+    It names the cause: an exception of the plugin, a file without data frames, a device that sends
     nothing, or bytes that are not frames.
     """
     sensor = device.sensor
@@ -436,7 +442,10 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
 
 
 def require_points(device: Device, source: str) -> None:
-    """Raise UsageError for a sensor without points, with a command that prints its frames."""
+    """Raise a UsageError for a sensor without points.
+
+    It suggests a command that prints the frames.
+    """
     sensor = device.sensor
     if not sensor.has_points:
         frames = ", ".join(sensor.incoming)
@@ -470,7 +479,7 @@ class FirstFrameTimeout:
         """
         waited = time.monotonic() - self._began
         if (
-            waited > PATIENCE
+            waited > FIRST_FRAME_TIMEOUT_S
             and self._device.is_live
             and not any(name in self._device.stats.frames for name in self._awaited)
         ):
@@ -492,7 +501,7 @@ def iter_device_scans(
         UsageError: if none of the scans is selected.
     """
     patience = FirstFrameTimeout(device, source)
-    for scan in device.scans(wait=LOOK, select=select):
+    for scan in device.scans(wait=POLL_S, select=select):
         if scan is not None:
             yield scan
             del scan

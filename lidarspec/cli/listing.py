@@ -25,9 +25,9 @@ STYLES = {
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Print lines as they are made: coloured on a terminal, else as plain text.
+    """Print each line when it is made, with colours only on a terminal.
 
-    Lines are folded to the width of the terminal. Respects NO_COLOR and FORCE_COLOR; coloured
+    Lines are folded to the width of the terminal. NO_COLOR and FORCE_COLOR are respected; coloured
     output into a pipe is not folded.
     """
     may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ

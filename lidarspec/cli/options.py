@@ -1,6 +1,6 @@
 """Options and types of values that verbs share, and the options that select scans.
 
-Every verb that reads has the same options for selection.
+All verbs that read scans have the same options for selection.
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ def configure_sensor(
         raise UsageError(f"-O {unset[0]}: expected NAME=VALUE")
     named: Sensor = sensor(sensor_id)
     configured: Sensor = named.configure(
-        **{name: _value(named, name, text) for name, text in texts.items()}
+        **{name: _parse_value(named, name, text) for name, text in texts.items()}
     )
     return configured
 
 
-def _value(sensor: Sensor, name: str, text: str) -> Any:
+def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
     """Return the value of an option given as text.
 
     Numbers and booleans are parsed as in `lidarspec.toml` if the option accepts them. All other
@@ -114,7 +114,7 @@ def _value(sensor: Sensor, name: str, text: str) -> Any:
 
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
-    """Add ``-n/--count``: the number of items after which the verb ends."""
+    """Add ``-n/--count``: the verb ends after this number of items."""
     return click.option(
         "-n",
         "--count",
@@ -140,11 +140,11 @@ def colour_option(function: Function) -> Function:
 
 
 class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
-    """A type of option for one or two numbers with a syntax of their own.
+    """A type of option for one or two numbers with a special syntax.
 
     Args:
         name: the name of the type, for help pages.
-        parse: returns the number of a text; raises ValueError or UsageError for invalid text.
+        parse: converts a text to a number; raises ValueError or UsageError for invalid text.
         form: the expected syntax, for messages.
     """
 
@@ -163,20 +163,20 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
             self.fail(f"{value!r} is not {self._form}", param, ctx)
 
 
-def _duration(text: str) -> float:
+def _parse_duration(text: str) -> float:
     seconds = duration(text)
     if seconds <= 0:
         raise ValueError(text)
     return seconds
 
 
-def _share(text: str) -> float:
+def _parse_share(text: str) -> float:
     if not 0 <= (number := share(text)) <= 1:
         raise ValueError(text)
     return number
 
 
-def _bytes(text: str) -> float:
+def _parse_bytes(text: str) -> float:
     digits = text.upper().removesuffix("B")
     number = float(digits.rstrip("KMG")) * {"K": 1e3, "M": 1e6, "G": 1e9}.get(digits[-1:], 1)
     if not 1e6 <= number < math.inf:
@@ -184,14 +184,14 @@ def _bytes(text: str) -> float:
     return number
 
 
-def _offset(text: str) -> int:
+def _parse_offset(text: str) -> int:
     offset = int(text, 0)
     if offset < 0:
         raise ValueError(text)
     return offset
 
 
-def _speed(text: str) -> float:
+def _parse_speed(text: str) -> float:
     if text == "max":
         speed = 0.0
     else:
@@ -201,8 +201,8 @@ def _speed(text: str) -> float:
     return speed
 
 
-def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
-    """Return the values before and after the colon of a text, None if empty.
+def _parse_pair(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
+    """Return the values before and after the colon of a text; None for an empty side.
 
     Every colon is tried, because dates contain colons.
     """
@@ -218,23 +218,23 @@ def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
     raise ValueError(text)
 
 
-def _moment(text: str) -> float | datetime:
+def _parse_moment(text: str) -> float | datetime:
     try:
         return duration(text)
     except UsageError:
         return datetime.fromisoformat(text)
 
 
-def _index(text: str) -> int:
+def _parse_index(text: str) -> int:
     return int(text)  # `Selection` refuses negative numbers, and gives the reason
 
 
-def _indices(text: str) -> tuple[int, int | None]:
-    low, high = _between(text, _index)
+def _parse_indices(text: str) -> tuple[int, int | None]:
+    low, high = _parse_pair(text, _parse_index)
     return low or 0, high
 
 
-def _metres(text: str) -> float:
+def _parse_metres(text: str) -> float:
     number, unit = split_unit(text)
     scale = factor(unit or "m", "m")
     if scale is None or not 0 <= float(number) < math.inf:
@@ -242,32 +242,34 @@ def _metres(text: str) -> float:
     return float(number) * float(scale)
 
 
-def _distances(text: str) -> tuple[float, float]:
-    low, high = _between(text, _metres)
+def _parse_distances(text: str) -> tuple[float, float]:
+    low, high = _parse_pair(text, _parse_metres)
     return low or 0.0, math.inf if high is None else high
 
 
 #: Seconds, from "10s", "500ms", "2min", "1h" or a bare number.
-DURATION = NumberType("duration", _duration, "a duration above 0, such as 10s, 500ms, 2min or 1h")
+DURATION = NumberType(
+    "duration", _parse_duration, "a duration above 0, such as 10s, 500ms, 2min or 1h"
+)
 #: A number from 0 to 1, from "1%" or "0.01".
-SHARE = NumberType("share", _share, "a share, such as 1% or 0.01")
+SHARE = NumberType("share", _parse_share, "a share, such as 1% or 0.01")
 #: An offset in bytes, from "940" or "0x3ac".
-OFFSET = NumberType("offset", _offset, "the offset of a byte, such as 940 or 0x3ac")
+OFFSET = NumberType("offset", _parse_offset, "the offset of a byte, such as 940 or 0x3ac")
 #: A number of bytes, from "256MB" or "1GB".
-BYTES = NumberType("size", _bytes, "a size of at least 1MB, such as 256MB or 1GB")
+BYTES = NumberType("size", _parse_bytes, "a size of at least 1MB, such as 256MB or 1GB")
 #: A factor above 0; 0 for "max".
-SPEED = NumberType("speed", _speed, "a speed, such as 1, 0.5, 10 or max")
+SPEED = NumberType("speed", _parse_speed, "a speed, such as 1, 0.5, 10 or max")
 #: A begin and an end, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
 SLICE = NumberType(
     "slice",
-    lambda text: _between(text, _moment),
+    lambda text: _parse_pair(text, _parse_moment),
     "a slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
 )
 #: A first and a last index, from "5:10".
-INDICES = NumberType("indices", _indices, "a slice of whole numbers, such as 5:10, 5: or :10")
+INDICES = NumberType("indices", _parse_indices, "a slice of whole numbers, such as 5:10, 5: or :10")
 #: A minimum and a maximum range in metres, from "0.5m:30m".
 DISTANCES = NumberType(
-    "distances", _distances, "a span of distances, such as 0.5m:30m, 50cm: or :30"
+    "distances", _parse_distances, "a span of distances, such as 0.5m:30m, 50cm: or :30"
 )
 
 #: Argument of `Selection` -> its option.
@@ -319,7 +321,11 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
 
 
 def selecting(*names: str) -> Callable[[Function], Function]:
-    """Add some of the options that select; the verb gets a `Selection`."""
+    """Add options that select; the verb gets a `Selection`.
+
+    Args:
+        names: arguments of `Selection`, keys of `SELECTING`.
+    """
 
     def options(function: Function) -> Function:
         @functools.wraps(function)

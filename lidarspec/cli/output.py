@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 #: Seconds between two updates of the progress line.
-PERIOD = 0.2
-#: Blanks between columns of a table; indentation of prose below its row; minimum width of a
-#: column of prose.
-GAP = 2
-HANGING = 6
-PROSE = 24
+UPDATE_PERIOD_S = 0.2
+#: In characters: gap between the columns of a table, indentation of prose below its row, and
+#: minimum width of a column of prose.
+COLUMN_GAP = 2
+PROSE_INDENT = 6
+MIN_PROSE_WIDTH = 24
 
 
 def output_options(function: Function) -> Function:
@@ -74,37 +74,41 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         period: minimum seconds between two updates; 0 shows every text.
     """
 
-    def __init__(self, unit: Callable[[float], str] = str, period: float = PERIOD) -> None:
+    def __init__(self, unit: Callable[[float], str] = str, period: float = UPDATE_PERIOD_S) -> None:
         self._is_shown = sys.stderr.isatty() and voice.loudness >= 0
         self._due = 0.0
         self._unit = unit
         self._period = period
-        self._bar: Bar | None = None
+        self._make_bar: Bar | None = None
 
     def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
-        """Show a text, which is made only if an update is due.
+        """Show a text if an update is due.
 
-        If `done`, the completed and the total amount, is known, a bar, the rate and the remaining
-        time are shown as well.
+        Args:
+            text: makes the text; called only if an update is due.
+            done: the completed and the total amount; if given, a bar, the rate and the remaining
+                time are also shown.
         """
         if not self._is_shown or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + self._period
-        if self._bar is None:
-            self._bar = _bar(is_measured=done is not None)
-        (task,) = self._bar.tasks
+        if self._make_bar is None:
+            self._make_bar = _make_bar(is_measured=done is not None)
+        (task,) = self._make_bar.tasks
         rate = f"{self._unit(task.speed)}/s" if task.speed else ""
         completed, total = done or (0, 0)
-        self._bar.update(
+        self._make_bar.update(
             task.id, description=printable(text()), completed=completed, total=total, rate=rate
         )
-        self._bar.start()
-        self._bar.refresh()
+        self._make_bar.start()
+        self._make_bar.refresh()
 
-    def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
-        """Show a text while a task runs, and print its remarks.
+    def show_progress(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
+        """Run a task, print its remarks, and show a text meanwhile.
 
-        An empty remark only updates the text.
+        Args:
+            remarks: runs the task when it is iterated; an empty remark only updates the text.
+            text: makes the text.
         """
         for remark in remarks:
             self(text)
@@ -118,17 +122,17 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
     def clear(self) -> None:
         """Remove the progress line."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        if self._make_bar is not None:
+            self._make_bar.stop()
+            self._make_bar = None
             self._due = 0.0
 
     def __exit__(self, *_: object) -> None:
         self.clear()
 
 
-def _bar(*, is_measured: bool) -> Bar:
-    """Return a line of text, with a bar if the total is known."""
+def _make_bar(*, is_measured: bool) -> Bar:
+    """Return a progress line of text, with a bar if the total is known."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -226,11 +230,11 @@ def emit_json_list(
 ) -> None:
     """Write a JSON object that ends with a list, each item as it is made, like `emit`."""
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
-    emit_parts(itertools.chain(_items(beginning, items), ["  ]\n}"]), output)
+    emit_parts(itertools.chain(_iter_items(beginning, items), ["  ]\n}"]), output)
 
 
-def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
-    """Yield each item with its comma; one item is held back until the next is known."""
+def _iter_items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
+    """Yield each item with its comma; each item waits until the next is known."""
     held = beginning
     for number, item in enumerate(items):
         yield held + "," * bool(number)
@@ -250,20 +254,26 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
         room = shutil.get_terminal_size().columns
     else:
         room = sys.maxsize
-    widths = _widths(lines, room)
+    widths = _fit_widths(lines, room)
     full = max(len(line[-1]) for line in lines)
-    hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
+    hangs = (
+        widths[-1] < min(full, MIN_PROSE_WIDTH)
+        or sum(widths) + COLUMN_GAP * (len(widths) - 1) > room
+    )
     if hangs:
-        widths = _widths([line[:-1] for line in lines], room)
+        widths = _fit_widths([line[:-1] for line in lines], room)
     return "\n".join(text.rstrip() for line in lines for text in _fold_row(line, widths, room))
 
 
-def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
-    """Return the widths of columns, the widest folded first, never within a word."""
+def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
+    """Return the widths of columns that fit in `room` characters, if possible.
+
+    The widest column is narrowed first, but not below the width of its longest word.
+    """
     columns = list(zip(*lines, strict=True))
     widths = [max(map(len, cells)) for cells in columns]
     for place in sorted(range(len(columns)), key=lambda place: -widths[place]):
-        excess = max(sum(widths) + GAP * (len(widths) - 1) - room, 0)
+        excess = max(sum(widths) + COLUMN_GAP * (len(widths) - 1) - room, 0)
         word = max((len(word) for cell in columns[place] for word in cell.split()), default=0)
         widths[place] = max(word, widths[place] - excess)
     return widths
@@ -279,9 +289,11 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 
     cells = [wrap(cell, width) for cell, width in zip(line, widths, strict=False)]
     for parts in itertools.zip_longest(*cells, fillvalue=""):
-        yield (" " * GAP).join(part.ljust(width) for part, width in zip(parts, widths, strict=True))
+        yield (" " * COLUMN_GAP).join(
+            part.ljust(width) for part, width in zip(parts, widths, strict=True)
+        )
     for cell in line[len(widths) :]:
-        yield from (" " * HANGING + text for text in wrap(cell, room - HANGING) if text)
+        yield from (" " * PROSE_INDENT + text for text in wrap(cell, room - PROSE_INDENT) if text)
 
 
 def render(what: Text) -> str:

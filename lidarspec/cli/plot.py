@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.inputs import (
-    PATIENCE,
+    FIRST_FRAME_TIMEOUT_S,
     conclude,
     iter_device_scans,
     no_scan_error,
@@ -108,7 +108,7 @@ def plot(
             _draw_scan(scan, title, ramp, max_range, output, suffix)
         else:
             title = f"{kind} of {device.sensor.id}"
-            default_duration = PATIENCE if device.is_live else math.inf
+            default_duration = FIRST_FRAME_TIMEOUT_S if device.is_live else math.inf
             end_s = time.monotonic() + (duration or default_duration)
             _save(_draw_over_time(device, source, selection, kind, end_s), output, suffix)
         if output != "-":
@@ -128,9 +128,10 @@ def _draw_scan(
 
 
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
-    """Return a complete scan by its number, counted from 1.
+    """Return the complete scan with this number, counted from 1.
 
-    If there are fewer, returns the last complete scan, or an incomplete one if there is none.
+    If there are fewer complete scans, returns the last one, or an incomplete scan if all scans are
+    incomplete.
     """
     chosen: Scan | None = None
     whole_count = 0

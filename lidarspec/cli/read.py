@@ -42,7 +42,7 @@ from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading, format_figure
 
 #: Width and decimals of the columns of points.
-POINTS = {
+POINT_FORMATS = {
     **dict.fromkeys(("x", "y", "z", "range"), (9, 3)),
     **dict.fromkeys(("azimuth", "elevation"), (9, 4)),
     **{
@@ -53,20 +53,20 @@ POINTS = {
         "column": (6, 0),
     },
 }
-#: Digits of a field of a packet, digits of a further column in float32, and the minimum width of a
-#: column.
-DIGITS = 10
-SINGLE = 7
-NARROWEST = 8
-#: Digits of a float64 in JSON.
-KEPT = 14
+#: Significant digits of a field of a packet and of a further column in float32; minimum width of a
+#: column in characters.
+FIELD_DIGITS = 10
+FLOAT32_DIGITS = 7
+MIN_COLUMN_WIDTH = 8
+#: Significant digits of a float64 in JSON.
+JSON_DIGITS = 14
 
 Row = dict[str, Any]
 Units = Mapping[str, str]
 #: Number of rows after which the column names are repeated.
-AGAIN = 20
+ROWS_PER_HEADER = 20
 #: Tolerance for sums of intervals, in seconds.
-ROUNDED = 1e-6
+TOLERANCE_S = 1e-6
 
 
 @click.command()
@@ -109,15 +109,15 @@ def read(
         if frame is None:
             require_points(device, source)
         if whole or frame:
-            rows = _packets(
+            rows = _iter_packets(
                 device, frame, until, FirstFrameTimeout(device, source, frame), selection
             )
         else:
-            rows = _points(
+            rows = _iter_points(
                 iter_device_scans(device, source, selection, until=until), every_point=every_point
             )
         printed = 0
-        for line in _lines(itertools.islice(rows, count), as_json=as_json):
+        for line in _iter_lines(itertools.islice(rows, count), as_json=as_json):
             say(line)
             printed += 1
         if not printed and not device.stats.frames:
@@ -125,25 +125,28 @@ def read(
         conclude(device)
 
 
-def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
+def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
     """Yield each row as JSON, or as aligned columns below their names and units."""
     widths: list[int] = []
     for units, row in rows:
         if as_json:
-            yield json.dumps({name: _plain(value) for name, value in row.items()}, allow_nan=False)
+            yield json.dumps(
+                {name: _to_json(value) for name, value in row.items()}, allow_nan=False
+            )
             continue
         shown = {name: value for name, value in row.items() if not isinstance(value, np.ndarray)}
         if not widths:
             headers = [f"{name} [{units[name]}]" if units.get(name) else name for name in shown]
             widths = [
-                max(len(header), _width(name)) for header, name in zip(headers, shown, strict=True)
+                max(len(header), _find_width(name))
+                for header, name in zip(headers, shown, strict=True)
             ]
-            yield _row(headers, widths)
-        yield _row([_text(name, value) for name, value in shown.items()], widths)
+            yield _format_row(headers, widths)
+        yield _format_row([_format_value(name, value) for name, value in shown.items()], widths)
 
 
-def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
-    """Yield the points of each complete scan, and of the incomplete ones at both ends."""
+def _iter_points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
+    """Yield the points of all complete scans, and of incomplete scans at both ends."""
     units: Units = UNITS
     for number, scan in enumerate(scans):
         if every_point:
@@ -156,7 +159,7 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
             yield units, {"scan": number, **dict(zip(columns, values, strict=True))}
 
 
-def _packets(
+def _iter_packets(
     device: Device,
     frame: str | None,
     until: float,
@@ -197,35 +200,35 @@ def _scalar(value: Any) -> Any:
     return float(value)
 
 
-def _width(name: str) -> int:
-    if name in POINTS:
-        return POINTS[name][0]
+def _find_width(name: str) -> int:
+    if name in POINT_FORMATS:
+        return POINT_FORMATS[name][0]
     if name.endswith("_ns"):
         return 20
-    return NARROWEST
+    return MIN_COLUMN_WIDTH
 
 
-def _text(name: str, value: Any) -> str:
+def _format_value(name: str, value: Any) -> str:
     if isinstance(value, int | np.bool_):
         return str(int(value))
     if not math.isfinite(value):
         if math.isnan(value):
             return "-"
         return "inf"
-    digits = SINGLE if isinstance(value, np.float32) else DIGITS
-    if name in POINTS:
-        return f"{value:.{POINTS[name][1]}f}"
+    digits = FLOAT32_DIGITS if isinstance(value, np.float32) else FIELD_DIGITS
+    if name in POINT_FORMATS:
+        return f"{value:.{POINT_FORMATS[name][1]}f}"
     return f"{value:.{digits}g}"
 
 
-def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
+def _format_row(cells: Sequence[str], widths: Sequence[int]) -> str:
     return " ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """Return a value for JSON: null for nan and infinity, whole numbers as integers."""
     if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value]
+        return [_to_json(item) for item in value]
     if isinstance(value, np.generic):
         number = value.item()
     else:
@@ -238,11 +241,12 @@ def _plain(value: Any) -> Any:
         # digits of a float64.
         if number.is_integer() and abs(number) < 2**53:
             return int(number)
-        return float(str(value) if single else f"{number:.{KEPT}g}")
+        return float(str(value) if single else f"{number:.{JSON_DIGITS}g}")
     return number
 
 
-#: Name and unit of each figure, the width of its column (0: only in the summary), and its text.
+#: Name and unit of each measured value, the width of its column (0: only in the summary), and the
+#: function that formats it.
 FIGURES: tuple[tuple[str, str, int, Callable[[MeterReading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
     ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
@@ -256,30 +260,30 @@ FIGURES: tuple[tuple[str, str, int, Callable[[MeterReading], str]], ...] = (
     ("input", "kB/s", 0, lambda r: format_figure(r.bytes_per_s, "{:.1f}", 1e-3)),
 )
 COLUMNS = [figure for figure in FIGURES if figure[2]]
-#: Widths of the columns of `stats`: the time, the figures, and the queue.
+#: Widths of the columns of `stats`: the time, the measured values, and the queue.
 WIDTHS = [6, *(width for _, _, width, _ in COLUMNS), 6]
 
 
 @dataclass
 class StatsPrinter:
-    """Prints a row of figures, or a JSON object, for each interval."""
+    """Prints a row of measured values, or a JSON object, for each interval."""
 
     device: Device
     as_json: bool
     printed: int = 0
 
     def interval(self, at: float | None, reading: MeterReading) -> None:
-        """Print the figures of one interval, which ended `at` seconds after the beginning."""
+        """Print the values of an interval that ended `at` seconds after the beginning."""
         if self.as_json:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
             return
-        if self.printed % AGAIN == 0:
-            say(_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
-            say(_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
+        if self.printed % ROWS_PER_HEADER == 0:
+            say(_format_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
+            say(_format_row(["s", *(unit for _, unit, _, _ in COLUMNS), ""], WIDTHS))
         self.printed += 1
         figures = [text(reading) for _, _, _, text in COLUMNS]
         say(
-            _row(
+            _format_row(
                 [format_figure(at, "{:.1f}"), *figures, format_figure(self.device.queued, "{}")],
                 WIDTHS,
             )
@@ -287,7 +291,7 @@ class StatsPrinter:
         sys.stdout.flush()
 
     def summary(self, reading: MeterReading) -> None:
-        """Print the figures of the whole input."""
+        """Print the values of the whole input."""
         if self.as_json:
             self._emit(
                 {"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()}
@@ -388,7 +392,8 @@ def _print_stats(
     """Print the lines and the summary of one source, and return the summary.
 
     Args:
-        interval, lasting: seconds between two lines, and in total.
+        interval: seconds between two lines.
+        lasting: total duration in seconds.
     """
     start = time.monotonic()
     try:
@@ -399,20 +404,20 @@ def _print_stats(
         else:
             _print_by_packet_time(feed, lines, interval, lasting)
     except KeyboardInterrupt:
-        lines.summary(_summary(feed, start))
+        lines.summary(_measure_input(feed, start))
         raise
-    reading = _summary(feed, start)
+    reading = _measure_input(feed, start)
     if reading.packets == 0:
         raise no_scan_error(feed.device, source, reading.seconds)
     lines.summary(reading)
     return reading
 
 
-def _summary(feed: LiveScans | LiveFrames, start: float) -> MeterReading:
-    """Return the figures of the whole input.
+def _measure_input(feed: LiveScans | LiveFrames, start: float) -> MeterReading:
+    """Return the measured values of the whole input.
 
     Args:
-        start: a time of `time.monotonic`, from which a live source is measured.
+        start: the begin of the measurement of a live source, a time of `time.monotonic`.
     """
     return feed.meter.summary(
         feed.device.stats, time.monotonic() - start if feed.device.is_live else None
@@ -430,7 +435,7 @@ def _print_by_clock(
     """Print a line for each interval of the clock."""
     edge = last = start
     end = start + lasting
-    while end - edge > ROUNDED and not feed.ended:
+    while end - edge > TOLERANCE_S and not feed.ended:
         edge = min(edge + interval, end)
         feed.read(edge)
         patience.check()

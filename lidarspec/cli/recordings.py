@@ -145,7 +145,7 @@ def _slice_error(source: str, target: str, times: str) -> UsageError:
 
 def _print_recording(task: SourceRecording) -> None:
     with Progress() as progress, contextlib.closing(task.run()) as remarks:
-        progress.follow(
+        progress.show_progress(
             remarks,
             lambda: _describe_recording(task, task.recorder) if task.recorder is not None else "",
         )
@@ -294,17 +294,17 @@ def replay(
         source=source,
         times=selection.times,
     )
-    is_interrupted = _run(played, destination, file)
+    is_interrupted = _run_replay(played, destination, file)
     _print_summary(file, place, sensor, played, is_file=is_file, as_json=as_json)
     if is_interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
 
 
-def _run(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:
+def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:
     """Run a replay; return whether it was interrupted before its end."""
     with contextlib.closing(destination), Progress() as progress:
         try:
-            progress.follow(played.run(), lambda: _describe_progress(played))
+            progress.show_progress(played.run(), lambda: _describe_progress(played))
         except KeyboardInterrupt:
             return True
         except WireError as error:
@@ -316,7 +316,7 @@ def _run(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> b
 
 
 def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | None:
-    """Return the sensor that was named, or that of the recording if it is installed."""
+    """Return the named sensor, or the sensor of the recording if it is installed."""
     if sensor_id:
         return named_sensor(sensor_id)
     with contextlib.suppress(LidarSpecError):
@@ -329,7 +329,7 @@ def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | 
 def _make_file(
     source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool
 ) -> BackgroundWriter:
-    """Return a new file for the bytes of another one."""
+    """Return a new file for the bytes of another file."""
     try:
         return make_recorder(source, file, place, sensor, overwrite=force)
     except UsageError as error:

@@ -103,11 +103,11 @@ GROUPS = {
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
 #: Verbs of plugins that are installed separately -> distribution.
-ELSEWHERE = {"ros2": "lidarspec-ros2"}
+SEPARATE_VERBS = {"ros2": "lidarspec-ros2"}
 
 
 def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Option:
-    """Return an option that sets the amount of remarks."""
+    """Return an option that sets the loudness of remarks."""
 
     def set_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value:
@@ -117,7 +117,7 @@ def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Optio
 
 
 #: Options of all verbs, except of verbs that have an option of the same name.
-SPOKEN = (
+COMMON_OPTIONS = (
     _make_verbosity_option(
         -1,
         "-q",
@@ -160,7 +160,7 @@ class Verbs(click.Group):
         else:
             return None
         parameters = {param.name for param in command.params}
-        command.params += [option for option in SPOKEN if option.name not in parameters]
+        command.params += [option for option in COMMON_OPTIONS if option.name not in parameters]
         if ctx.resilient_parsing:
             from lidarspec.cli.completion import attach
 
@@ -171,11 +171,11 @@ class Verbs(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in VERBS and args[0] not in find_added_verbs() and not ctx.resilient_parsing:
-            if args[0] in ELSEWHERE:
+            if args[0] in SEPARATE_VERBS:
                 error = click.UsageError(
                     f"the verb {args[0]!r} is part of a plugin that is not installed", ctx
                 )
-                raise suggest(error, install_command(ELSEWHERE[args[0]], extra=args[0]))
+                raise suggest(error, install_command(SEPARATE_VERBS[args[0]], extra=args[0]))
             raise click.UsageError(
                 f"unknown verb {args[0]!r}{did_you_mean(args[0], self.list_commands(ctx))}", ctx
             )
@@ -278,7 +278,7 @@ def main(ctx: click.Context) -> None:
         say(guide())
 
 
-main.params += SPOKEN
+main.params += COMMON_OPTIONS
 
 
 @click.command()

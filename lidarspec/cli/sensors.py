@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
 
-#: Number of packets to plan for: a turn may have this many, some of them shorter.
-PACKETS = 32
+#: Number of packets for which a plan is made: a turn may have this many, some of them shorter.
+PLANNED_PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
@@ -46,7 +46,7 @@ def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
 
 
 def guide() -> str:
-    """Return what is installed and connected, and the first commands to type."""
+    """Return a text with the installed sensors, the ports, and the first commands."""
     from lidarspec.device.named_devices import read_devices
     from lidarspec.transports.ports import list_serial_ports
 
@@ -93,14 +93,20 @@ def sensors(as_json: bool, output: str | None) -> None:
         broken = registry().failures
         emit_json(
             [
-                _facts(sensor) | {"distribution": homes.get(name, "")}
+                _sensor_to_dict(sensor) | {"distribution": homes.get(name, "")}
                 for name, sensor in loaded.items()
             ],
             output,
         )
     elif installed:
         rows = [
-            [row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution]
+            [
+                row.id,
+                f"{row.vendor} {row.model}",
+                _format_links(row.links),
+                row.status,
+                row.distribution,
+            ]
             for row in installed
         ]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
@@ -129,27 +135,27 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
     sensor = named_sensor(sensor_id)
     if as_plan:
-        plans = {name: _plan(sensor, name) for name in sensor.data_frames}
+        plans = {name: _list_plan(sensor, name) for name in sensor.data_frames}
         emit_json(plans, output) if as_json else emit(
             "\n".join(line for name in plans for line in (f"{name}:", *plans[name])), output
         )
         return
     if as_json:
-        frames = {name: _frame(frame) for name, frame in sensor.frames.items()}
-        commands = {name: _command(sensor, name) for name in sensor.commands}
-        emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
+        frames = {name: _frame_to_dict(frame) for name, frame in sensor.frames.items()}
+        commands = {name: _command_to_dict(sensor, name) for name in sensor.commands}
+        emit_json({**_sensor_to_dict(sensor), "frames": frames, "commands": commands}, output)
         return
     from lidarspec.explaining.formatting import describe_losses
 
     losses = describe_losses(sensor).replace("`", "")
-    links = _links(summarize_links(sensor))
+    links = _format_links(summarize_links(sensor))
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}"
         + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
-        f"  link    {links}\n{_range_line(sensor)}  losses  {losses}"
+        f"  link    {links}\n{_format_range(sensor)}  losses  {losses}"
         f"\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
-    units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
+    units = {role: _format_unit(sensor, path) for role, path in sensor.info.items()}
     parts += (
         [
             "  reports "
@@ -158,7 +164,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         if sensor.info
         else []
     )
-    parts += [f"  command {name}{_command_text(sensor, name)}" for name in sensor.commands]
+    parts += [f"  command {name}{_format_command(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [
             [row.offset, row.size, row.type, row.field, row.unit, row.meaning]
@@ -175,14 +181,14 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     emit("\n".join(parts), output)
 
 
-def _range_line(sensor: Sensor) -> str:
+def _format_range(sensor: Sensor) -> str:
     if sensor.range_limits is None:
         return ""
     low, high = sensor.range_limits
     return f"  range   {low:g} .. {high:g} m\n"
 
 
-def _unit(sensor: Sensor, path: str) -> str:
+def _format_unit(sensor: Sensor, path: str) -> str:
     """Return the unit of a field, "frame.path", after a comma."""
     from lidarspec.frames.schema import make_schema
 
@@ -196,8 +202,8 @@ def _unit(sensor: Sensor, path: str) -> str:
     return ""
 
 
-def _plan(sensor: Sensor, frame: str) -> list[str]:
-    """Return the plan of a data frame in lines, or the reason why there is none."""
+def _list_plan(sensor: Sensor, frame: str) -> list[str]:
+    """Return the lines of the plan of a data frame, or the reason why it has no plan."""
     from lidarspec.frames.frame_table import CompiledTable
     from lidarspec.framing.results import Counters, Found, pack_found
     from lidarspec.packets.stream import PacketStream
@@ -211,7 +217,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     except SpecError as error:
         return [f"plain evaluation: {error}"]
     if sweep:
-        frames = maker.seal(maker.table([sweep(index) for index in range(PACKETS)]))
+        frames = maker.seal(maker.table([sweep(index) for index in range(PLANNED_PACKETS)]))
     else:
         frames = [sensor.example(frame)]
     sent = pack_found([Found(frame, 0, data) for data in frames])
@@ -273,7 +279,7 @@ def trust(folder: str) -> None:
     )
 
 
-def _facts(sensor: Sensor) -> dict[str, Any]:
+def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     """Return the facts about a sensor as a JSON object."""
     from lidarspec.exports.json import facts, link_data
 
@@ -287,7 +293,7 @@ def _facts(sensor: Sensor) -> dict[str, Any]:
     }
 
 
-def _frame(frame: Frame) -> dict[str, Any]:
+def _frame_to_dict(frame: Frame) -> dict[str, Any]:
     from lidarspec.exports.json import facts
     from lidarspec.frames.wire_table import frame_size, wire_table
 
@@ -300,7 +306,7 @@ def _frame(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
+def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
     args = {name: argument.to_dict() for name, argument in command.arguments.items()}
     if command.frame is None or args:
@@ -316,10 +322,10 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
     }
 
 
-def _command_text(sensor: Sensor, name: str) -> str:
+def _format_command(sensor: Sensor, name: str) -> str:
     from lidarspec.explaining.formatting import format_argument_type
 
-    command = _command(sensor, name)
+    command = _command_to_dict(sensor, name)
     args = "".join(
         f" {name}={format_argument_type(argument.kind)}"
         for name, argument in sensor.commands[name].arguments.items()
@@ -334,10 +340,10 @@ def _command_text(sensor: Sensor, name: str) -> str:
     return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
 
 
-def _links(links: Mapping[str, KnownLink]) -> str:
-    return ", ".join(_link_text(link) for link in links.values())
+def _format_links(links: Mapping[str, KnownLink]) -> str:
+    return ", ".join(_format_link(link) for link in links.values())
 
 
-def _link_text(link: KnownLink) -> str:
+def _format_link(link: KnownLink) -> str:
     unit = "baud" if link.kind == "serial" else ""
     return f"{link.kind} {'/'.join(map(str, link.numbers))} {unit}".strip()

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 #: Default duration of a file, in seconds.
-IN_A_FILE = 10.0
-#: Maximum width and height of the picture in cells, and lines reserved for the summary.
-WIDEST = 100
-HIGHEST = 42
-SUMMARY = 8
+FILE_DURATION_S = 10.0
+#: Maximum width and height of the picture in cells, and number of lines for the summary.
+MAX_PICTURE_COLUMNS = 100
+MAX_PICTURE_LINES = 42
+SUMMARY_LINES = 8
 PLACES = (
     f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or"
     " udp]"
@@ -163,7 +163,7 @@ def sim(
                 f"--to {place}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
                 f" ({', '.join(SUFFIXES)})"
             )
-        written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
+        written = write_file(device, place, duration or FILE_DURATION_S, overwrite=force)
         _announce(sensor, place, place, {}, as_json=as_json)
         note(f"{_format_sent(device)}, {size(written)}")
         return
@@ -178,7 +178,7 @@ def sim(
         controls = {name: control.local_source for name, control in opened.controls.items()}
         _announce(sensor, opened.local_source, opened.source, controls, as_json=as_json)
         with handle_sigterm(), Progress() as progress:
-            serve(device, opened, seconds=duration, on_pass=_watching(device, opened, progress))
+            serve(device, opened, seconds=duration, on_pass=_make_watcher(device, opened, progress))
     finally:
         opened.close()
         if opened.unsent_bytes:
@@ -191,7 +191,7 @@ def sim(
 def _announce(
     sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
-    """Print the place of the sensor, its other links, and the next command."""
+    """Print the address of the sensor, its other links, and the next command."""
     verb = verb_to_show(sensor)
     following = f"lidarspec {verb} {shlex.quote(source)} {format_sensor_options(sensor)}"
     if as_json:
@@ -213,8 +213,10 @@ def _announce(
     note(f"{sensor.id}, simulated{control_lines}\n  next: {following}")
 
 
-def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
-    """Return a callback that prints received commands, and when the plug is pulled."""
+def _make_watcher(
+    device: SimulatedDevice, opened: Outlet, progress: Progress
+) -> Callable[[], None]:
+    """Return a callback that prints received commands, and each unplugging."""
     began = time.monotonic()
     printed = 0
     present = True
@@ -267,23 +269,26 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     result = demonstrate(sensor, turns=count, errors=errors)
     whole = [scan for scan in result.scans if scan.whole]
     if as_json:
-        emit_json(_facts(result, whole), None)
+        emit_json(_result_to_dict(result, whole), None)
     else:
-        say("\n".join([render(_picture(whole[-1])), *_summary(result, whole, errors)]), colour=True)
+        say(
+            "\n".join([render(_draw_picture(whole[-1])), *_summarize(result, whole, errors)]),
+            colour=True,
+        )
     if result.digest != result.recorded_digest:
         click.get_current_context().exit(FINDINGS)
 
 
-def _picture(scan: Scan) -> Text:
-    columns, lines = shutil.get_terminal_size((80, HIGHEST))
-    width = min(columns, WIDEST)
-    height = max(min(lines - SUMMARY, HIGHEST), 12)
+def _draw_picture(scan: Scan) -> Text:
+    columns, lines = shutil.get_terminal_size((80, MAX_PICTURE_LINES))
+    width = min(columns, MAX_PICTURE_COLUMNS)
+    height = max(min(lines - SUMMARY_LINES, MAX_PICTURE_LINES), 12)
     return draw_cloud(
         scan.points, width=width, height=height, look=choose_appearance(scan.points)
     ).text()
 
 
-def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[str]:
+def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[str]:
     stats = result.stats
     name = result.sensor.id
     frames = sum(stats.frames.values())
@@ -305,7 +310,7 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
             f" of {stats.bytes_in} bytes skipped"
         ),
     ]
-    facts = _facts(result, whole)
+    facts = _result_to_dict(result, whole)
     if facts["rate_hz"]:
         rate = f" at {facts['rate_hz']:.1f} Hz"
     else:
@@ -326,7 +331,7 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
     return [*lines, f"next: lidarspec view sim:{name}"]
 
 
-def _facts(result: Demonstration, whole: list[Scan]) -> dict[str, object]:
+def _result_to_dict(result: Demonstration, whole: list[Scan]) -> dict[str, object]:
     rates = [scan.rate_hz for scan in whole if np.isfinite(scan.rate_hz)]
     return {
         "sensor": result.sensor.id,

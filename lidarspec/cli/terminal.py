@@ -1,7 +1,7 @@
 """Standard output and standard error of all verbs.
 
-Addresses, file names and texts of devices and plugins come from others: characters that control a
-terminal are escaped. A remark that cannot be written does not end a verb, which would stop a
+Addresses, file names and texts of devices and plugins are not trusted: characters that control a
+terminal are escaped. A remark that cannot be written does not end a verb, because that would stop a
 recording; data that cannot be written is an error.
 """
 
@@ -22,17 +22,18 @@ from lidarspec.errors import SourceError, printable
 
 
 class Verbosity:
-    """The amount of remarks printed beside the data.
+    """The amount of remarks that are printed on standard error.
 
     Attributes:
-        loudness: -1 for none, 1 for more than by default; each command begins with 0.
+        loudness: -1 for no remarks, 0 for the default, 1 for more remarks; each command begins
+            with 0.
     """
 
     loudness = 0
 
 
 voice = Verbosity()
-#: The sequences that change colours, and do nothing else.
+#: Pattern of the escape sequences that only change colours.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
 
@@ -40,7 +41,7 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
     """Print data on standard output; bytes as they are.
 
     Args:
-        colour: keep colours of the text in a pipe; None if the text has none of ours.
+        colour: True keeps the colours of the text in a pipe; None if lidarspec has not coloured it.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.
@@ -67,18 +68,19 @@ def note(text: str) -> None:
 
 @contextlib.contextmanager
 def prepare_streams() -> Iterator[None]:
-    """Prepare standard input, output and error for a verb, and flush them.
+    """Prepare standard input, output and error for a verb, and flush them at its end.
 
     Closed streams are replaced. Each warning is printed once, as a remark.
 
     Raises:
-        BrokenPipeError, SourceError: as `say`.
+        BrokenPipeError: if the reader has closed the pipe.
+        SourceError: if output cannot be written for another reason.
     """
     voice.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:
-            # A file opened later would get the number of a closed stream, and with it what is
-            # printed. Output that was closed is refused.
+            # Without this, a file that is opened later would get the descriptor of the closed
+            # stream, and with it the printed text. Writing to a closed output is refused.
             descriptor = os.open(os.devnull, flags)
             mode = "r" if name == "stdin" else "w"
             setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115

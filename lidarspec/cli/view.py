@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 
 from lidarspec.cli.inputs import (
-    PATIENCE,
+    FIRST_FRAME_TIMEOUT_S,
     conclude,
     no_scan_error,
     refuse_overwriting,
@@ -124,12 +124,15 @@ def view(
         )
         return
     if in_rerun:
-        _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
+        _show_in_rerun(source, sensor_id, output or "", ramp, duration, selection)
         return
     if once or not is_interactive():
         with open_device(source, sensor_id) as device:
             require_points(device, source)
-            say(_draw_once(device, source, ramp, duration or PATIENCE, selection), colour=True)
+            say(
+                _draw_once(device, source, ramp, duration or FIRST_FRAME_TIMEOUT_S, selection),
+                colour=True,
+            )
             conclude(device)
         return
     if is_live(source):
@@ -142,7 +145,7 @@ def view(
         require_points(device, source)
         if switch is not None:
             switch.sensor_id = device.sensor.id
-        _show(
+        _run_window(
             device,
             Window(
                 LiveScans(device, played=True, select=selection),
@@ -206,7 +209,7 @@ def _open_in_browser(server: PageServer) -> bool:
 
 
 def parse_address(address: str | None) -> tuple[str, int]:
-    """Return the host and the port of the page; port 0 stands for any free port.
+    """Return the host and the port of the page; with port 0, the system chooses one.
 
     Raises:
         UsageError: if the port is not a number.
@@ -218,7 +221,7 @@ def parse_address(address: str | None) -> tuple[str, int]:
     return origin.host, origin.port or 0
 
 
-def _in_rerun(
+def _show_in_rerun(
     source: str,
     sensor_id: str | Sensor | None,
     target: str,
@@ -247,11 +250,11 @@ def _in_rerun(
         conclude(device)
 
 
-def _show(device: Device, window: Window, *, taken: bool) -> None:
+def _run_window(device: Device, window: Window, *, taken: bool) -> None:
     """Run the window until it or its terminal is closed.
 
     Args:
-        taken: whether standard input is the data.
+        taken: whether standard input contains the data, so that no keys can be read.
     """
     try:
         with Screen(sys.stdout, keyboard(taken=taken)) as screen:

@@ -56,7 +56,7 @@ BROKEN: tuple[tuple[Place, int, str], ...] = (
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(inputs, "PATIENCE", 0.2)
+    monkeypatch.setattr(inputs, "FIRST_FRAME_TIMEOUT_S", 0.2)
     return tmp_path
 
 
