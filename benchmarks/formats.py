@@ -52,7 +52,7 @@ print(json.dumps([seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * unit]
 sys.exit(code)
 """
 
-#: What a user would write: all points in memory, then one call.
+#: Code of a user: all points in memory, then one call.
 BESIDE = """
 import sys
 import numpy as np

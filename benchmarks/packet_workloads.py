@@ -90,7 +90,7 @@ def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
             cloud.x,
             cloud.y,
             cloud.intensity,
-        )  # of these sensors, the planar ones are not organised
+        )  # only planar sensors have no shape here
     return cloud.x, cloud.y, cloud.z, cloud.intensity
 
 

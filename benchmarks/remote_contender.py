@@ -69,7 +69,7 @@ def prepare_in(python: Path, prepare: Callable[..., Contender], *arguments: Any)
 def serve() -> None:
     """Run the worker: prepare the contender and answer requests."""
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints does not get between the replies
+    os.dup2(2, 1)  # keep a library's output out of the replies
     try:
         prepare, arguments = pickle.load(sys.stdin.buffer)
         contender = prepare(*arguments)

@@ -19,7 +19,7 @@ COLUMNS = {
 INNER = ("libraries",)
 #: characters; what is piped to a file is not folded to a terminal.
 WIDE = 180
-#: shares of memcpy below this say nothing.
+#: Smallest meaningful share of memcpy.
 LEAST_SHARE = 1e-4
 
 

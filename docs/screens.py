@@ -31,7 +31,7 @@ HERE = Path(__file__).parent / "how-to" / "screens"
 #: pixels of a cell, of the margin, and of a dot.
 ACROSS, DOWN, MARGIN, DOT = 8, 16, 12, 2.3
 GROUND, PLAIN = "#101218", "#d8dae0"
-#: what the pages call the port of the sensor.
+#: The sensor's port in the pages' commands.
 PORT = "/dev/ttyUSB0"
 
 

@@ -41,7 +41,7 @@ VERBS: dict[str, tuple[str, ...]] = {
     "send": ("send", "SOURCE", "start", *COMMANDED, "--timeout", "200ms"),
     "detect": ("detect", "SOURCE", *BRIEF),
 }
-#: places, the exit code that DESIGN gives them, and a word of what is said.
+#: Broken sources, their documented exit code, and a word of the message.
 BROKEN: tuple[tuple[Place, int, str], ...] = (
     (nothing, 3, "no such port"),
     (busy, 3, "in use"),

@@ -44,7 +44,7 @@ FRAME_PERIOD_NS = 555_556
 STL = "ldrobot-stl27l"
 TEXT = b"these are the minutes of a meeting, and no lidar was there\n"
 CHECKOUT = Path(__file__).parents[2]
-#: what differs from one machine or run to the next, and its replacement.
+#: Texts that differ between machines or runs, and their replacements.
 VARIABLE_TEXTS = (
     (re.compile(re.escape(str(CHECKOUT))), "CHECKOUT"),
     (re.compile(re.escape(ls.__version__)), "VERSION"),

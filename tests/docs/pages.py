@@ -27,7 +27,7 @@ from typing import Any
 
 DOCS = Path(__file__).parents[2] / "docs"
 OUTPUT = "Output"
-#: what stands between two blocks of one file.
+#: Separator between two blocks of a file.
 SEPARATOR = "\n\n"
 #: pip takes the build backend from what is installed, and needs no package index.
 OFFLINE = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}

@@ -13,7 +13,7 @@ from lidarspec.framing.results import pack_found
 from tests.broken import sound
 
 HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}
-COUNT = 12  # where the count stands
+COUNT = 12  # offset of the count
 LONGEST = 87
 SOUND = sound.sensor()
 

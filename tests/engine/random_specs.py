@@ -14,7 +14,7 @@ import construct
 
 from lidarspec import spec as vocabulary
 
-#: what the text may name.
+#: Names that the text may use.
 NAMES: dict[str, Any] = {
     **vars(construct),
     **{name: getattr(vocabulary, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")},

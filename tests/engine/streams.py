@@ -20,7 +20,7 @@ from tests.agreement import cuts
 from tests.by_construct import reader
 from tests.engine.oracle import Cut
 
-#: about so many bytes to a stream: the oracle takes its time.
+#: Approximate bytes of a stream; the oracle is slow.
 LENGTH = 800
 MEGABYTE = 1 << 20
 MANY_HEADERS = 200

@@ -32,7 +32,7 @@ GOOD_RATIO = 2.2
 #: On a busy machine many runs are slowed down; the shortest of both lengths are compared.
 MAX_TRIES = 15
 MUTANT_TRIES = 5
-#: CPU seconds below which a ratio says nothing.
+#: Minimum CPU seconds of a meaningful ratio.
 MIN_SECONDS = 0.05
 
 

@@ -20,7 +20,7 @@ from tests.engine.engines import is_compiled
 from tests.engine.random_specs import make_struct, spec
 
 LONGEST = 150
-#: what compiles points, where it is installed.
+#: The compiled back end, if it is installed.
 JIT = ("jit",) if importlib.util.find_spec("numba") else ()
 
 

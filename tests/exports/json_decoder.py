@@ -127,7 +127,7 @@ class Decoder:
             self.at = start
             try:
                 value = self.read(kind["part"])
-            except AssertionError:  # it would be longer than what is left
+            except AssertionError:  # longer than the remaining bytes
                 continue
             constants = {
                 member["name"]: member.get("const")
