@@ -52,7 +52,7 @@ MAX_COUNTED_KINDS = 16
 UNKNOWN_ENDPOINT = ("0.0.0.0", 0)
 #: The bytes in front of an IPv4 address that is written as an IPv6 address (RFC 4291).
 _IPV4_MAPPED_PREFIX = bytes.fromhex("00000000000000000000ffff")
-# #: A datagram over IPv6 can be longer, because the length does not count its header.
+#: A datagram over IPv6 can be longer, because the length does not count its header.
 _EXTRA_PAYLOAD_BYTES_IPV6 = 20
 
 

@@ -330,7 +330,7 @@ def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
 
 @lru_cache(maxsize=64)
 def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit, and whether it is a digit, (256,)."""
+    """Return the value of each character as a digit, and which are digits, (256,)."""
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
@@ -537,7 +537,7 @@ class Tokens:
         return int(256**size - 1)
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded: fractions with few digits instead of random bits."""
+        """Return values that can be encoded: fractions with few digits."""
         if self.base == 16:
             return values
         drawn = values.copy()
@@ -777,7 +777,7 @@ class Echoes:
         return steps + characters[begin:], np.append(places, offsets[begin:])
 
     def _find_steps(self, characters: bytes) -> list[bytes]:
-        """Return the steps at the start of the characters, up to the first incomplete step."""
+        """Return the complete steps at the start of the characters."""
         steps = re.match(b"(?:%b)*" % self._step.pattern, characters, re.DOTALL)
         return [step[0] for step in self._step.finditer(steps[0])] if steps else []
 

@@ -120,7 +120,7 @@ def _format_expression(expression: Any, path: str) -> str:
 
 
 def _expand_path(path: str, way: re.Match[str]) -> str:
-    """Return the whole path of ``this.count`` or ``this._.count`` in the part at `path`."""
+    """Return the whole path of ``this.count`` or ``this._.count`` in a part."""
     names = path.split(".")[:-1]
     for name in way[0].split(".")[1:]:
         if name == "_root":
@@ -379,7 +379,7 @@ class _Builder:
             con = con.subcon
 
     def _adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
-        """Return the adapter of an integer, unless wrappers already give its values a meaning."""
+        """Return the adapter of an integer, unless its wrappers define its values."""
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
         return int_adapter(con)
@@ -749,7 +749,10 @@ class _Builder:
         return node
 
     def _encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
-        """Return bytes with functions that decode them; None if only construct can read them."""
+        """Return bytes with functions that decode them, or None.
+
+        It is None if only construct can read them.
+        """
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
             return None
@@ -1060,7 +1063,7 @@ def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
 
 
 def _is_text(con: Construct) -> bool:
-    """Return whether a construct parses to bytes up to a terminator or of a declared size."""
+    """Return whether a construct parses to bytes of variable size."""
     while isinstance(
         con,
         construct.NullTerminated
@@ -1083,7 +1086,7 @@ def _describe_form(con: Construct) -> str:
 
 
 def _find_terminator(con: Construct) -> bytes:
-    """Return the terminator byte after a field of arbitrary bytes; b"" for other fields."""
+    """Return the terminator after a field of arbitrary bytes; b"" for other fields."""
     is_ended = (
         isinstance(con, construct.NullTerminated)
         and con.subcon is construct.GreedyBytes

@@ -42,7 +42,7 @@ Fault = construct.ConstructError
 
 
 class MismatchError(construct.ConstructError):  # type: ignore[misc]
-    """A value on the wire contradicts the spec; the engine converts it to a `WireError`."""
+    """A value contradicts the spec; the engine converts it to a `WireError`."""
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
         super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
@@ -301,7 +301,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
 
 
 class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
-    """A NullTerminated that searches for its terminator instead of reading single bytes."""
+    """A NullTerminated that searches for its terminator, not byte by byte."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         if len(self.term) != 1 or not self.require or not isinstance(stream, io.BytesIO):
@@ -409,7 +409,7 @@ class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
 
 
 class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
-    """A NamedTuple of a struct without its private entries, which construct's own rejects."""
+    """A NamedTuple of a struct without private entries, which construct's rejects."""
 
     def _decode(self, obj: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, dict):

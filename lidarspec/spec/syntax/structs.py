@@ -462,7 +462,7 @@ def fixed_size(con: Construct) -> int:
 
 
 def remove_private(parsed: Any) -> Any:
-    """Return a parsed object without the private entries of construct and this package."""
+    """Return a parsed object without private entries."""
     if isinstance(parsed, dict):
         return Container(
             {
