@@ -43,6 +43,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.scenes import Box, Room
 from lidarspec.simulation.simulator import make_opening_frame, simulate
 from lidarspec.spec.arguments import Address, Range, Taken, Text
+from lidarspec.spec.syntax import check_bound
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.value_ranges import (
     LayoutRanges,
@@ -65,6 +66,8 @@ MAX_EXCEPTIONS = 6
 LOW_NUMBERS = (8, 40)
 #: Number of tries to draw a frame without a layout in one example.
 TRIES = 4
+#: Maximum number of elements of nested arrays of such a frame, which construct builds one by one.
+MAX_BUILT_ELEMENTS = 400
 
 #: Maximum length in bytes of an argument if its field has no fixed size.
 MAX_OCTETS = 16
@@ -456,6 +459,8 @@ class _DrawnNumbers(random.Random):
         super().__init__(0)
         self._draw = draw
         self._ranges = ranges
+        #: elements of the arrays around the one that is drawn, multiplied.
+        self._elements = 1
 
     def draw(self, strategy: SearchStrategy[Any]) -> Any:
         """Draw a value of a strategy."""
@@ -477,8 +482,18 @@ class _DrawnNumbers(random.Random):
         return self.draw(_mostly_low(0, (1 << bits) - 1))
 
     def draw_elements(self, count: int, draw_one: Callable[[], Any]) -> list[Any]:
-        """Draw the elements of an array."""
-        return _draw_array(self._draw, count, draw_one)
+        """Draw the elements of an array.
+
+        Raises:
+            RangeError: if construct would build too many elements.
+        """
+        around = self._elements
+        self._elements *= max(count, 1)
+        try:
+            check_bound(self._elements, MAX_BUILT_ELEMENTS, "number of elements", "")
+            return _draw_array(self._draw, count, draw_one)
+        finally:
+            self._elements = around
 
     def random(self) -> float:
         return self._draw(st.floats(0, 1, exclude_max=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.simulation.faults import Faults
+from lidarspec.spec import Simulation
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports import serving
 from tests.lines import free_port, read_until
@@ -53,12 +55,16 @@ def test_time_stands_still_without_advance() -> None:
 
 
 @posix
-def test_replies_with_pauses_come_in_virtual_time() -> None:
+def test_replies_after_a_pause_come_without_advance() -> None:
+    paused = dataclasses.replace(
+        ls.sensor("slamtec-rplidar-a1"),
+        simulation=Simulation(answers={"get_info": (5.0, ("info", {"hardware": 9}))}),
+    )
     with (
-        virtual_port("slamtec-rplidar-a1", virtual_time=True) as port,
-        ls.open(port.path, "slamtec-rplidar-a1", start=False) as device,
+        virtual_port(paused, virtual_time=True) as port,
+        ls.open(port.path, paused, start=False) as device,
     ):
-        assert device.send("get_info").confirmed
+        assert device.send("get_info").values.hardware == 9
         assert device.send("scan").confirmed
         port.advance(0.5)
         read_until(device, lambda: device.stats.frames["node"] > 500)

@@ -108,6 +108,8 @@ def test_dependent_fields_are_drawn_together() -> None:
     assert {1, 7} < {value["kind"] for value in drawn}
     assert any(value["extra"] is not None for value in drawn)
     assert len({value["count"] for value in drawn}) > 10
+    longest = max(len(sensor.build("data", value)) for value in drawn)
+    assert 150 < longest <= sensor.frames["data"].max_length
     for value in drawn:
         assert value["count"] == len(value["samples"]) >= 1
         assert 5 <= value["low"] < value["high"]
