@@ -218,9 +218,9 @@ def plausible(f: Fields) -> Any:
 
 
 def correction(distance: Any) -> Any:
-    """Return the angle correction in degrees for a distance in metres, 0 where there is no return.
+    """Return the angle correction in degrees, 0 if there is no return.
 
-    Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
+    `distance` is in metres. Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
     """
     mm = np.maximum(distance * 1000, 1)
     return np.where(distance > 0, np.rad2deg(np.arctan(19.16 * (mm - 90.15) / (90.15 * mm))), 0)
@@ -264,9 +264,10 @@ def configure(
     *,
     zero: Literal["data", "housing"] = "data",
 ) -> Sensor:
-    """Return the sensor with angles from the zero of the data, as on the wire, or the housing.
+    """Return the sensor with angles from the zero of the data or of the housing.
 
-    Source: manual 2.2.2, bytes 13 and 14; it does not say whether the host should add the angle.
+    The data on the wire count from the zero of the data. Source: manual 2.2.2, bytes 13 and 14;
+    whether the host should add the angle is not documented.
     """
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
@@ -442,7 +443,7 @@ M1C1_MINI_V11 = Sensor(
 def make_coin(model: str, **facts: Any) -> Sensor:
     """Return a sensor of the COIN series, which measures by time of flight.
 
-    It is an M1C1_Mini whose angles need no correction, changed by `facts`, arguments of `Sensor`.
+    It is an M1C1_Mini without correction of the angles, changed by `facts`, arguments of `Sensor`.
     """
     name = f"cspc-{model.lower()}"
     return dataclasses.replace(
