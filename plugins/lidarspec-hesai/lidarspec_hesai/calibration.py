@@ -148,7 +148,7 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
     table are ignored, as in the vendor's reader.
 
     Args:
-        wanted: the columns, with the model's values, whose spread the unit's must resemble.
+        wanted: the columns, with the model's values; the unit's must have a similar spread.
 
     Raises:
         UsageError: if the file cannot be read, or does not have these columns for every channel of

@@ -21,7 +21,7 @@ def make_spinning_sensor(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a rotating sensor, whose angles are requested when it is opened.
+    """Return a rotating sensor; opening it requests its angles.
 
     Args:
         id: the id of the sensor.
