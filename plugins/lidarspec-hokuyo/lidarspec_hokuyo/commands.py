@@ -158,7 +158,7 @@ URG_ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 
 
 def list_orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """Return all commands of a scanner whose scans are of this kind."""
+    """Return all commands of a scanner that sends scans of this kind."""
     scans = {
         "start": (SCAN_COMMANDS[kind][0].encode(), 13, {"starts": True}),
         "get_scan": (SCAN_COMMANDS[kind][1].encode(), 10, {}),

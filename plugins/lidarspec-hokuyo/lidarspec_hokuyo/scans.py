@@ -87,7 +87,7 @@ def make_decimal(name: str, places: int, most: int = 9999) -> Any:
     largest = (first, *[9] * (places - 1))
     digits = zip(DIGITS[places], largest, strict=True)
     return name / Struct(
-        *(place / Scaled(OneOf(Int8ub, range(high + 1)), 1, "") for place, high in digits)
+        *(digit_name / Scaled(OneOf(Int8ub, range(high + 1)), 1, "") for digit_name, high in digits)
     )
 
 
@@ -104,8 +104,8 @@ def two_digit_value(digits: Any) -> Any:
 def split_digits(name: str, value: int, places: int) -> dict[str, int]:
     """Return the digits of a number by their field path."""
     return {
-        f"{name}.{place}": int(digit)
-        for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
+        f"{name}.{digit_name}": int(digit)
+        for digit_name, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
     }
 
 
