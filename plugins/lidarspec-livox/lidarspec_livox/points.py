@@ -44,7 +44,7 @@ def make_returns(count: int, *members: Any) -> Any:
 
 
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
-    """Return points from x, y and z on the wire, whose axes are those of REP-103.
+    """Return points from x, y and z on the wire, which are in REP-103 axes.
 
     Three zeros mean no return.
 
@@ -63,7 +63,7 @@ def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) ->
 def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
     """Return points from depth, azimuth and zenith angle (from the z axis).
 
-    The arguments are those of `cartesian`.
+    The arguments are the same as for `cartesian`.
     """
     members = f.points if returns == 1 else f.points.returns
     azimuth = np.deg2rad(f.points.azimuth)
