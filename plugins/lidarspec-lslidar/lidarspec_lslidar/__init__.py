@@ -191,7 +191,7 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     Args:
         i: the number of the packet.
         hertz: revolutions per second.
-        count: samples of a packet that contains its length, else 0.
+        count: samples of a packet that contains its length; 0 for other packets.
         timed: whether packets have a time.
     """
     seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS_PER_TURN)), 1_000_000)

@@ -121,10 +121,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
-    """Return points clockwise from ahead, with azimuths between those of the blocks.
+    """Return points clockwise from ahead, with azimuths interpolated between blocks.
 
-    The origin is an optical centre beside the axis, which rotates with the lasers. `unit` is the
-    distance step in centimetres.
+    The optical centre rotates with the lasers at a distance from the axis. `unit` is the distance
+    step in centimetres.
     """
     dual = f.return_mode == DUAL
     block = np.arange(BLOCKS)[:, None, None]
