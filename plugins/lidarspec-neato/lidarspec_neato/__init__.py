@@ -113,7 +113,7 @@ def sample_times(f: Fields, count: int) -> Any:
 
 
 def points(f: Fields, direction: int) -> Polar:
-    """Return points one degree apart, including weak ones.
+    """Return points one degree apart, including weak points.
 
     `direction` is 1 for counter-clockwise, -1 for clockwise.
     """
