@@ -217,13 +217,13 @@ def configure(
         UsageError: if the metadata cannot be read or are of another model, or the layout does not
             exist.
     """
-    given = {"rows": rows, "turn": turn, "profile": profile}
-    given = {name: value for name, value in given.items() if value is not None}
-    metadata = metadata or (None if given else sensor.options.get("metadata"))
+    arguments = {"rows": rows, "turn": turn, "profile": profile}
+    arguments = {name: value for name, value in arguments.items() if value is not None}
+    metadata = metadata or (None if arguments else sensor.options.get("metadata"))
     if metadata is not None:
-        if given:
+        if arguments:
             raise UsageError(
-                f"{sensor.id}: the metadata contain {' and '.join(given)}: omit this option"
+                f"{sensor.id}: the metadata contain {' and '.join(arguments)}: omit this option"
             )
         unit = read_unit(metadata)
         models = [
@@ -238,7 +238,7 @@ def configure(
     layout = {
         **DEFAULT_LAYOUT,
         **{name: value for name, value in sensor.options.items() if name in DEFAULT_LAYOUT},
-        **given,
+        **arguments,
     }
     for name, maximum in (("rows", 128), ("turn", 4096)):
         if not 16 <= layout[name] <= maximum or layout[name] % 16:
