@@ -35,7 +35,7 @@ from lidarspec.spec import (
 
 FIRINGS = 50
 LASERS = 8
-POSITIONS_PER_TURN = 10_400  # positions of a turn
+POSITIONS_PER_TURN = 10_400
 FINE_STEP_VERSION = (
     5  # the first version of packets with steps of 10 um; before it they are of 10 mm
 )
