@@ -200,7 +200,7 @@ def split_angles(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
 def laser_degrees(entry: Any) -> Any:
     """Return the degrees of each laser, on the lasers' axis.
 
-    The angle is nan if the sensor is not calibrated, so such a laser gives no points.
+    An angle is nan if the sensor is not calibrated, and its points are invalid.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
@@ -256,7 +256,7 @@ def make_points(
     distance: Any = None,
     ring: Any = None,
 ) -> Polar:
-    """Return the points of lasers whose optical centre is beside the axis.
+    """Return the points of lasers with an optical centre away from the axis.
 
     The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step between
     shots follows from the speed in DIFOP until the first good step.
