@@ -61,14 +61,14 @@ def ros2(
     (--params-file), names (-r __node:=front, -r scan:=front/scan). The node is configured and
     activated when it starts. The reference lists its parameters.
     """
-    given = {
+    parameters = {
         "source": source,
         "sensor": sensor_id,
         "options": list(options),
         "calibration": calibration,
         "autostart": True,
     }
-    run({name: value for name, value in given.items() if value}, ctx.meta["ros_args"])
+    run({name: value for name, value in parameters.items() if value}, ctx.meta["ros_args"])
 
 
 def main() -> None:

@@ -341,13 +341,13 @@ class LidarNode(LifecycleNode):
         self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Send a command, and return its reply or the error in the response."""
-        given = {
+        values = {
             argument: self.get_parameter(f"{name}.{argument}").value
             for argument in device.sensor.commands[name].args
         }
         try:
             words = [
-                f"{argument}={value}" for argument, value in given.items() if value is not None
+                f"{argument}={value}" for argument, value in values.items() if value is not None
             ]
             reply = device.send(name, **parse_arguments(device.sensor, name, words))
         except LidarSpecError as error:

@@ -279,9 +279,9 @@ class Settings:
 
     def find_mount(self) -> Mount | None:
         """Return the mount of the parameters or of `lidarspec.toml`; None if neither."""
-        given = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
+        mount = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
         device = find_device(self["source"])
-        return given if given != Mount() else None if device is None else device.mount
+        return mount if mount != Mount() else None if device is None else device.mount
 
     def open_device(self, record: Callable[[Transport], TrafficLog]) -> Device:
         """Return the open device.
