@@ -178,8 +178,10 @@ def points(f: Fields) -> Polar:
     differences = f.blocks.more
     channel = pixels.index % CHANNELS
     angle, tilt = (
-        np.where(channel == 0, 0, np.where(channel == 1, one, np.where(channel == 2, two, three)))
-        for one, two, three in (
+        np.where(
+            channel == 0, 0, np.where(channel == 1, first, np.where(channel == 2, second, third))
+        )
+        for first, second, third in (
             (differences.angle_1, differences.angle_2, differences.angle_3),
             (differences.tilt_1, differences.tilt_2, differences.tilt_3),
         )
