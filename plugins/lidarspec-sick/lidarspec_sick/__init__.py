@@ -1,4 +1,4 @@
-"""SICK scanners: those that send LMDscandata, and multiScan and picoScan with compact telegrams."""
+"""SICK scanners with LMDscandata, and multiScan and picoScan with compact telegrams."""
 
 from __future__ import annotations
 
