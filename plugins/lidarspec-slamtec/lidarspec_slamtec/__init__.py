@@ -112,16 +112,16 @@ FRAMES = {
 def configure(
     sensor: Sensor, *, dtheta: Literal["unsigned", "signed"] | None = None, mode: int | None = None
 ) -> Sensor:
-    """Return the sensor with another interpretation of express capsules, or another scan mode.
+    """Return the sensor with other options for express capsules or the scan mode.
 
     Args:
-        dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK,
-            or "signed" as in the protocol.
-        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` has to be the
-            kind of its answers.
+        dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK, or
+            "signed" as in the protocol.
+        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` must be the
+            kind of its replies.
 
     Raises:
-        UsageError: for a mode that is not a number from 0 to 255.
+        UsageError: if the mode is not a number from 0 to 255.
     """
     if dtheta is not None:
         changed = dataclasses.replace(
