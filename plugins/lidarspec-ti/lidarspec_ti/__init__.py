@@ -4,12 +4,12 @@ A frame on its data UART is a header and parts with a type and a length, selecte
 padded with arbitrary bytes to a multiple of 32. Each point has a velocity. Its SNR is in a separate
 part, in the order of the points: ``packets.parts("tlvs.side_info")``.
 
-Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), whose
-44 bytes of header are 40 by its own table; mmWave SDK 3.5 (mmw_output.h) for the types of parts,
-dpif_pointcloud.h for points and SNR. Assumed: the cycles are those of the 200 MHz R4F, and the
-longest range. Heat maps, and parts of other demos of the toolbox, are kept as bytes. To configure
-and start the radar, send it the lines of a .cfg file over its other UART at 115 200 baud; this
-plugin does not.
+Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), which
+prints a header of 44 bytes that has 40 by its own table; mmWave SDK 3.5 (mmw_output.h) for the
+types of parts, dpif_pointcloud.h for points and SNR. Assumed: the cycles of the 200 MHz R4F, and
+the longest range. Heat maps, and parts of other demos of the toolbox, are kept as bytes. To
+configure and start the radar, send it the lines of a .cfg file over its other UART at 115 200 baud;
+this plugin does not.
 """
 
 from __future__ import annotations
