@@ -53,9 +53,9 @@ from lidarspec.spec import (
 SYNC = b"\xb5\x62"  # UBX frames, 3.2 UBX Frame Structure
 ACK = 0x05
 CFG = 0x06
-MAX_PAYLOAD = 1200  # bytes of other UBX messages; more than RXM-RAWX of 35 signals has
-MAX_SENTENCE = 120  # bytes; NMEA 0183 allows 82, and high precision is longer
-WEEK = 604_800.0
+MAX_PAYLOAD_BYTES = 1200  # of other UBX messages: more than RXM-RAWX with 35 signals
+MAX_SENTENCE_BYTES = 120  # NMEA 0183 allows 82; sentences of high precision are longer
+WEEK_S = 604_800.0
 
 
 class Fletcher(Checksum):
@@ -82,8 +82,11 @@ class Fletcher(Checksum):
         return hash(Fletcher)
 
 
-def ubx(message: bytes, size: int, *fields: Construct) -> Construct:
-    """Return a UBX frame with its class, id and length, and the fields of its payload."""
+def make_ubx(message: bytes, size: int, *fields: Construct) -> Construct:
+    """Return the struct of a UBX frame: class and id, length, payload, checksum.
+
+    `size` is the length of the payload in bytes, `fields` are its fields.
+    """
     names = [field.name for field in fields]
     return Checksummed(
         Struct(
@@ -103,7 +106,7 @@ FIX_TYPES = Enum(
     Int8ul, none=0, dead_reckoning=1, fix_2d=2, fix_3d=3, gnss_and_dead_reckoning=4, time_only=5
 )
 
-NAV_PVT = ubx(  # p. 150
+NAV_PVT = make_ubx(  # p. 150
     b"\x01\x07",
     92,
     "time_of_week" / Scaled(Int32ul, 0.001, "s") * "iTOW: GPS time of week",
@@ -148,7 +151,7 @@ NAV_PVT = ubx(  # p. 150
     "declination_accuracy" / Scaled(Int16ul, 0.01, "deg"),
 )
 
-NAV_TIMEUTC = ubx(  # p. 168
+NAV_TIMEUTC = make_ubx(  # p. 168
     b"\x01\x21",
     20,
     "time_of_week" / Scaled(Int32ul, 0.001, "s") * "iTOW: GPS time of week",
@@ -170,7 +173,7 @@ NAV_TIMEUTC = ubx(  # p. 168
     ),
 )
 
-TIM_TP = ubx(  # p. 183
+TIM_TP = make_ubx(  # p. 183
     b"\x0d\x01",
     16,
     "time_of_week" / Scaled(Int32ul, 0.001, "s") * "of the next pulse",
@@ -192,25 +195,25 @@ TIM_TP = ubx(  # p. 183
     ),
 )
 
-ACKNOWLEDGE = ubx(b"\x05\x01", 2, "message_class" / Int8ul, "message_id" / Int8ul)
-REFUSE = ubx(b"\x05\x00", 2, "message_class" / Int8ul, "message_id" / Int8ul)
-SET_MESSAGE = ubx(  # UBX-CFG-MSG, p. 54
+ACKNOWLEDGE = make_ubx(b"\x05\x01", 2, "message_class" / Int8ul, "message_id" / Int8ul)
+REFUSE = make_ubx(b"\x05\x00", 2, "message_class" / Int8ul, "message_id" / Int8ul)
+SET_MESSAGE = make_ubx(  # UBX-CFG-MSG, p. 54
     b"\x06\x01",
     3,
     "message_class" / Int8ul,
     "message_id" / Int8ul,
     "rate" / Int8ul * "once every so many solutions, 0: never",
 )
-SET_RATE = ubx(  # UBX-CFG-RATE, p. 75
+SET_RATE = make_ubx(  # UBX-CFG-RATE, p. 75
     b"\x06\x08",
     6,
     "period" / Scaled(Int16ul, 0.001, "s") * "between measurements",
     "cycles" / Int16ul * "measurements for each solution",
     "time_reference" / Enum(Int16ul, utc=0, gps=1, glonass=2, beidou=3, galileo=4),
 )
-POLL_PVT = ubx(b"\x01\x07", 0)
-POLL_TIMEUTC = ubx(b"\x01\x21", 0)
-POLL_TIM_TP = ubx(b"\x0d\x01", 0)
+POLL_PVT = make_ubx(b"\x01\x07", 0)
+POLL_TIMEUTC = make_ubx(b"\x01\x21", 0)
+POLL_TIM_TP = make_ubx(b"\x0d\x01", 0)
 
 OTHER_UBX = Checksummed(
     Struct(
@@ -261,7 +264,7 @@ GGA = Struct(
     "age" / Scaled(Float32b, 1, "s") * "of differential corrections",
     "station" / Bytes(4) * "of differential corrections",
 )
-OTHER_NMEA = Struct("address" / Bytes(5), "content" / Bytes(MAX_SENTENCE - 12))
+OTHER_NMEA = Struct("address" / Bytes(5), "content" / Bytes(MAX_SENTENCE_BYTES - 12))
 
 COORDINATES = {"time": "hhmmss.ss", "latitude": "ddmm.mmmmm", "longitude": "dddmm.mmmmm"}
 SENTENCE = Tokens(
@@ -273,29 +276,29 @@ WIRE_OTHER = replace(SENTENCE, joined=1, rest=True)
 
 
 def is_date(f: Fields) -> Any:
-    """A date and time of the calendar, also before they are known."""
+    """Return whether date and time are possible, even before they are known."""
     return (f.month <= 12) & (f.day <= 31) & (f.hour < 24) & (f.minute < 60) & (f.second <= 60)
 
 
-def is_pvt(f: Fields) -> Any:
-    """A position on Earth at a date of the calendar."""
+def is_position(f: Fields) -> Any:
+    """Return whether the position is on Earth and the date is possible."""
     return is_date(f) & (abs(f.latitude) <= 90) & (abs(f.longitude) <= 180)
 
 
 def is_pulse(f: Fields) -> Any:
-    return f.time_of_week < WEEK
+    return f.time_of_week < WEEK_S
 
 
-def utc(f: Fields) -> Any:
+def utc_time(f: Fields) -> Any:
     """Return the seconds since 1970, and the fraction of a second."""
     return unix_time(f.year, f.month, f.day, f.hour, f.minute, f.second), f.nano * 1e-9
 
 
-def date_of(i: int, rate: float) -> dict[str, Any]:
-    """Return the date of frame i, beginning on Sunday, 2026-01-04, in GPS time of week."""
+def date_values(i: int, rate: float) -> dict[str, Any]:
+    """Return the date of simulated frame i, from Sunday, 2026-01-04, on."""
     second = int(i // rate)
     return {
-        "time_of_week": i / rate % WEEK,
+        "time_of_week": i / rate % WEEK_S,
         "year": 2026,
         "month": 1,
         "day": 4 + second // 86_400 % 28,
@@ -308,10 +311,13 @@ def date_of(i: int, rate: float) -> dict[str, Any]:
 
 
 def pvt_sweep(i: int) -> dict[str, Any]:
-    """Return solution i of five a second: northward at 1 m/s from the manual's position."""
+    """Return simulated solution i, five a second.
+
+    The receiver moves northward at 1 m/s from the manual's position.
+    """
     valid = {"valid.date": 1, "valid.time": 1, "valid.fully_resolved": 1}
     return {
-        **date_of(i, 5),
+        **date_values(i, 5),
         **valid,
         "fix_type": 3,
         "flags": 1,
@@ -330,12 +336,12 @@ def pvt_sweep(i: int) -> dict[str, Any]:
 
 def timeutc_sweep(i: int) -> dict[str, Any]:
     valid = {"valid.utc": 1, "valid.week": 1, "valid.time_of_week": 1, "valid.standard": 3}
-    return {**date_of(i, 1), **valid}
+    return {**date_values(i, 1), **valid}
 
 
 def pulse_sweep(i: int) -> dict[str, Any]:
-    """Return the announcement of the pulse after second i, in GPS week 2400."""
-    return {"time_of_week": (i + 1) % WEEK, "week": 2400 + int((i + 1) // WEEK), "flags.utc": 1}
+    """Return the simulated announcement of the pulse after second i, in GPS week 2400."""
+    return {"time_of_week": (i + 1) % WEEK_S, "week": 2400 + int((i + 1) // WEEK_S), "flags.utc": 1}
 
 
 def clock_digits(i: int) -> float:
@@ -380,11 +386,13 @@ def gga_sweep(i: int) -> dict[str, Any]:
     }
 
 
-def text(struct: Construct, wire: Tokens, **more: Any) -> Frame:
-    return Frame(struct, wire=wire, max_length=MAX_SENTENCE, **more)
+def make_sentence_frame(struct: Construct, wire: Tokens, **more: Any) -> Frame:
+    return Frame(struct, wire=wire, max_length=MAX_SENTENCE_BYTES, **more)
 
 
-def configured(message_id: int, frame: str, args: dict[str, Any], **values: Any) -> Command:
+def make_configuration_command(
+    message_id: int, frame: str, args: dict[str, Any], **values: Any
+) -> Command:
     """Return a command of the class CFG, which the receiver acknowledges or refuses."""
     return Command(
         frame,
@@ -403,23 +411,23 @@ GNSS = Sensor(
     frames={
         "nav_pvt": Frame(
             NAV_PVT,
-            plausible=is_pvt,
-            clock=Clock(utc),
+            plausible=is_position,
+            clock=Clock(utc_time),
             simulation=Simulation(pvt_sweep, rate=5),
         ),
         "nav_timeutc": Frame(
             NAV_TIMEUTC,
             plausible=is_date,
-            clock=Clock(utc),
+            clock=Clock(utc_time),
             simulation=Simulation(timeutc_sweep, rate=1),
         ),
         "tim_tp": Frame(TIM_TP, plausible=is_pulse, simulation=Simulation(pulse_sweep, rate=1)),
-        "rmc": text(RMC, WIRE_RMC, simulation=Simulation(rmc_sweep, rate=1)),
-        "gga": text(GGA, WIRE_GGA, simulation=Simulation(gga_sweep, rate=1)),
+        "rmc": make_sentence_frame(RMC, WIRE_RMC, simulation=Simulation(rmc_sweep, rate=1)),
+        "gga": make_sentence_frame(GGA, WIRE_GGA, simulation=Simulation(gga_sweep, rate=1)),
         "acknowledge": Frame(ACKNOWLEDGE),
         "refuse": Frame(REFUSE),
-        "ubx": Frame(OTHER_UBX, max_length=8 + MAX_PAYLOAD),
-        "nmea": text(OTHER_NMEA, WIRE_OTHER),
+        "ubx": Frame(OTHER_UBX, max_length=8 + MAX_PAYLOAD_BYTES),
+        "nmea": make_sentence_frame(OTHER_NMEA, WIRE_OTHER),
         "set_message": Frame(SET_MESSAGE, direction="out"),
         "set_rate": Frame(SET_RATE, direction="out"),
         "poll_nav_pvt": Frame(POLL_PVT, direction="out"),
@@ -428,7 +436,7 @@ GNSS = Sensor(
     },
     links={"data": Serial(9600, 38_400, 115_200)},
     commands={
-        "message": configured(
+        "message": make_configuration_command(
             1,
             "set_message",
             {
@@ -437,7 +445,7 @@ GNSS = Sensor(
                 "rate": ("rate", 0, 255),
             },
         ),
-        "rate": configured(
+        "rate": make_configuration_command(
             8, "set_rate", {"period": ("period", 0.025, 65.0)}, cycles=1, time_reference="gps"
         ),
         "nav_pvt": Command("poll_nav_pvt", reply="nav_pvt"),
