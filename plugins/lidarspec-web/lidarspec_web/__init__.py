@@ -6,7 +6,7 @@
 
 Modules in reading order:
 
-* `source_server`: a source, read and served; what `lidarspec view --web` runs.
+* `source_server`: a source, read and served; `lidarspec view --web` runs it.
 * `broadcast`: a source that is read once and shown to any number of pages; files are played.
 * `recent_bytes`: the newest bytes of the source, frame by frame, and damaged bytes.
 * `scan_message`: one scan as the binary message that a page draws.

@@ -76,7 +76,7 @@ class Connections:
 
     async def close(self) -> None:
         """Close all connections, including those of clients that do not read."""
-        waiting = [one.transport for one in self._waiting.values()]
+        waiting = [connection.transport for connection in self._waiting.values()]
         for transport in [*waiting, *self._admitted.values()]:
             transport.abort()
         await asyncio.sleep(0)  # the loop closes their sockets

@@ -191,12 +191,12 @@ class OpenPage:
             return None
         self._frame_due = now + FRAME_PERIOD_S
         number = self._backlog.newest_number
-        taken = self._backlog.frame(number)
-        if taken is None or number == self._sent_frame:
+        stored = self._backlog.frame(number)
+        if stored is None or number == self._sent_frame:
             return None
         self._sent_frame = number
         try:
-            return await self._run_in_thread(lambda: self._answers.frame(taken, "last"))
+            return await self._run_in_thread(lambda: self._answers.frame(stored, "last"))
         except LidarSpecError:
             return None  # a frame without an explanation is not shown
 

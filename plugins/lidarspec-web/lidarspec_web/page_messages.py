@@ -128,10 +128,10 @@ class PageMessages:
 
     def find_frame(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
         """Return a frame by its number."""
-        taken = backlog.frame(number)
-        if taken is None:
+        stored = backlog.frame(number)
+        if stored is None:
             return _discarded_reply(f"frame {number}")
-        return self.frame(taken, "number")
+        return self.frame(stored, "number")
 
     def origin(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
@@ -139,11 +139,11 @@ class PageMessages:
         """Return the frame that a point of a scan came from, with the path of its field."""
         if shown is None or index >= len(shown.scan):
             return _discarded_reply(f"point {index} of scan {number}")
-        place = shown.scan.provenance(index)
-        taken = backlog.find_point_frame(place)
-        if taken is None:
+        point_origin = shown.scan.provenance(index)
+        stored = backlog.find_point_frame(point_origin)
+        if stored is None:
             return _discarded_reply(f"the frame of point {index}")
-        return self.frame(taken, "point", place)
+        return self.frame(stored, "point", point_origin)
 
     def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
         """Return a damaged piece with the changes that would explain the damage."""

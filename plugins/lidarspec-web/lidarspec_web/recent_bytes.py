@@ -295,18 +295,20 @@ class RecentBytes:
     def _stream_bytes(self, begin: int, end: int) -> bytes:
         """Return the stored bytes of a stream from one offset to another."""
         parts = [
-            bytes(one.buffer[max(begin - one.offset, 0) : end - one.offset])
-            for one in self._inputs
-            if one.offset < end
+            bytes(
+                stored_input.buffer[max(begin - stored_input.offset, 0) : end - stored_input.offset]
+            )
+            for stored_input in self._inputs
+            if stored_input.offset < end
         ]
         return b"".join(parts)
 
     def _datagrams(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
         """Yield offset and bytes of each datagram that begins in a range of offsets."""
-        for one in self._inputs:
-            offsets = one.offset + np.cumsum(one.sizes) - one.sizes
-            starts = to_array(one.starts)
+        for stored_input in self._inputs:
+            offsets = stored_input.offset + np.cumsum(stored_input.sizes) - stored_input.sizes
+            starts = to_array(stored_input.starts)
             for index in np.flatnonzero((offsets >= begin) & (offsets < end)).tolist():
                 start = int(starts[index])
-                data = one.buffer[start : start + int(one.sizes[index])]
+                data = stored_input.buffer[start : start + int(stored_input.sizes[index])]
                 yield int(offsets[index]), data.tobytes()

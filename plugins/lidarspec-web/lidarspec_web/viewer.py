@@ -1,7 +1,7 @@
 """A source in a cell of a notebook, drawn by the code of the page.
 
 A thread reads the source. The cell asks for each scan after it has drawn the previous one (`next`),
-as a page does, and sends `hello` when it is shown. Its messages are those of `page_messages`.
+as a page does, and sends `hello` when it is shown. `page_messages` makes the messages to it.
 """
 
 from __future__ import annotations
