@@ -186,14 +186,14 @@ def relatives(name: str) -> dict[str, str | Relative]:
 
     CSPC models send the same packet too.
     """
-    own = MODELS[name]
+    own_model = MODELS[name]
     models = {
-        make_id(other): describe_difference(own, model)
+        make_id(other): describe_difference(own_model, model)
         for other, model in MODELS.items()
-        if other != name and model.form.size == own.form.size
+        if other != name and model.form.size == own_model.form.size
     }
     return models | dict.fromkeys(
-        CSPC_MODELS.get(own.form.size, ()), "info, which a CSPC sends when it is started"
+        CSPC_MODELS.get(own_model.form.size, ()), "info, which a CSPC sends when it is started"
     )
 
 
