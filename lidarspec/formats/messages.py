@@ -142,7 +142,7 @@ class RosMessages:
             is_finite = bool(np.isfinite(measured).all())
             values |= {
                 name: vector(*np.where(is_finite, measured, 0.0).tolist()),
-                f"{name}_make_covariance": _make_covariance(is_known=is_finite),
+                f"{name}_covariance": _make_covariance(is_known=is_finite),
             }
         values["orientation"] = self.types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         values["orientation_covariance"] = _make_covariance(is_known=False)
