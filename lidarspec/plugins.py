@@ -337,7 +337,8 @@ class Registry:
         names = {other.name for other in self._offered[home] if other.value == entry.value}
         if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"its entry point is called {entry.name!r}, but {entry.value} has another id",
+                f"the entry point is named {entry.name!r}, but the sensor that it loads"
+                f" ({entry.value}) has another id and no such alias",
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
@@ -957,8 +958,8 @@ def sensors() -> dict[str, Sensor]:
 def sensor(name: str | Path | Sensor) -> Sensor:
     """Return one sensor, by id or alias, or from a file.
 
-    A file is "./mysensor.py", or "./mysensor.py:id" if it has several sensors. A sensor is returned
-    unchanged.
+    A file is "./mysensor.py", or "./mysensor.py:id" if it has several sensors. A `Sensor` is
+    returned unchanged.
 
     Raises:
         UnknownSensor: with a suggestion.

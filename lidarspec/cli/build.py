@@ -41,7 +41,7 @@ REPLY_SILENCE_S = 0.2
 def build(
     sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None
 ) -> None:
-    """Build one frame from field=value; a value with a unit is physical.
+    """Build one frame from field=value, raw or with a unit such as 1.5m.
 
     A number without a unit is the raw integer. points[*].distance=1m sets every element,
     points[3].intensity=7 a single one; a later assignment overrides an earlier one. Constants,

@@ -95,7 +95,7 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
     "-f",
     "--frame",
     metavar="NAME",
-    help="Frame type, if the bytes are ambiguous; with many frames, only this type.",
+    help="Read the bytes as this frame type; of many frames, show only this type.",
 )
 @count_option("frames")
 @click.option("--bad", is_flag=True, help="Show only damaged frames and bytes outside frames.")

@@ -80,7 +80,7 @@ GROUPS = {
             "frames",
             "Explain every byte of each frame: offset, hex, field, value, unit, meaning.",
         ),
-        "build": ("build", "Build one frame from field=value; a value with a unit is physical."),
+        "build": ("build", "Build one frame from field=value, raw or with a unit such as 1.5m."),
         "crc": (
             "finding",
             "Find the checksum of sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.",

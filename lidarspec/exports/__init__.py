@@ -184,8 +184,8 @@ def _refuse_inexpressible(node: tree.Node) -> None:
             raise ExportError(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
             raise ExportError(
-                f"{element}: the layout depends on an array element, which this language does not"
-                " store"
+                f"{element}: the layout depends on an array element, which the exported"
+                " code cannot look up"
             )
     if isinstance(node, tree.Opaque):
         reason = node.reason

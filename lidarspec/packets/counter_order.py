@@ -207,7 +207,7 @@ class CounterOrder:
         return CounterReadings(numbers, periods, has_counter, times, steps, paces)
 
     def _find_last_number(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
-        """Return the highest number of the counter, for each packet or for all."""
+        """Return the value after which the counter wraps, one or one per packet."""
         last = self._rule.last
         if callable(last):
             (values,) = header_function(last, batch.table.schema, _integers)(batch)

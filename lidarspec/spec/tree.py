@@ -539,7 +539,7 @@ def width(formula: Formula) -> int:
 
 
 def move_to_part(formula: Formula, axis: str) -> Formula:
-    """Return a formula of a part with paths from the top of the outer frame.
+    """Rewrite the paths in a part's formula to start at the top of the outer frame.
 
     Args:
         axis: the path of the part.

@@ -48,9 +48,8 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     except LidarSpecError:  # another property reports the failure
         return
     most = int(readings.max(initial=0))
-    message = (
-        f"it reaches {most / 1e9:g} s in the sweep, but wraps_at is {float(clock.wraps_at):g} s"
-    )
+    wraps_at_s = float(clock.wraps_at)
+    message = f"the clock reaches {most / 1e9:g} s in the sweep, but wraps_at is {wraps_at_s:g} s"
     require(most <= to_exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
 

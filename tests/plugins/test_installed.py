@@ -270,7 +270,8 @@ def test_the_first_of_two_plugins_with_one_id_wins(
     [
         (
             "liar-x2 = liar",
-            "liar-x1: its entry point is called 'liar-x2', but liar:liar_x2 has another id",
+            "liar-x1: the entry point is named 'liar-x2', but the sensor that it loads"
+            " (liar:liar_x2) has another id and no such alias",
         ),
         ("odd-x1 = odd", "lidarspec_sensors must return sensors, got int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),

@@ -120,7 +120,7 @@ def make_packet(
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
         "first_return" / Int8ul * "return in the first block of a shot",
-        "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
+        "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
         "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if verify_crc else body),

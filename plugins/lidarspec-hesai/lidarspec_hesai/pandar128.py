@@ -182,8 +182,8 @@ FRAMES = {
 def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
     """Return the points of a packet.
 
-    Shots end at the packet's time (HesaiLidar_SDK_2.0); firing times depend on the state of the
-    block.
+    The last shot is fired `last` seconds after the packet's time (as in HesaiLidar_SDK_2.0), and
+    earlier shots are counted back from it. Delays of channels depend on the state of the block.
 
     Args:
         last: seconds from the packet's time to the last shot.

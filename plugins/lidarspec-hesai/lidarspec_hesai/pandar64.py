@@ -58,7 +58,7 @@ DATA = Struct(
     "lasers" / Const(CHANNELS, Int8ul),
     "block_count" / Const(BLOCKS, Int8ul),
     "header_reserved" / Bytes(1),
-    "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
+    "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
     "header_end" / Const(bytes(2)),
     "blocks"
     / Array(

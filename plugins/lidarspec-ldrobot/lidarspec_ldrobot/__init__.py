@@ -269,8 +269,8 @@ LD06 = make_lidar(
     turn=(5.0, 13.0),  # with PWM control, as for the LD19 (inno-maker's page of the LD06)
     status="capture",
     source=(
-        "LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured"
-        " frames"
+        "LD06 and LD19 development manual v2.5 (same frame as the STL-27L); three consecutive"
+        " captured frames"
     ),
 )
 LD20 = make_lidar(

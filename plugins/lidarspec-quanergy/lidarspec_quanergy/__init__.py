@@ -95,7 +95,7 @@ THREE_RETURNS = Struct(
 ONE_RETURN = Struct(
     *make_header(4, 2224),
     "status" / Int16ub * "0 good, 1 version mismatch of software and firmware, 2 watchdog",
-    "return_id" / Int8ub * "index of the return, of three",
+    "return_id" / Int8ub * "which of the three returns this packet contains",
     "reserved" / Bytes(1),
     "firings"
     / Array(
@@ -118,8 +118,8 @@ def plausible(f: Fields) -> Any:
 def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
     """Return three returns of each laser.
 
-    If a laser has fewer, the packet repeats the first or second distance as the third. The first or
-    second return is then not a point.
+    If a laser has fewer, the packet repeats the first or second distance as the third. The return
+    that equals the third is then not a point, so that it is not counted twice.
 
     `elevation` is in radians, one per laser.
     """

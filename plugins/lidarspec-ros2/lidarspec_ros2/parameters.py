@@ -71,8 +71,8 @@ PARAMETERS = (
     Parameter(
         "source",
         "",
-        "Port, address, file, simulated sensor, or name in lidarspec.toml: SOURCE of the command"
-        " line.",
+        "Port, address, file, simulated sensor, or a name in lidarspec.toml; the SOURCE of the"
+        " command line.",
     ),
     Parameter(
         "sensor",
