@@ -181,6 +181,7 @@ class WireError(LidarSpecError):
 
     Attributes:
         sensor, frame: ids, "" if unknown.
+        kind: kind of the fault, such as "checksum" or "trailing bytes"; "" if it has no name.
         offset: byte offset of the fault in the data.
         path: field path with array indices, "" for the whole frame.
         expected, got: the expected and the actual value.
@@ -193,6 +194,7 @@ class WireError(LidarSpecError):
         *,
         sensor: str = "",
         frame: str = "",
+        kind: str = "",
         offset: int = 0,
         path: str = "",
         expected: object = None,
@@ -200,6 +202,7 @@ class WireError(LidarSpecError):
         data: bytes = b"",
     ) -> None:
         self.reason = reason
+        self.kind = kind
         self.sensor = sensor
         self.frame = frame
         self.offset = offset

@@ -233,6 +233,7 @@ def _to_wire_error(
     offset = to_wire_offset(fault.offset)
     return WireError(
         fault.reason(offset),
+        kind=fault.kind,
         offset=offset,
         path=fault.path,
         expected=fault.expected,
@@ -618,10 +619,8 @@ def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
         return 0, fault.offset
     layout = layout_of(sensor, fault.frame, fault.data)
     fits = isinstance(layout, Layout) and layout.size == len(fault.data)
-    whole = fault.reason.find("after the frame") >= 0 or (
-        fits and fault.reason.find("checksum") >= 0
-    )
-    if whole:
+    is_complete = fault.kind == diagnose.TRAILING or (fits and fault.kind == diagnose.CHECKSUM)
+    if is_complete:
         return (1, len(fault.data))
     return (0, fault.offset)
 

@@ -14,6 +14,7 @@ from typing import Any
 import construct
 
 from lidarspec.errors import MissingField, SpecError, UsageError, WireError, struct_error
+from lidarspec.frames.diagnose import TRAILING
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
@@ -172,6 +173,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
         f"{len(data) - size} bytes after the end of the frame at byte {size}",
         sensor=sensor.id,
         frame=name,
+        kind=TRAILING,
         offset=size,
         expected=size,
         got=len(data),

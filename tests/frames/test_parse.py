@@ -237,3 +237,11 @@ def test_a_checksum_that_raises_is_the_plugins_fault() -> None:
             use()
         assert (error.value.path, error.value.sensor) == ("data", sensor.id)
     assert len(sensor.parse(b"\1\2", frame="data", verify=False)) == 2
+
+
+def test_a_complete_frame_with_trailing_bytes_is_named_by_its_own_type() -> None:
+    sensor = load_sensor("shape-twins")
+    for name in ("data", "info"):
+        with pytest.raises(ls.WireError) as caught:
+            sensor.parse(sensor.example(name) + b"\0")
+        assert (caught.value.frame, caught.value.kind) == (name, "trailing bytes")
