@@ -25,7 +25,7 @@ def run(arguments: list[str], folder: Path) -> str:
     return result.stdout
 
 
-@needs("mcap", "google.protobuf")
+@needs("mcap", "google")
 def test_the_commands_work_as_they_are_printed(tmp_path: Path) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     source = f"sim:{sensor.id}?rate=max"
