@@ -228,9 +228,7 @@ class _StatePickler(pickle.Pickler):
         """
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
-                raise pickle.PicklingError(
-                    "parts of frames, whose layout is in what is around them"
-                )
+                raise pickle.PicklingError("parts of frames require the layout of their frame")
             return _make_table, (
                 self._constants[()],
                 self._frames[id(obj.schema)],
@@ -238,7 +236,7 @@ class _StatePickler(pickle.Pickler):
             )
         if isinstance(obj, Packets):
             if AROUND in obj.state:
-                raise pickle.PicklingError("parts of frames")
+                raise pickle.PicklingError("parts of frames require their frame")
             state = {name: _take_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
         if isinstance(obj, struct.Struct):

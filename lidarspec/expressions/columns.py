@@ -797,7 +797,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     array = table.raw(info.path)
     if array.dtype == object:
         raise SpecError(
-            "its values are no numbers, and a column holds numbers: declare a text as bytes",
+            "its values are not numbers: declare text as bytes",
             path=info.path,
         )
     with np.errstate(invalid="ignore"):  # a signalling nan is a nan

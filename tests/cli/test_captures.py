@@ -96,7 +96,7 @@ def test_every_verb_describes_a_capture_without_datagrams(
     said = f"{path}: 3 of 3 packets are not UDP over IP and were not read: 2 TCP, 1 ARP"
     output = done.stdout + done.stderr
     assert output.count(said) == 1, output
-    assert "holds no bytes" not in output
+    assert "contains no bytes" not in output
     assert "no data received" not in output
 
 
@@ -114,7 +114,7 @@ def test_an_unsupported_link_layer_is_named_with_a_way_to_read_it(
     message = f"{path}: 3 of 3 packets have an unsupported link layer and were not read: 3 PPP"
     assert output.count(message) == 1, output
     assert output.count("editcap -C BYTES -T rawip") == 1
-    assert "holds no bytes" not in output
+    assert "contains no bytes" not in output
 
 
 def test_a_few_packets_of_an_unsupported_link_layer_are_named_too(tmp_path: Path) -> None:

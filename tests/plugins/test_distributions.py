@@ -44,8 +44,8 @@ FAILING = {
     "broken-plausible": "no such luck",
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
-    "broken-shape": "lengths that do not go together",
-    "broken-result": "has to return Polar or Cartesian",
+    "broken-shape": "the arrays have different lengths",
+    "broken-result": "must return Polar or Cartesian",
 }
 
 FRAME = "bb ad 01 0a 0b 0c 0d 00"

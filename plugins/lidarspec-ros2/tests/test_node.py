@@ -236,7 +236,7 @@ def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(
     client.until(lambda: len(scans) > 1)
     assert message(scans[-1], SCAN).header.frame_id == "mast"
     assert client.set("scan_ring", 99) == ""
-    asked = "ring 99 is asked for"
+    asked = "ring 99 does not exist"
     client.until(
         lambda: any(
             asked in text
