@@ -19,6 +19,7 @@ import click
 from lidarspec.cli.failures import report
 from lidarspec.cli.options import sensor_words
 from lidarspec.errors import UsageError
+from lidarspec.known_sensors import install_command
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -90,8 +91,8 @@ def import_ros() -> None:
     except ImportError as error:
         text = f"ROS 2 not found ({error})"
         raise UsageError(
-            f"{text}: source it, such as `. /opt/ros/jazzy/setup.bash`, or install"
-            " lidarspec-ros2[ros2]"
+            f"{text}: source it, such as `. /opt/ros/jazzy/setup.bash`, or run:"
+            f" {install_command('lidarspec-ros2', extra='ros2')}"
         ) from None
 
 

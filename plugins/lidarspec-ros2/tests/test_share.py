@@ -121,7 +121,7 @@ def test_the_page_of_vendors_parameters_names_topics_parameters_and_services_of_
     pairs = re.findall(r"^\| (.+) \| (.+) \|$", text, re.MULTILINE)
     assert len(pairs) > 25
     for theirs, ours in pairs:
-        names = re.findall(r"`([\w./]+)`", ours.partition(":")[0])
+        names = re.findall(r"`([\w./]+)`", re.split("[:;]", ours)[0])
         assert set(names) <= {*NAMED, *topics, "tf"}, theirs
         assert set(re.findall(r"`~/send/(\w+)`", ours)) <= set(services), theirs
 
@@ -157,7 +157,7 @@ def test_commands_on_the_page_start_a_node(
         )
     node = run(simulated, *others, ros=words[place + 1 :])
     if "publish_tf:=true" in words and importlib.util.find_spec("tf2_msgs") is None:
-        assert "publish_tf takes tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
+        assert "publish_tf requires tf2_msgs" in node.communicate(timeout=PATIENCE)[1]
     else:
         client.until(
             lambda: any(

@@ -104,7 +104,7 @@ def test_little_shared_memory_is_a_warning_with_a_remedy(monkeypatch: pytest.Mon
     for part in (
         "2.5 MB",
         "21 MB free",
-        "22 MB are needed",
+        "22 MB are required",
         "--shm-size",
         "--ipc=host",
         "qos:=reliable",

@@ -110,7 +110,9 @@ def test_a_clock_change_is_reported(
     path, _ = record(tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540)  # packets of ten seconds
     clouds = client.listen("points", PointCloud2)
     run(str(path), ros=format_parameters(qos="reliable"))
-    client.until(lambda: any("clock was set by +10.0" in text for text in list_diagnostics(client)))
+    client.until(
+        lambda: any("clock was changed by +10.0" in text for text in list_diagnostics(client))
+    )
     stamps = np.array(
         [stamp(message(data, "sensor_msgs/msg/PointCloud2").header.stamp) for data in clouds]
     )
