@@ -12,5 +12,5 @@ ACK = Struct("header" / Const(b"\x17\x71\x44\x99"), "name" / CString("ascii"))
 
 @hookimpl
 def lidarspec_sensors():
-    frames = {**sensor().frames, "ack": Frame(ACK, max_length=5)}
+    frames = {**sensor().frames, "ack": Frame(ACK, max_length=12)}
     return [sensor(frames=frames, commands={})]

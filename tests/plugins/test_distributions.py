@@ -55,7 +55,7 @@ import json, lidarspec as ls
 from lidarspec.plugins import registry
 sensors = ls.sensors()
 plugins = [[p.distribution, p.version, p.entry_point, list(p.sensors), p.error, bool(p.traceback)] for p in registry().plugins]
-good = [name for name, s in sensors.items() if not name.startswith("broken-") and s.parse(s.example(s.data_frame), s.data_frame)]
+good = [name for name, s in sensors.items() if not name.startswith("broken-") and all(s.parse(s.example(name), name) for name in s.main_frames)]
 """
 
 WORK = """

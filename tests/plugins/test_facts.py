@@ -27,7 +27,7 @@ PACKETS_OF_M2 = 3 * 1260
 
 @functools.cache
 def _sensors() -> dict[str, ls.Sensor]:
-    return dict(ls.sensors())
+    return {name: sensor for name, sensor in ls.sensors().items() if sensor.has_points}
 
 
 def _data(sensor: ls.Sensor) -> Frame:

@@ -287,7 +287,7 @@ def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
     hidden = "import sys; sys.modules['numba'] = None\n"
     assert run(hidden + DECODING).stdout.split() == ["False", "36"]
     asked = run(hidden + DECODING.replace("* 3)", "* 3, backend='jit')"))
-    assert "LibraryError: this needs numba" in asked.stderr
+    assert "LibraryError: this requires numba" in asked.stderr
     assert "pip install 'lidarspec[jit]'" in asked.stderr
 
 
@@ -307,7 +307,9 @@ def test_without_numba_asking_for_it_is_an_error_and_nothing_else_is() -> None:
 def test_compiled_checksums_are_those_of_the_algorithm(
     algorithm: Checksum, spans: tuple[tuple[int, int], ...]
 ) -> None:
-    rows = np.random.default_rng(1).integers(0, 256, (kernelsums.EARNED, 50), dtype=np.uint8)
+    rows = np.random.default_rng(1).integers(
+        0, 256, (kernelsums.MIN_FRAMES_SEEN, 50), dtype=np.uint8
+    )
     seal = Seal((), spans, algorithm, ())
     found = kernelsums.checksums(seal, rows)
     assert found is not None

@@ -13,7 +13,7 @@ HERE = Path(__file__).resolve().parents[1] / "broken"
 
 #: mistakes that the authors of parsers make, as a plugin can make them.
 USUAL = {
-    "int_for_round": {"LS303", "LS116"},  # an Adapter is read by construct alone
+    "int_for_round": {"LS106"},
     "count_unguarded": {"LS503"},
     "no_wrap": {"LS504"},
     "full_circle": {"LS505"},

@@ -176,6 +176,7 @@ def test_frames_are_the_bytes_of_values() -> None:
     assert len(set(drawn)) > 15
 
 
+@pytest.mark.filterwarnings("ignore:Generating overly large repr")  # in a note of Hypothesis
 @each_shape
 def test_a_stream_without_noise_has_frames_alone(name: str) -> None:
     sensor = load_sensor(name)

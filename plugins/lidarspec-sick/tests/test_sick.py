@@ -121,7 +121,7 @@ def test_any_number_of_echoes_is_read_with_their_strengths(
     assert cloud.range[:echoes].tolist() == list(range(1, echoes + 1))
     assert cloud.intensity[:echoes].tolist() == [10 * number for number in range(1, echoes + 1)]
     assert cloud.return_index[:echoes].tolist() == list(range(echoes))
-    with pytest.raises(UsageError, match="echoes is a number from 1 to"):
+    with pytest.raises(UsageError, match="echoes must be a number from 1 to"):
         sensor.configure(echoes=6)
 
 
