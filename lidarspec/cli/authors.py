@@ -45,7 +45,8 @@ MAX_CAPTURE_BYTES = 1 << 22
 @click.option(
     "--distribution",
     metavar="NAME",
-    help="Name of the distribution, such as lidarspec-acme; if it exists, the sensor is added.",
+    help="Name of the distribution, such as lidarspec-acme; if it exists, the sensor is added to"
+    " it.",
 )
 @click.option("--vendor", metavar="NAME", help="Name of the vendor; default: from the id.")
 @click.option("--model", metavar="NAME", help="Name of the model; default: from the id.")

@@ -236,7 +236,9 @@ class _StatePickler(pickle.Pickler):
             )
         if isinstance(obj, Packets):
             if AROUND in obj.state:
-                raise pickle.PicklingError("parts of frames require their frame")
+                raise pickle.PicklingError(
+                    "parts of a frame cannot be pickled alone; pickle the packets of the frame"
+                )
             state = {name: _take_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
         if isinstance(obj, struct.Struct):

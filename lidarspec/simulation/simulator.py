@@ -400,7 +400,7 @@ class PointPlacement(Measurement):
         """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
-            reason = "points by coordinates require Simulation(directions=...)"
+            reason = "a sensor with Cartesian points requires Simulation(directions=...)"
             raise SpecError(reason, path="simulation", sensor=self._sensor.id)
         directions = np.full((2, len(numbers), *shape), np.nan)
         with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):

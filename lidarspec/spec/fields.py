@@ -246,7 +246,7 @@ class Checksummed(layer.SealedStruct):
         while isinstance(inner, Checksummed):
             if self.over is None and inner.over is None:
                 both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
-                raise SpecError(f"{both}: declare over= for the inner one")
+                raise SpecError(f"{both}: declare over= on the inner Checksummed")
             inner = inner.subcon
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:

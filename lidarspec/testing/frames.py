@@ -70,7 +70,12 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
         again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(examples)))]
     else:
         again = examples[:3]
-    require(examples[:3] == again, "LS311", "two examples of one seed differ", name)
+    require(
+        examples[:3] == again,
+        "LS311",
+        "example(seed=...) returned different bytes for the same seed",
+        name,
+    )
     longest = max(map(len, examples))
     require(
         longest <= frame.max_length,

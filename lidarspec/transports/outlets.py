@@ -684,7 +684,7 @@ class Outlet:
         if self.data.has_listener:
             self.data.send([chunk], patient=True)
         if not self.data.has_listener:
-            raise Disconnected(f"{self.local_source}: the reader has closed it")
+            raise Disconnected(f"{self.local_source}: the reader has disconnected")
 
     def await_listener(self) -> None:
         """Wait for a new listener to the data; see `OutletLine.await_listener`."""

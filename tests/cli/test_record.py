@@ -417,7 +417,7 @@ def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
     for number, name in enumerate(("one.lsr", "two.lsr"), start=1):
         ran("record", place, "-s", STREAM, "-o", tmp_path / name, "-n", 60)
         assert read_received(tmp_path / name).startswith(read_received(stream))
-        player.hears(f"(?s)(the reader has closed it.*){{{number}}}")
+        player.hears(f"(?s)(the reader has disconnected.*){{{number}}}")
     player.child.send_signal(signal.SIGINT)
     assert "stream.lsr to /dev/" in player.wait_until_end(130)
 

@@ -128,7 +128,7 @@ NAV_PVT = make_ubx(  # p. 150
     "nano" / Scaled(Int32sl, 1, "ns") * "fraction of the second, may be negative",
     "fix_type" / FIX_TYPES,
     "flags" / Int8ul * "bit 0: valid fix, bit 1: differential, bits 7-6: carrier phase",
-    "flags2" / Int8ul * "bits 7-5: time, date and their availability are confirmed",
+    "flags2" / Int8ul * "bit 7: time confirmed, 6: date confirmed, 5: confirmation available",
     "satellites" / Int8ul * "numSV: used in the solution",
     "longitude" / Scaled(Int32sl, 1e-7, "deg"),
     "latitude" / Scaled(Int32sl, 1e-7, "deg"),
