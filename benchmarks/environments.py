@@ -45,7 +45,7 @@ def install(python: Path, requirements: Sequence[str]) -> dict[str, str]:
     """Install requirements into an environment, together if possible.
 
     Returns:
-        The reason for each one that failed, by its name without versions: "lds2d",
+        The reason for each failed requirement, by its name without versions: "lds2d",
         "lidarspec[jit]".
     """
     reason = run_installer(python, requirements)

@@ -425,7 +425,7 @@ class Registry:
         )
 
     def _found(self) -> dict[str, Sensor]:
-        """Return the loaded sensors by id, without those that lost their id."""
+        """Return the loaded sensors by id, without ids that another plugin claimed."""
         return {
             name: one
             for home, own in self._sensors.items()
@@ -891,9 +891,9 @@ def _trial(*homes: Home) -> tuple[str, str]:
 
 
 def load_alone() -> None:
-    """Load the plugins in the arguments, print their threads, and end the process.
+    """Load the plugins in the arguments, print the threads they left, and end.
 
-    `_trial` starts a process for this. A mark precedes the threads in the output.
+    `_trial` starts a process for this. A mark precedes the names of the threads in the output.
     """
     import faulthandler
 

@@ -110,7 +110,7 @@ def holds_several_types(path: str | Path) -> bool:
 
 
 def _iter_tables(batches: Iterable[Batch]) -> Iterator[Columns]:
-    """Yield the columns of each batch; all batches have the columns of the first."""
+    """Yield the columns of each batch, the same columns as in the first batch."""
     names: list[str] = []
     for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
         columns = frame_columns(packets)

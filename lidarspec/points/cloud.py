@@ -359,7 +359,7 @@ def _select(value: Any, which: Any) -> Any:
 
 
 def grid_of(cloud: PointCloud) -> Grid:
-    """Return the organisation of the points of a cloud."""
+    """Return the columns and rows of organised points; an empty Grid for others."""
     if cloud.shape:
         return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
     return Grid()

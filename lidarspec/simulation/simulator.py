@@ -989,7 +989,7 @@ class FramesWithoutPoints:
         return self._batches[name][1][number - start]
 
     def iter_unasked(self) -> Iterator[bytes]:
-        """Yield the frames that are sent periodically, in the order of their times."""
+        """Yield the periodic frames other than data frames, in the order of their times."""
         rates = {
             name: frame.simulation.rate
             for name, frame in self._sensor.incoming.items()

@@ -262,7 +262,7 @@ def test_sensors_that_cannot_be_simulated_give_a_reason() -> None:
         simulate(replace(sensor, points=lambda f: Polar(f.samples.distance * 0 + 1, 0)), 1)
     with pytest.raises(SpecError, match="no field determines the range"):
         simulate(replace(sensor, points=lambda f: Polar(1, np.deg2rad(f.first))), 1)
-    with pytest.raises(SpecError, match=r"require Simulation\(directions=\.\.\.\)"):
+    with pytest.raises(SpecError, match=r"requires Simulation\(directions=\.\.\.\)"):
         simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
     with pytest.raises(SpecError, match="sweep must return 'size', because the length"):
         simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)

@@ -60,12 +60,12 @@ SIMULATED_SPEED_HZ = 10
 
 @dataclass(frozen=True)
 class Unit:
-    """The corrections of a unit, and the times of its series.
+    """The calibration of one HDL-64E, and the firing times of its model series.
 
     Attributes:
         period: seconds from shot to shot.
-        firing: microseconds from four lasers to the next four.
-        within: microseconds of the four lasers after the first.
+        firing: microseconds between groups of four lasers.
+        within: delay of each laser in a group of four, in microseconds.
         vertical: elevation of the 64 lasers in degrees.
         offset: degrees to the left of the azimuth.
         height: metres above the origin, perpendicular to the beam.
@@ -85,7 +85,7 @@ class Unit:
     nominal: bool = True
 
     def by_block(self, values: Any) -> Any:
-        """Return values of the 64 lasers for the slots of each block, (blocks, slots)."""
+        """Return values of the 64 lasers by block and slot, (blocks, slots)."""
         return np.tile(np.reshape(values, (2, SLOTS)), (BLOCKS // 2, 1))
 
     @property
