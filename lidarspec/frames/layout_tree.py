@@ -591,10 +591,8 @@ class HeaderNode:
         return self.children[value]
 
 
-#: for all; and its values.
 #: reads the field of a node in candidates. Returns the indices of the candidates that have the
 #: field (None: all), and the values.
-#: for all; and its values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
 Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 

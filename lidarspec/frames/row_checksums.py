@@ -70,10 +70,8 @@ MAX_TABLE_ROW_BYTES = 1 << 7
 #: from this number of rows on, `_sum_words` is faster than tables.
 MIN_SUM_ROWS = 1024
 
-#: by one, it is several times as fast.
 #: width, polynomial and reflection of the CRC-32 that `zlib` computes. On rows that are not short,
 #: one call for each row is several times as fast as NumPy.
-#: by one, it is several times as fast.
 ZLIB_CRC = (32, 0x04C11DB7, True)
 
 #: ranges of bytes in a row: (offset of the first byte, offset after the last byte) of each.

@@ -32,9 +32,7 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: packets.
 #: Maximum size of a batch of data: in ns of the device's time, and in packets.
-#: packets.
 MAX_BATCH_NS = SECOND // 4
 MAX_BATCH_PACKETS = 128
 #: Number of fillers that are sent in a pause.

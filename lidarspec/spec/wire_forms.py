@@ -151,10 +151,8 @@ class NumberRun:
 
 
 Run = TextRun | NumberRun
-#: them; none where the struct is complete, or no frame can begin so.
 #: Returns the runs of fields that follow the first bytes of a struct, as far as these bytes
 #: determine them. It is empty if the struct is complete, or if no frame begins with these bytes.
-#: them; none where the struct is complete, or no frame can begin so.
 NextRuns = Callable[[bytes], Sequence[Run]]
 
 

@@ -164,10 +164,8 @@ class _Context:
     in_bits: bool = False
     #: number of bytes up to the end of the enclosing part, if its length is declared elsewhere.
     room: tree.Formula | None = None
-    #: the frame is not known.
     #: returns the offset in the frame, or None if no formula gives it. It is None in parts, because
     #: their offset in the frame is not known.
-    #: the frame is not known.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
     def inside(self, **changes: Any) -> _Context:

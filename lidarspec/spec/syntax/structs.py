@@ -529,10 +529,8 @@ def is_expression(value: object) -> bool:
     return isinstance(value, ExprMixin | Construct)
 
 
-#: of any size hardly ever fits.
 #: upper limits of the small numbers that are drawn half of the time, because a large number is
 #: hardly ever a valid count or key.
-#: of any size hardly ever fits.
 SMALL_LIMITS = (1, 6, 40)
 
 #: maximum number of attempts to draw a valid part.
