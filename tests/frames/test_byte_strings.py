@@ -36,6 +36,7 @@ from construct import (
     Probe,
     RepeatUntil,
     Seek,
+    Sequence,
     StopIf,
     Struct,
     Switch,
@@ -453,10 +454,14 @@ def test_examples_pass_checks_of_the_whole_frame() -> None:
         (Seek(4), "declare those bytes"),
     ],
 )
-def test_nameless_checks_are_refused_with_a_suggestion(part: Any, instead: str) -> None:
+def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str) -> None:
     with pytest.raises(SpecError) as caught:
         sensor(Struct("k" / Int8ub, part))
     assert instead in str(caught.value)
+    for named in ("v" / part, "v" / Sequence(Int8ub, part)):
+        with pytest.raises(SpecError, match="^v: ") as caught:
+            sensor(Struct("k" / Int8ub, named))
+        assert instead in str(caught.value)
 
 
 @pytest.mark.parametrize(

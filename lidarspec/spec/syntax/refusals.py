@@ -17,7 +17,6 @@ from lidarspec.spec.syntax.adapters import is_int_adapter, try_values
 from lidarspec.spec.syntax.replacements import (
     BoundedPart,
     DescribedField,
-    HeldCheck,
     Partition,
 )
 from lidarspec.spec.syntax.structs import (
@@ -62,31 +61,26 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Slicing: ("LS106", "Slicing loses the other elements: use the Array below it"),
     construct.Indexing: ("LS106", "Indexing loses the other elements: use the Array below it"),
     construct.Pointer: ("LS112", "Pointer reads outside the frame"),
-    construct.Seek: ("LS112", "Seek reads outside the frame"),
+    construct.Seek: (
+        "LS112",
+        "Seek reads outside the frame: declare those bytes, 'reserved' / Bytes(n)",
+    ),
     construct.Select: (
         "LS113",
         "Select and Optional hide errors in the bytes: use If or Switch on a header field",
+    ),
+    construct.Probe: (
+        "LS105",
+        "Probe prints while parsing: use lidarspec explain to see every byte of a frame",
+    ),
+    construct.StopIf: (
+        "LS105",
+        "StopIf omits the rest of a struct: use 'rest' / If(this.more, Struct(...))",
     ),
 }
 
 #: constructs that limit a greedy part.
 _BOUNDED_KINDS = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
-
-
-#: construct in a struct without a name -> the message with a replacement.
-_UNNAMED_REASONS: dict[type, str] = {
-    HeldCheck: (
-        "a Check must have a name: 'valid' / Check(...); or use plausible=lambda f: ...,"
-        " which is vectorized"
-    ),
-    construct.Probe: (
-        "Probe prints while parsing: use lidarspec explain to see every byte of a frame"
-    ),
-    construct.StopIf: (
-        "StopIf omits the rest of a struct: use 'rest' / If(this.more, Struct(...))"
-    ),
-    construct.Seek: "Seek reads outside the frame: declare those bytes, 'reserved' / Bytes(n)",
-}
 
 
 def check_struct(con: Construct) -> SpecError | None:
@@ -100,22 +94,10 @@ def check_struct(con: Construct) -> SpecError | None:
             bits or never ends. It has the path and the reason.
     """
     endless = _check_ends(con, "", bounded=False)
-    for path, part, in_bits in _iter_constructs(con, "", in_bits=False):
-        lost = try_values(part).lost if is_int_adapter(part) else None
-        if lost is not None and not isinstance(part, construct.FlagsEnum):
-            raw, back = lost
-            reason = f"{author_class(part)} makes {back!r:.80} of {raw} when a frame is built again"
-            raise SpecError(reason, path=path, rule="LS106")
-        for kind, (rule, reason) in _REFUSED.items():
-            is_exact = kind is construct.FlagsEnum and is_int_adapter(part) and lost is None
-            if isinstance(part, kind) and not is_exact:
-                raise SpecError(reason, path=path, rule=rule)
-        if isinstance(part, type(construct.Flag)) and not in_bits:
-            raise SpecError(
-                "Flag keeps only one bit of its byte: use a BitStruct, or Int8ul",
-                path=path,
-                rule="LS107",
-            )
+    constructs = list(_iter_constructs(con, "", in_bits=False))
+    for path, part, in_bits in constructs:
+        _check_class(part, path, in_bits=in_bits)
+    for path, part, in_bits in constructs:
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
         if isinstance(part, construct.FocusedSeq):
@@ -130,6 +112,25 @@ def check_struct(con: Construct) -> SpecError | None:
             )
     _check_measures(con, "", (1, 0, ""), {})
     return endless
+
+
+def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
+    """Refuse a construct of a class that loses bits, runs code or reads other bytes."""
+    lost = try_values(part).lost if is_int_adapter(part) else None
+    if lost is not None and not isinstance(part, construct.FlagsEnum):
+        raw, back = lost
+        reason = f"{author_class(part)} makes {back!r:.80} of {raw} when a frame is built again"
+        raise SpecError(reason, path=path, rule="LS106")
+    for kind, (rule, reason) in _REFUSED.items():
+        is_exact = kind is construct.FlagsEnum and is_int_adapter(part) and lost is None
+        if isinstance(part, kind) and not is_exact:
+            raise SpecError(reason, path=path, rule=rule)
+    if isinstance(part, type(construct.Flag)) and not in_bits:
+        raise SpecError(
+            "Flag keeps only one bit of its byte: use a BitStruct, or Int8ul",
+            path=path,
+            rule="LS107",
+        )
 
 
 def _check_ends(
@@ -230,10 +231,8 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             continue
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
-                kind = type(unwrap(child))
-                reason = _UNNAMED_REASONS.get(
-                    kind, f"an unnamed {kind.__name__} would lose its value: give it a name"
-                )
+                kind = author_class(unwrap(child))
+                reason = f"an unnamed {kind} would lose its value: give it a name"
                 raise SpecError(reason, path=path, rule="LS105")
             continue
         if name in seen:

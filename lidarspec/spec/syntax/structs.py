@@ -153,14 +153,9 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         prepared = (prepare(child, limit, in_bits=in_bits) for child in members)
         return seal(MarkedStruct(*prepared), checksums)
     if isinstance(con, construct.Renamed):
-        inner = con.subcon
-        while isinstance(
-            inner, construct.Renamed
-        ):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
-            inner = inner.subcon
-        return construct.Renamed(
-            prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs
-        )
+        # ("name" / con) * "docs" wraps twice, and the path would name it twice
+        inner = prepare(_strip_name(con), limit, in_bits=in_bits)
+        return construct.Renamed(inner, newname=con.name, newdocs=con.docs)
     if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch | Partition):
         return con
     same = copy.copy(con)
@@ -186,6 +181,13 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     return same
 
 
+def _strip_name(con: Construct) -> Construct:
+    """Return a construct without its name and documentation."""
+    while isinstance(con, construct.Renamed):
+        con = con.subcon
+    return con
+
+
 def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
     """Return the construct of a LazyBound; the LazyBound itself in its own content."""
     if con in _BINDING:
@@ -202,8 +204,9 @@ def _name_padding(members: list[Construct]) -> list[Construct]:
     taken = {member.name for member in members}
     named = list[Construct]()
     for member in members:
-        is_padding = isinstance(member, construct.Padded) and member.subcon is construct.Pass
-        if is_padding or isinstance(member, construct.Check):
+        part = _strip_name(member)
+        is_padding = isinstance(part, construct.Padded) and part.subcon is construct.Pass
+        if member.name is None and (is_padding or isinstance(part, construct.Check)):
             kind = "padding" if is_padding else "check"
             number = 1
             name = kind
@@ -243,10 +246,8 @@ def _expand_macro(con: Construct) -> list[Construct]:
     Another member is returned unchanged.
     """
     name = con.name
-    inner = con
+    inner = _strip_name(con)
     docs = con.docs
-    while isinstance(inner, construct.Renamed):
-        inner = inner.subcon
 
     def rename_ending(ending: str, part: Construct, what: str) -> Construct:
         return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
