@@ -15,12 +15,16 @@ from typing import Any
 
 import construct
 import numpy as np
-from construct import BitsInteger, BytesInteger, Construct, FormatField, Subconstruct
+from construct import BytesInteger, Construct, FormatField, Subconstruct
 
 from lidarspec.spec import tree
+from lidarspec.spec.syntax.structs import bit_width, children, fixed_size, number_kind
 
 #: number of random values to try for a field that is wider than a byte.
 TRIAL_COUNT = 200
+
+#: maximum width of an integer in a column, in bits.
+MAX_INT_BITS = 64
 
 #: adapters with a known meaning, which are handled elsewhere.
 _KNOWN = (construct.Enum, construct.Validator, construct.StringEncoded)
@@ -91,7 +95,6 @@ def is_int_adapter(con: Construct) -> bool:
 def try_values(con: Construct) -> Trial:
     """Return the results of an adapter of an integer for trial values."""
     bits = _int_bits(con.subcon)
-    is_signed = _is_signed(con.subcon)
     if bits <= 8:
         raws: Sequence[int] = range(1 << bits)
     else:
@@ -100,7 +103,7 @@ def try_values(con: Construct) -> Trial:
         source = random.Random(bits)
         edges = [0, 1, 2, (1 << bits) - 1, 1 << (bits - 1), (1 << (bits - 1)) - 1]
         raws = [*edges, *(source.getrandbits(bits) for _ in range(TRIAL_COUNT))]
-    if is_signed:
+    if number_kind(con.subcon) == "i":
         raws = [raw - (1 << bits) if raw >> (bits - 1) else raw for raw in raws]
     return _run_trial(
         raws, functools.partial(_decode_int, con), functools.partial(_encode_int, con)
@@ -160,19 +163,11 @@ def _encode_int(con: Any, value: Any, size: int) -> Any:
 
 
 def _int_bits(con: Construct) -> int:
-    """Return the width of an integer in bits; 0 for another construct."""
-    if isinstance(con, FormatField):
-        return 0 if con.fmtstr[-1] in "efd?" else 8 * int(con.length)
-    if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
-        bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
-        return bits if bits <= 64 else 0
-    return 0
-
-
-def _is_signed(con: Any) -> bool:
-    if isinstance(con, FormatField):
-        return bool(con.fmtstr[-1].islower())
-    return bool(con.signed)
+    """Return the width of an integer in bits; 0 for a wider one and for another construct."""
+    if number_kind(con) not in ("i", "u") or not isinstance(con.length, int):
+        return 0
+    bits = bit_width(con)
+    return bits if bits <= MAX_INT_BITS else 0
 
 
 def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
@@ -260,8 +255,5 @@ def _find_independent_size(con: Construct) -> int:
         part = pending.pop()
         if not isinstance(part, _INDEPENDENT_KINDS):
             return 0
-        pending += [part.subcon] if isinstance(part, Subconstruct) else getattr(part, "subcons", [])
-    try:
-        return int(con.sizeof())
-    except Exception:  # a size that depends on other fields
-        return 0
+        pending += children(part)
+    return fixed_size(con)

@@ -351,20 +351,14 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     subcon = con.subcon
     while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
         subcon = subcon.subcon
-    if (
-        not isinstance(field, FormatField | BytesInteger | BitsInteger)
-        or getattr(field, "fmtstr", "B")[-1] in "efd?"
-    ):
+    kind = number_kind(field)
+    if kind not in ("i", "u"):
         return None
     width = bit_width(field)
-    if isinstance(field, FormatField):
-        signed = field.fmtstr[-1].islower()
-    else:
-        signed = field.signed
-    low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
-    with contextlib.suppress(
-        Exception
-    ):  # a function of a plugin may raise anything for the placeholder
+    low = -(1 << (width - 1)) if kind == "i" else 0
+    high = low + (1 << width) - 1
+    # A function of a plugin may raise anything for the placeholder, or for an unexpected number.
+    with contextlib.suppress(Exception):
         passes = con._validate(compared := _ComparisonRecorder(), None, "")
         if compared.values and not passes and all(type(value) is int for value in compared.values):
             return tuple(
@@ -372,7 +366,7 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
                 for value in sorted({*compared.values})
                 if low <= value <= high and con._validate(value, None, "")
             )
-    with contextlib.suppress(Exception):  # or for an unexpected number
+    with contextlib.suppress(Exception):
         if width <= 16:
             seen = (
                 (lambda raw: subcon._decode(raw, None, None))
@@ -454,8 +448,23 @@ def bit_width(con: Construct) -> int:
     return 8 * int(inner.sizeof())
 
 
+def number_kind(con: Construct) -> str:
+    """Return "f" for a float, "i" for a signed and "u" for an unsigned integer.
+
+    Returns "" for another construct.
+    """
+    if isinstance(con, BytesInteger | BitsInteger):
+        return "i" if con.signed else "u"
+    code = con.fmtstr[-1] if isinstance(con, FormatField) else "?"
+    if code == "?":
+        return ""
+    if code in "efd":
+        return "f"
+    return "i" if code.islower() else "u"
+
+
 def fixed_size(con: Construct) -> int:
-    """Return the number of bytes of a struct; 0 if its size is not fixed."""
+    """Return the number of bytes of a construct; 0 if its size is not fixed."""
     try:
         return int(con.sizeof())
     except Exception:  # construct raises KeyError if a condition reads a field
@@ -556,13 +565,11 @@ def random_value(
     if path in drawn:
         return drawn[path](source)
     if isinstance(con, Const):
-        return con.parse(
-            con.build(con.value), _verify=False
-        )  # for an Enum: its name with the number, which expressions need
+        # For an Enum this is its name with the number, which expressions need.
+        return con.parse(con.build(con.value), _verify=False)
     if isinstance(con, construct.Rebuild):
-        with contextlib.suppress(
-            Exception
-        ):  # it may depend on later fields; it is evaluated again when the frame is built
+        # It may depend on later fields; it is evaluated again when the frame is built.
+        with contextlib.suppress(Exception):
             return con.func(scope)
     if isinstance(con, Struct):
         values = Container(_=scope)
@@ -592,21 +599,12 @@ def random_value(
             return source.draw_elements(count, draw_one)
         return [draw_one() for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
-        return random_value(
-            con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon,
-            source,
-            drawn,
-            scope,
-            path,
-        )
+        holds = construct.evaluate(con.condfunc, scope)
+        branch = con.thensubcon if holds else con.elsesubcon
+        return random_value(branch, source, drawn, scope, path)
     if isinstance(con, construct.Switch):
-        return random_value(
-            con.cases.get(construct.evaluate(con.keyfunc, scope), con.default),
-            source,
-            drawn,
-            scope,
-            path,
-        )
+        case = con.cases.get(construct.evaluate(con.keyfunc, scope), con.default)
+        return random_value(case, source, drawn, scope, path)
     if isinstance(con, LimitedNumber):
         raw = source.choice(con.allowed)
         if isinstance(con.subcon, construct.Enum):
@@ -685,16 +683,6 @@ def _draw_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, 
     return random_value(con, source, drawn, scope, path)
 
 
-def _find_number_kind(con: Construct) -> str:
-    """Return "f" for a float, "i" for a signed and "u" for an unsigned integer."""
-    if not isinstance(con, FormatField):
-        return "i" if con.signed else "u"
-    code = con.fmtstr[-1]
-    if code in "efd":
-        return "f"
-    return "i" if code.islower() else "u"
-
-
 def _draw_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> Any:
     if con is construct.Pass or isinstance(con, construct.Check | PaddingField | Reserved):
         # checks and padding are computed when the frame is built
@@ -711,16 +699,13 @@ def _draw_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> 
         return source.randbytes(
             check_bound(construct.evaluate(con.length, scope), con.limit, "length", "")
         )
-    if hasattr(source, "draw_number") and isinstance(con, FormatField | BytesInteger | BitsInteger):
-        return source.draw_number(path, bit_width(con), _find_number_kind(con))
-    if (
-        isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
-    ):  # it may be a count
-        return con.parse(
-            con.build(
-                source.randint(0, min(source.choice(SMALL_LIMITS), (1 << (bit_width(con) - 1)) - 1))
-            )
-        )
+    kind = number_kind(con)
+    if kind and hasattr(source, "draw_number"):
+        return source.draw_number(path, bit_width(con), kind)
+    if kind and source.random() < 0.5:
+        # It may be a count.
+        limit = min(source.choice(SMALL_LIMITS), (1 << (bit_width(con) - 1)) - 1)
+        return con.parse(con.build(source.randint(0, limit)))
     if con in (construct.VarInt, construct.ZigZag):
         return source.randint(0, source.choice(SMALL_LIMITS))
     if isinstance(con, BitsInteger):
