@@ -245,87 +245,94 @@ def _expand_macro(con: Construct) -> list[Construct]:
     They are the member itself, and fields for the length, count or padding that construct hides.
     Another member is returned unchanged.
     """
-    name = con.name
     inner = _strip_name(con)
-    docs = con.docs
-
-    def rename_ending(ending: str, part: Construct, what: str) -> Construct:
-        return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
-
-    if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
-        members = _expand_macro(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
-        optional = (
-            construct.Renamed(
-                construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs
-            )
-            for one in members
-        )
-        if len(members) == 1:
-            return [con]
-        return list(optional)
-    if (
-        name
-        and isinstance(inner, construct.StringEncoded)
-        and isinstance(inner.subcon, construct.Prefixed)
-        and inner.subcon.subcon is construct.GreedyBytes
-    ):  # PascalString
+    if not con.name:
+        return [con]
+    if isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
+        return _expand_optional(con, inner)
+    if _is_pascal_string(inner):
         text = construct.StringEncoded(construct.GreedyBytes, inner.encoding)
-        prefixed = construct.Prefixed(inner.subcon.lengthfield, text, inner.subcon.includelength)
-        return _expand_macro(construct.Renamed(prefixed, newname=name, newdocs=docs))
-    if name and isinstance(inner, construct.Prefixed):
-        if inner.includelength:
-            plus = inner.lengthfield.sizeof()
-        else:
-            plus = 0
-        length = construct.this[f"{name}_size"]
-        if is_greedy(inner.subcon):
-            content = BoundedPart(length - plus if plus else length, inner.subcon)
-        else:
-            content = inner.subcon
-        members = _expand_macro(construct.Renamed(content, newname=name, newdocs=docs))
-        return [
-            rename_ending(
-                "_size",
-                SizeField(inner.lengthfield, (members[-1].name,), plus, members[0].name),
-                "bytes of",
-            ),
-            *members,
-        ]
-    if (
-        name
-        and isinstance(inner, construct.FocusedSeq)
-        and [part.name for part in inner.subcons] == ["count", "items"]
-    ):  # PrefixedArray
-        count, items = (part.subcon for part in inner.subcons)
-        array = Array(construct.this[f"{name}_count"], items.subcon)
-        return [
-            rename_ending("_count", CountField(count.subcon, name), "number of"),
-            construct.Renamed(array, newname=name, newdocs=docs),
-        ]
+        length = inner.subcon
+        prefixed = construct.Prefixed(length.lengthfield, text, length.includelength)
+        return _expand_prefixed(con, prefixed)
+    if isinstance(inner, construct.Prefixed):
+        return _expand_prefixed(con, inner)
+    if _is_prefixed_array(inner):
+        return _expand_prefixed_array(con, inner)
+    if isinstance(inner, construct.Aligned):
+        members, span = _expand_padded(con, inner)
+        filler = PaddingField(span, modulus=inner.modulus, pattern=inner.pattern)
+        return [*members, _name_field(con, "_padding", filler, "padding of")]
     is_padded = isinstance(inner, construct.Padded) and inner.subcon is not construct.Pass
-    if name and (
-        isinstance(inner, construct.Aligned)
-        or is_padded
-        or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))
-    ):
-        members = _expand_macro(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
-        span = (members[0].name, members[-1].name)
-        if isinstance(inner, construct.Aligned):
-            return [
-                *members,
-                rename_ending(
-                    "_padding",
-                    PaddingField(span, modulus=inner.modulus, pattern=inner.pattern),
-                    "padding of",
-                ),
-            ]
-        is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
-        if is_full:
+    if is_padded or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon)):
+        members, span = _expand_padded(con, inner)
+        if isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon):
             return members
         pattern = inner.pattern if is_padded else b"\0"
         filler = PaddingField(span, to=inner.length, pattern=pattern)
-        return [*members, rename_ending("_padding", filler, "padding of")]
+        return [*members, _name_field(con, "_padding", filler, "padding of")]
     return [con]
+
+
+def _is_pascal_string(con: Construct) -> bool:
+    return (
+        isinstance(con, construct.StringEncoded)
+        and isinstance(con.subcon, construct.Prefixed)
+        and con.subcon.subcon is construct.GreedyBytes
+    )
+
+
+def _is_prefixed_array(con: Construct) -> bool:
+    is_sequence = isinstance(con, construct.FocusedSeq)
+    return is_sequence and [part.name for part in con.subcons] == ["count", "items"]
+
+
+def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
+    """Return a field that construct hides, named and documented after its member."""
+    return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
+
+
+def _expand_content(con: Construct, content: Construct) -> list[Construct]:
+    """Return the members for the content of a member, with the member's name."""
+    return _expand_macro(construct.Renamed(content, newname=con.name, newdocs=con.docs))
+
+
+def _expand_optional(con: Construct, inner: construct.IfThenElse) -> list[Construct]:
+    members = _expand_content(con, inner.thensubcon)
+    if len(members) == 1:
+        return [con]
+    return [
+        construct.Renamed(
+            construct.If(inner.condfunc, member.subcon), newname=member.name, newdocs=member.docs
+        )
+        for member in members
+    ]
+
+
+def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construct]:
+    plus = inner.lengthfield.sizeof() if inner.includelength else 0
+    content = inner.subcon
+    if is_greedy(content):
+        length = construct.this[f"{con.name}_size"]
+        content = BoundedPart(length - plus if plus else length, content)
+    members = _expand_content(con, content)
+    size = SizeField(inner.lengthfield, (members[-1].name,), plus, members[0].name)
+    return [_name_field(con, "_size", size, "bytes of"), *members]
+
+
+def _expand_prefixed_array(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
+    count, items = (part.subcon for part in inner.subcons)
+    array = Array(construct.this[f"{con.name}_count"], items.subcon)
+    return [
+        _name_field(con, "_count", CountField(count.subcon, con.name), "number of"),
+        construct.Renamed(array, newname=con.name, newdocs=con.docs),
+    ]
+
+
+def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct], tuple[str, str]]:
+    """Return the members inside a padded part, and the names of the first and the last."""
+    members = _expand_content(con, inner.subcon)
+    return members, (members[0].name, members[-1].name)
 
 
 class _ComparisonRecorder:
