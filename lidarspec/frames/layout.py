@@ -171,7 +171,7 @@ class Leaf:
                 (len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,)
             )
             return which, windows[starts].astype(self._native)
-        return which, self._is_scalar.load(gather_rows(buffer, starts, self.size))
+        return which, self._from_start.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
         """Return its value in the first bytes of a frame; None if they end before it."""
@@ -223,7 +223,7 @@ class Leaf:
         )
 
     @cached_property
-    def _is_scalar(self) -> Leaf:
+    def _from_start(self) -> Leaf:
         return self.shift(self.offset)
 
     @cached_property

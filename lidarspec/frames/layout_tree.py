@@ -111,9 +111,8 @@ def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
         offset -> (mask, value).
     """
     walk = HeaderWalk({}, limit)
-    with contextlib.suppress(
-        Exception
-    ):  # if an expression of the struct fails, the constants before it are still known
+    # If an expression of the struct fails, the constants before it are still known.
+    with contextlib.suppress(Exception):
         walk.visit(root, "")
     return walk.constants
 
@@ -453,9 +452,8 @@ class HeaderWalk:
         if leaf.info.allowed is not None or is_partial:
             self.conditions[leaf.info] = Condition.of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
-        if leaf.shape and len(leaf.shape) > len(leaf.strides) - (
-            leaf.info.kind == "bytes"
-        ):  # bytes, or an array within a bit block
+        is_in_block = len(leaf.shape) > len(leaf.strides)
+        if leaf.shape and (leaf.info.kind == "bytes" or is_in_block):
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
 
     def _seal(self, node: tree.Sealed, start: int) -> None:
@@ -497,9 +495,8 @@ class HeaderWalk:
         """
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
-                with contextlib.suppress(
-                    Exception
-                ):  # construct evaluates other fields when a frame is built
+                # construct evaluates other fields when a frame is built.
+                with contextlib.suppress(Exception):
                     yield leaf, operator.index(tree.evaluate(leaf.info.rebuilt, self._read_known))
 
     def _read_known(self, path: str) -> int | None:
@@ -1015,14 +1012,12 @@ class HeaderTree:
             neither if the frame is longer than the available bytes.
         """
 
-        def size_asked(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
+        def read_selector(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
             nonlocal node
-            node.leaf, node.before, node.value_classes, node.constants = (
-                leaf,
-                dict(walk.leaves),
-                self._get_value_classes(leaf),
-                self._new_constants(walk),
-            )
+            node.leaf = leaf
+            node.before = dict(walk.leaves)
+            node.value_classes = self._get_value_classes(leaf)
+            node.constants = self._new_constants(walk)
             value = leaf.read_first(data)
             if value is None:
                 raise UnknownSelectorError(leaf)
@@ -1035,7 +1030,7 @@ class HeaderTree:
             return node
         self._size += not node.least  # a node with a known size was counted before
         walk = HeaderWalk(
-            node.values, self.limit, self._given, size_asked, len(data) if is_all else None
+            node.values, self.limit, self._given, read_selector, len(data) if is_all else None
         )
         try:
             node.result = walk_layout(walk, self.root)
