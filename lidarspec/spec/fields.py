@@ -385,7 +385,7 @@ class Checksummed(layer.SealedStruct):
         return start, end
 
 
-layer.SealedStruct.author_class = Checksummed
+layer.SealedStruct.plugin_class = Checksummed
 
 
 class Parts(layer.Partition):
@@ -443,13 +443,13 @@ class Parts(layer.Partition):
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         parsed = layer.ParsedParts()
-        goes_on = self._rule(context, path)
-        while (announced := goes_on(parsed)) != 0:
+        next_size = self._rule(context, path)
+        while (announced := next_size(parsed)) != 0:
             place = f"{path}[{len(parsed)}]"
-            spot = stream.tell()
+            offset = stream.tell()
             kind = self._kind(stream, context, place)
             part = self.cases[kind]._parsereport(stream, context, place)
-            self._take(parsed, kind, part, (spot, stream.tell()), announced, place)
+            self._append(parsed, kind, part, (offset, stream.tell()), announced, place)
             if stream.tell() - start > self.limit:
                 raise RangeError("the parts are longer than the frame may be", path=place)
         return parsed
@@ -458,16 +458,16 @@ class Parts(layer.Partition):
         if not isinstance(obj, list | tuple):
             raise layer.MismatchError(path, 0, "a list of its parts", repr(obj), "value")
         built = layer.ParsedParts()
-        goes_on = self._rule(context, path)
+        next_size = self._rule(context, path)
         for index, part in enumerate(obj):
-            announced = goes_on(built)
+            announced = next_size(built)
             place = f"{path}[{index}]"
-            kind, value, data = self._built(part, context, place)
-            self._take(
+            kind, value, data = self._build_part(part, context, place)
+            self._append(
                 built, kind, value, (stream.tell(), stream.tell() + len(data)), announced, place
             )
             stream.write(data)
-        if goes_on(built) != 0:
+        if next_size(built) != 0:
             raise RangeError(
                 f"the frame announces more parts than the {len(built)} that were given", path=path
             )
@@ -491,7 +491,7 @@ class Parts(layer.Partition):
         )
         count, size, within = bounds
 
-        def goes_on(parsed: layer.ParsedParts) -> int:
+        def next_size(parsed: layer.ParsedParts) -> int:
             if count is not None:
                 if len(parsed) < count:
                     return -1
@@ -510,10 +510,10 @@ class Parts(layer.Partition):
                 path,
             )
 
-        return goes_on
+        return next_size
 
     @staticmethod
-    def _take(
+    def _append(
         parsed: layer.ParsedParts,
         kind: str,
         part: Any,
@@ -534,7 +534,7 @@ class Parts(layer.Partition):
         """Return the first kind with matching constants, as far as there are bytes.
 
         Raises:
-            Mismatch: if no kind matches.
+            MismatchError: if no kind matches.
         """
         start = stream.tell()
         names = list(self.cases)
@@ -563,7 +563,7 @@ class Parts(layer.Partition):
             )
         return names[-1]
 
-    def _built(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
+    def _build_part(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
         """Build a part as the first kind that accepts it; return kind, value and bytes."""
         faults = list[ConstructError]()
         for name, case in self.cases.items():

@@ -336,24 +336,23 @@ Formula = int | Ref | Op | Untraced
 Read = Callable[[str], "int | None"]
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
-    **{
-        "+": operator.add,
-        "*": operator.mul,
-        "//": operator.floordiv,
-        "%": operator.mod,
-        "&": operator.and_,
-        "|": operator.or_,
-        "/": operator.truediv,
-    },
-    **{"^": operator.xor, "<<": operator.lshift, ">>": operator.rshift, "not": operator.not_},
-    **{
-        "==": operator.eq,
-        "!=": operator.ne,
-        "<": operator.lt,
-        "<=": operator.le,
-        ">": operator.gt,
-        ">=": operator.ge,
-    },
+    "+": operator.add,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "//": operator.floordiv,
+    "%": operator.mod,
+    "&": operator.and_,
+    "|": operator.or_,
+    "^": operator.xor,
+    "<<": operator.lshift,
+    ">>": operator.rshift,
+    "not": operator.not_,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
     "-": lambda first, *second: first - second[0] if second else -first,
 }
 
@@ -465,15 +464,11 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
     """
     if not indices.keys() <= set(info.axes):
         return None
-    is_byte = info.kind == "bytes" and info.path in indices
-    kind, bits = ("int", 8) if is_byte else (info.kind, info.bits)
-    return replace(
-        info,
-        path=path,
-        axes=tuple(axis for axis in info.axes if axis not in indices),
-        kind=kind,
-        bits=bits,
-    )
+    axes = tuple(axis for axis in info.axes if axis not in indices)
+    element = replace(info, path=path, axes=axes)
+    if info.kind == "bytes" and info.path in indices:
+        return replace(element, kind="int", bits=8)
+    return element
 
 
 def fraction_in(formula: Formula) -> str | float | None:
@@ -981,9 +976,9 @@ def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula 
     if one is None or other is None:
         return None
     neutral = 1 if symbol == "*" else 0
-    if other == neutral or (one == neutral and symbol != "-"):
-        if other == neutral:
-            return one
+    if other == neutral:
+        return one
+    if one == neutral and symbol != "-":
         return other
     if symbol == "*" and 0 in (one, other):
         return 0
@@ -1082,7 +1077,7 @@ class Scope:
         raise UntraceableExpressionError("an expression uses the length of an array")
 
 
-class Beside(Scope):
+class RawCopyScope(Scope):
     """The context of a value that has no struct of its own (construct's RawCopy).
 
     It has names for the bytes and the offsets of the value. For other names, expressions of the

@@ -71,17 +71,17 @@ def frame_tree(con: Construct) -> tree.Node:
     return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
 
-def _build_twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """Return the node that `made` builds, and the builder.
+def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
+    """Return the node that `build` makes, and the builder.
 
     If rebuilt values depend on later fields, the node is built a second time by a builder that
     knows the fields and sizes of the first pass.
     """
     builder = _Builder()
-    root = made(builder)
+    root = build(builder)
     if builder.rebuilding:
         builder = _Builder(builder)
-        root = made(builder)
+        root = build(builder)
     return root, builder
 
 
@@ -298,7 +298,7 @@ class _Builder:
     def _raw(self, con: RawPart, place: _Context) -> tree.Struct:
         """Return a RawCopy as a struct of the value, its bytes and its offsets."""
         info = place.info
-        scope = tree.Beside(place.scope, info.path, self._asked)
+        scope = tree.RawCopyScope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
             place.scope.add(place.name, scope)
 
@@ -491,17 +491,12 @@ class _Builder:
                 else functools.partial(_find_offset_after, place.offset, members, len(members))
             )
             inside = _Context(described, scope, child.name or "", place.in_bits, offset=offset)
-            part = unwrap(child)
-            if isinstance(
-                filler := (
-                    unwrap(part.thensubcon) if isinstance(part, construct.IfThenElse) else part
-                ),
-                PaddingField,
-            ):
-                inside = replace(
-                    inside,
-                    room=self._padding(filler, inside, _sum_member_sizes(members, filler.of[0])),
-                )
+            filler = unwrap(child)
+            if isinstance(filler, construct.IfThenElse):
+                filler = unwrap(filler.thensubcon)
+            if isinstance(filler, PaddingField):
+                size = _sum_member_sizes(members, filler.of[0])
+                inside = replace(inside, room=self._padding(filler, inside, size))
             elif place.room is not None and child is con.subcons[-1]:
                 inside = replace(
                     inside, room=tree.combine("-", place.room, tree.total(map(tree.size, members)))
@@ -952,14 +947,10 @@ _TRANSFORMED_REASON = (
 
 #: class that only construct can read -> the message with a replacement.
 _OPAQUE_REASONS = {
-    **{
-        name: _TRANSFORMED_REASON.format(name)
-        for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")
-    },
-    **{
-        name: f"{name} has no numbers: use the Array or Struct inside it"
-        for name in ("NamedTuple",)
-    },
+    "ProcessXor": _TRANSFORMED_REASON.format("ProcessXor"),
+    "ProcessRotateLeft": _TRANSFORMED_REASON.format("ProcessRotateLeft"),
+    "Compressed": _TRANSFORMED_REASON.format("Compressed"),
+    "NamedTuple": "NamedTuple has no numbers: use the Array or Struct inside it",
     "StringEncoded": (
         "text has no numbers and no fixed offset: use Bytes(n), and decode it for display"
     ),

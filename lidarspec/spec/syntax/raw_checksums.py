@@ -91,7 +91,7 @@ def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[d
 def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
     """Return a struct with seals around it."""
     for arguments in seals:
-        struct = SealedStruct.author_class(struct, **arguments)
+        struct = SealedStruct.plugin_class(struct, **arguments)
     return struct
 
 

@@ -111,10 +111,10 @@ class MarkedStruct(Struct):  # type: ignore[misc]
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, end)
         obj["_marks"] = marks
-        for sizing, place, spot, value in inner._sizings if is_verifying(context) else ():
+        for sizing, field, offset, value in inner._sizings if is_verifying(context) else ():
             expected = sizing.value(obj)
             if value != expected:
-                raise MismatchError(place, spot, expected, value, "length")
+                raise MismatchError(field, offset, expected, value, "length")
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -133,8 +133,8 @@ class MarkedStruct(Struct):  # type: ignore[misc]
             if con.name:
                 inner[con.name] = value
                 marks[con.name] = (start, stream.tell())
-        for sizing, place, _, _ in inner._sizings:
-            context._params["_sizes"][place] = sizing.value(inner)
+        for sizing, field, _, _ in inner._sizings:
+            context._params["_sizes"][field] = sizing.value(inner)
         return inner
 
     def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
@@ -196,7 +196,7 @@ class IndexedArray(Array):  # type: ignore[misc]
             raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
         if len(obj) != count:
             raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
-        return _built(self, obj, stream, context, path)
+        return _build_elements(self, obj, stream, context, path)
 
 
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
@@ -220,10 +220,12 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
             raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
-        return _built(self, obj, stream, context, path)
+        return _build_elements(self, obj, stream, context, path)
 
 
-def _built(con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any, path: str) -> Any:
+def _build_elements(
+    con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any, path: str
+) -> Any:
     """Build the elements of an array, with the index in an error's path."""
     built = construct.ListContainer()
     for index, element in enumerate(elements):
@@ -263,13 +265,13 @@ class LimitedNumber(Subconstruct):  # type: ignore[misc]
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
         if is_verifying(context):
-            return self._hold(obj, start, path)
+            return self._check_allowed(obj, start, path)
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        return self._hold(self.subcon._build(obj, stream, context, path), 0, path)
+        return self._check_allowed(self.subcon._build(obj, stream, context, path), 0, path)
 
-    def _hold(self, obj: Any, start: int, path: str) -> Any:
+    def _check_allowed(self, obj: Any, start: int, path: str) -> Any:
         if int(obj) not in self.allowed:
             raise MismatchError(path, start, tree.format_values(self.allowed), int(obj), "value")
         return obj
@@ -473,7 +475,7 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     absent: frozenset[int]
 
     #: the class for plugins, `Checksummed`; it replaces construct's Checksum of a RawCopy.
-    author_class: Callable[..., SealedStruct]
+    plugin_class: Callable[..., SealedStruct]
 
 
 class SizeField(Subconstruct):  # type: ignore[misc]
