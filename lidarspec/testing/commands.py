@@ -117,7 +117,7 @@ def an_exchange_holds(
     """Fail unless a command has these bytes, and `answer` is its reply.
 
     Raises:
-        Violation: if the bytes differ, or the reply does not match.
+        ViolationError: if the bytes differ, or the reply does not match.
     """
     command = sensor.commands[name]
     try:

@@ -222,7 +222,7 @@ def require(holds: object, code: str, what: str, path: str = "") -> None:
     """Raise a `ViolationError` unless `holds`.
 
     Raises:
-        Violation: with this code, text and path.
+        ViolationError: with this code, text and path.
     """
     if not holds:
         raise ViolationError(code, what, path)

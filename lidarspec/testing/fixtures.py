@@ -43,9 +43,9 @@ def virtual_port(
         virtual_time: True lets the sensor's time pass only in `advance`.
 
     Yields:
-        An object with the attributes `path` (to open) and `device` (`device.heard` lists the
-        received commands), and the methods `unplug`, `plug`, `jump_clock(seconds)` and, with
-        virtual time, `advance(seconds)`.
+        An object with the attributes `path` (to open) and `device` (`device.commands_received`
+        lists the received commands), and the methods `unplug`, `plug`, `jump_clock(seconds)` and,
+        with virtual time, `advance(seconds)`.
 
     Raises:
         SourceError: if the port cannot be opened.

@@ -386,7 +386,7 @@ def entries(subject: SensorUnderTest) -> dict[str, Any]:
     """Return the valid vectors of the sensor by their keys.
 
     Raises:
-        Violation: if the file cannot be read.
+        ViolationError: if the file cannot be read.
     """
     return {
         place: vector
@@ -423,7 +423,7 @@ def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
     """Return whether an entry belongs to the sensor; set the frame of a command.
 
     Raises:
-        Violation: for an invalid entry.
+        ViolationError: for an invalid entry.
     """
     require(isinstance(vector, dict), "LS702", "not an object", place)
     unknown = sorted(vector.keys() - KEYS.keys())
@@ -456,8 +456,8 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], place: str)
     """Return whether an entry belongs to the sensor.
 
     Raises:
-        Violation: if several sensors share the file and the entry names none, or if it names an
-            unknown sensor.
+        ViolationError: if several sensors share the file and the entry names none, or if it names
+            an unknown sensor.
     """
     named = vector.get("sensor", [])
     family = subject.family
@@ -481,7 +481,7 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) 
     """Return the parsed vector.
 
     Raises:
-        Violation: if it cannot be parsed; for a wrong checksum, with the checksums that match.
+        ViolationError: if it cannot be parsed; for a wrong checksum, with the checksums that match.
     """
     try:
         return subject.sensor.parse(data, frame=name)
