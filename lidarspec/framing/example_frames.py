@@ -53,6 +53,8 @@ LARGEST_BATCH = 64
 BATCH_BYTES = 1 << 22
 #: how many random headers are tried.
 HEADERS = 400
+#: the rule of `lidarspec check` for a frame type without an example.
+NO_EXAMPLE = "LS301"
 #: field path -> function that draws a raw value.
 Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
@@ -249,7 +251,7 @@ def make_of_values(
         stops = np.array([len(data)])
         if engine.survey(rows, np.zeros(1, np.intp), stops).status[0] == VALID:
             return data
-    raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
+    raise SpecError("no random frame is valid", path=frame, sensor=sensor.id, rule=NO_EXAMPLE)
 
 
 def _remove_lengths(values: Any, root: Node) -> Any:
@@ -347,6 +349,7 @@ def _make_along_sweep(
             "no random frame passes `plausible`, and no `sweep` is declared",
             path=frame,
             sensor=sensor.id,
+            rule=NO_EXAMPLE,
         )
     for _ in range(tries):
         values = sweep(source.randrange(10_000))
@@ -368,6 +371,7 @@ def _make_along_sweep(
         "neither random frames nor frames of `sweep` pass `plausible`",
         path=frame,
         sensor=sensor.id,
+        rule=NO_EXAMPLE,
     )
 
 
