@@ -53,6 +53,12 @@ LARGEST_BATCH = 64
 BATCH_BYTES = 1 << 22
 #: how many random headers are tried.
 HEADERS = 400
+#: numbers up to these limits are drawn more often, because counts and keys are mostly low.
+LOW_NUMBERS = (8, 40)
+#: how often a named value or the key of a switch may be drawn for a header field, and the number of
+#: these values.
+NAMED_SHARE = 0.7
+MAX_NAMED_VALUES = 16
 #: the rule of `lidarspec check` for a frame type without an example.
 NO_EXAMPLE = "LS301"
 #: field path -> function that draws a raw value.
@@ -106,9 +112,10 @@ def random_row(
         SpecError: if none of them is plausible.
     """
     engine = get_codec(sensor.frames[frame])
-    for attempt in range(
-        tries if sensor.simulation_of(frame).sweep is None else min(tries, TRIES_BEFORE_SWEEP)
-    ):
+    random_tries = tries
+    if sensor.simulation_of(frame).sweep is not None:
+        random_tries = min(tries, TRIES_BEFORE_SWEEP)
+    for attempt in range(random_tries):
         layout, chosen = make_random_header(engine, source, drawn)
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _make_random_rows(engine, layout, number, source)
@@ -170,18 +177,16 @@ def switch_keys(root: Node) -> Iterator[int]:
 
 
 def _draw_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
-    if leaf.info.const is not None or leaf.info.allowed:
-        if leaf.info.const is not None:
-            return int(leaf.info.const)
-        return source.choice(leaf.info.allowed or ())
+    if leaf.info.const is not None:
+        return int(leaf.info.const)
+    if leaf.info.allowed:
+        return source.choice(leaf.info.allowed)
     top = (1 << leaf.info.bits) - 1
-    kinds = [
-        source.randint(0, top),
-        source.randint(0, min(top, 8)),
-        source.randint(0, min(top, 40)),
-    ]
-    named = [key for key in (*leaf.info.labels, *keys) if key <= top]
-    value = source.choice(kinds + named[:16] * (1 if source.random() < 0.7 else 0))
+    candidates = [source.randint(0, min(top, limit)) for limit in (top, *LOW_NUMBERS)]
+    if source.random() < NAMED_SHARE:
+        named = [key for key in (*leaf.info.labels, *keys) if key <= top]
+        candidates += named[:MAX_NAMED_VALUES]
+    value = source.choice(candidates)
     is_negative = (
         leaf.info.dtype is not None
         and leaf.info.dtype.kind == "i"
@@ -215,12 +220,8 @@ def _make_random_rows(
             letters = source.choices(LETTERS, k=number * math.prod(leaf.shape))
             leaf.store(rows, np.array(letters, np.uint8).reshape(number, *leaf.shape))
         if leaf.info.allowed:
-            leaf.store(
-                rows,
-                np.array(
-                    source.choices(leaf.info.allowed, k=number * math.prod(leaf.shape))
-                ).reshape(number, *leaf.shape),
-            )
+            values = source.choices(leaf.info.allowed, k=number * math.prod(leaf.shape))
+            leaf.store(rows, np.array(values).reshape(number, *leaf.shape))
     return rows
 
 
@@ -277,7 +278,9 @@ def _remove_lengths(values: Any, root: Node) -> Any:
 def _remove_field(values: Any, path: str) -> None:
     """Remove a field from nested mappings, if it is there."""
     *parents, name = path.split(".")
-    get_member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
+    if parents:
+        values = get_member(values, ".".join(parents), {})
+    values.pop(name, None)
 
 
 def _fill_headers(

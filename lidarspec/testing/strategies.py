@@ -35,7 +35,7 @@ from lidarspec.frames.layout import Leaf
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.framing.example_frames import make_of_values, switch_keys
+from lidarspec.framing.example_frames import LOW_NUMBERS, make_of_values, switch_keys
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scan import Scan
@@ -62,8 +62,6 @@ Fields = Mapping[str, SearchStrategy[Any]]
 #: one value and has at most `MAX_EXCEPTIONS` exceptions.
 MAX_SINGLE_DRAWS = 12
 MAX_EXCEPTIONS = 6
-#: Numbers up to these limits are drawn more often, because counts and keys are mostly low.
-LOW_NUMBERS = (8, 40)
 #: Number of tries to draw a frame without a layout in one example.
 TRIES = 4
 #: Maximum number of elements of nested arrays of such a frame, which construct builds one by one.
@@ -219,8 +217,9 @@ def streams(
     resolved = _resolve(sensor)
     runs = [_run(resolved, name) for name in resolved.incoming]
     if noise is True:
-        runs += [_noise(), _truncated(resolved)]
-    elif noise is not False:
+        noise = st.binary(min_size=1, max_size=MAX_NOISE_BYTES)
+        runs.append(_truncated(resolved))
+    if noise is not False:
         runs.append(noise.map(lambda data: [data]))
     sequences = st.lists(st.one_of(*runs), max_size=MAX_RUNS)
     return _joined_runs(sequences, is_stream=not resolved.datagrams)
@@ -243,10 +242,6 @@ def _run(draw: DrawFn, sensor: Sensor, frame: str) -> list[bytes]:
     before = [] if declared.after is None else [draw(frames(sensor, declared.after))]
     count = draw(_integers(declared.confirm, declared.confirm + 2))
     return before + [draw(frames(sensor, frame)) for _ in range(count)]
-
-
-def _noise() -> SearchStrategy[list[bytes]]:
-    return st.binary(min_size=1, max_size=MAX_NOISE_BYTES).map(lambda data: [data])
 
 
 @st.composite
@@ -399,10 +394,10 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
     low, high = info.limits
     keys = switch_keys(sensor.frames[frame].tree)
     named = sorted({key for key in (*info.labels, *keys) if low <= key <= high})
-    numbers = [st.integers(max(low, 0), min(high, top)) for top in LOW_NUMBERS]
+    numbers = _mostly_low(low, high)
     if named:
-        numbers.insert(0, st.sampled_from(named))
-    return st.one_of(*numbers, st.integers(low, high))
+        return st.sampled_from(named) | numbers
+    return numbers
 
 
 def _element(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
@@ -516,8 +511,8 @@ class _DrawnNumbers(random.Random):
 @functools.lru_cache(maxsize=1024)
 def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
     """Return a strategy for numbers that may be counts: low numbers are more frequent."""
-    ranges = [(max(low, 0), min(high, top)) for top in LOW_NUMBERS]
-    return st.one_of(*(st.integers(*ends) for ends in ranges), st.integers(low, high))
+    low_numbers = [st.integers(max(low, 0), min(high, top)) for top in LOW_NUMBERS]
+    return st.one_of(*low_numbers, st.integers(low, high))
 
 
 @st.composite
