@@ -97,7 +97,7 @@ class LayoutRanges:
         fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
         for path, value in values.items():
             elements = itertools.cycle(value.flat)
-            fixed[path] = functools.partial(lambda known, _: next(known), elements)
+            fixed[path] = functools.partial(_return_next, elements)
         with contextlib.suppress(SpecError):
             layout, row = random_row(self._sensor, self._frame, random.Random(0), fixed)
             return LayoutRanges(self._sensor, self._frame, layout, self._header, row)
@@ -229,20 +229,25 @@ class LayoutRanges:
         return _are_valid(self._sensor, self._frame, self.layout, rows)
 
 
+def _return_next(values: Iterator[Any], _: random.Random) -> Any:
+    """Return the next value, instead of a random one."""
+    return next(values)
+
+
 def find_ends(
     wanted: Mapping[str, tuple[int, int]],
-    take: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
+    are_valid: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
     """Return the last valid value of each field on the way to a wanted value.
 
     Args:
         wanted: path -> (valid value, wanted value).
-        take: returns for each (path, value) whether it is valid.
+        are_valid: returns for each (path, value) whether it is valid.
     """
     valid = {path: start for path, (start, _) in wanted.items()}
     refused: dict[str, int] = {}
     ends = [(path, end) for path, (start, end) in wanted.items() if start != end]
-    for (path, end), is_valid in zip(ends, take(ends), strict=True):
+    for (path, end), is_valid in zip(ends, are_valid(ends), strict=True):
         if is_valid:
             valid[path] = end
         else:
@@ -255,7 +260,7 @@ def find_ends(
         ]
         if not middles:
             return valid
-        for (path, middle), is_valid in zip(middles, take(middles), strict=True):
+        for (path, middle), is_valid in zip(middles, are_valid(middles), strict=True):
             if is_valid:
                 valid[path] = middle
             else:
@@ -400,11 +405,13 @@ def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]
         and (values := list(_iter_values_at(base, path.split("."))))
     }
 
-    def take(tried: Sequence[tuple[str, int]]) -> list[bool]:
+    def are_valid(tried: Sequence[tuple[str, int]]) -> list[bool]:
         return [_can_build(sensor, frame, _with_value(base, path, value)) for path, value in tried]
 
-    low = find_ends({path: (raw, info.limits[0]) for path, (info, raw) in bounded.items()}, take)
-    high = find_ends({path: (raw, info.limits[1]) for path, (info, raw) in bounded.items()}, take)
+    lowest = {path: (raw, info.limits[0]) for path, (info, raw) in bounded.items()}
+    highest = {path: (raw, info.limits[1]) for path, (info, raw) in bounded.items()}
+    low = find_ends(lowest, are_valid)
+    high = find_ends(highest, are_valid)
     return {path: (low[path], high[path]) for path in bounded if low[path] < high[path]}
 
 
