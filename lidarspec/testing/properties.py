@@ -125,10 +125,8 @@ class Property:
                     Finding(error.code, error.what, error.path, subject.sensor.id, file)
                 )
             except AssertionError as error:
-                code = "LS414" if "Traceback" in str(error) else self.rule
-                findings.append(
-                    Finding(code, _find_main_line(error), ".".join(case), subject.sensor.id)
-                )
+                what = _find_first_line(error)
+                findings.append(Finding(self.rule, what, ".".join(case), subject.sensor.id))
             except SpecError as error:
                 place = ".".join(case)
                 path = error.path if error.path.startswith(place) else place
@@ -279,14 +277,10 @@ PROPERTIES = (
 )
 
 
-def _find_main_line(error: BaseException) -> str:
-    """Return the most informative line of the message of an error."""
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    if lines:
-        if "Traceback" in str(error):
-            return lines[-1]
-        return lines[0]
-    return type(error).__name__
+def _find_first_line(error: BaseException) -> str:
+    """Return the first line of the message of an error that is not empty."""
+    lines = (line for line in str(error).splitlines() if line.strip())
+    return next(lines, type(error).__name__)
 
 
 def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
