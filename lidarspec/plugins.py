@@ -195,6 +195,7 @@ class Plugin:
         distribution, version, entry_point: its origin.
         sensors: the ids that it adds.
         error: the reason why it, or one of its ids, is not available; "" without an error.
+        rule: the code under which `lidarspec check` explains the error, "" if there is none.
         traceback: the traceback of the error.
         remark: side effects of loading it.
     """
@@ -204,6 +205,7 @@ class Plugin:
     entry_point: str
     sensors: tuple[str, ...] = ()
     error: str = ""
+    rule: str = ""
     traceback: str = ""
     remark: str = ""
 
@@ -287,7 +289,9 @@ class Registry:
                 others = [other for other in self._claims[lost[0]] if other != home]
             whose = ", ".join(":".join(other) for other in others)
             plugin = replace(
-                plugin, error=f"{lost[0]}: another sensor has this id already: that of {whose}"
+                plugin,
+                error=f"{lost[0]}: another sensor has this id already: that of {whose}",
+                rule="LS005",
             )
         return replace(plugin, sensors=tuple(own))
 
@@ -306,7 +310,7 @@ class Registry:
             if self._manager.has_plugin(name):
                 self._manager.unregister(name=name)
             if isinstance(error, pluggy.PluginValidationError):
-                raise SpecError(" ".join(str(error).split()), path=name) from None
+                raise SpecError(" ".join(str(error).split()), path=name, rule="LS004") from None
             raise
         distribution, _, module = name.partition(":")
         self._store_sensors((distribution, module), sensors, claimed=True)
@@ -592,26 +596,30 @@ class Registry:
                 if algorithm is not None:
                     return _reseal(frame, algorithm)
             except Exception as error:
-                self._record_failure(
+                self._record_checksum_failure(
                     hook.plugin_name,
                     f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}",
                 )
         return frame
 
-    def _record_failure(self, name: str, reason: str) -> None:
+    def _record_checksum_failure(self, name: str, reason: str) -> None:
         for index, plugin in enumerate(self._modules):
             if ":".join(plugin.home) == name and not plugin.error:
                 self._modules[index] = replace(
-                    plugin, error=reason, traceback=traceback.format_exc()
+                    plugin, error=reason, rule="LS010", traceback=traceback.format_exc()
                 )
 
     def _check(self, sensor: Any, own: list[Any]) -> None:
         if not isinstance(sensor, Sensor):
-            raise SpecError(f"lidarspec_sensors must return sensors, got {type(sensor).__name__}")
+            raise SpecError(
+                f"lidarspec_sensors must return sensors, got {type(sensor).__name__}", rule="LS006"
+            )
         for name in (sensor.id, *sensor.aliases):
             if sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError(
-                    "another sensor has this id already: one of the same plugin", sensor=name
+                    "another sensor has this id already: one of the same plugin",
+                    sensor=name,
+                    rule="LS005",
                 )
 
 
@@ -748,7 +756,8 @@ def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) 
             reason = str(error)
         else:
             reason = f"{type(error).__name__}: {error}"
-        return replace(plugin, error=reason, traceback=traceback.format_exc())
+        rule = error.rule if isinstance(error, SpecError) else ""
+        return replace(plugin, error=reason, rule=rule, traceback=traceback.format_exc())
 
 
 def _letters(name: str) -> str:
@@ -780,10 +789,12 @@ def _check_hooks(plugin: Any, name: str) -> None:
             continue
         if attribute not in HOOKS:
             raise SpecError(
-                f"unknown hook {attribute!r}: expected one of {', '.join(HOOKS)}", path=name
+                f"unknown hook {attribute!r}: expected one of {', '.join(HOOKS)}",
+                path=name,
+                rule="LS002",
             )
         if not _is_hook(function):
-            raise SpecError(f"{attribute} lacks @hookimpl", path=name)
+            raise SpecError(f"{attribute} lacks @hookimpl", path=name, rule="LS003")
 
 
 #: the registry of this environment after its first use, and substitutes for it.
@@ -996,6 +1007,7 @@ def _from_file(text: str) -> Sensor:
         raise SpecError(
             "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
             path=str(file),
+            rule="LS006",
         )
     if len(ids) > 1 and not wanted:
         raise UsageError(

@@ -173,7 +173,8 @@ class Frame:
         object.__setattr__(self, "endless", check_struct(self.prepared))
         if not longest:
             raise SpecError(
-                "max_length is required, because the struct has no fixed size or has a wire form"
+                "max_length is required, because the struct has no fixed size or has a wire form",
+                rule="LS009",
             )
 
     def __repr__(self) -> str:

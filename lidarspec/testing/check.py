@@ -34,17 +34,8 @@ from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"
-#: (part of a message of the registry, rule of the error).
-LOADING_MESSAGES = (
-    ("unknown hook", "LS002"),
-    ("lacks @hookimpl", "LS003"),
-    ("another sensor has this id", "LS005"),
-    ("must return sensors, got", "LS006"),
-    ("that returns a sensor", "LS006"),
-    ("definition", "LS004"),
-    ("lidarspec_checksum for", "LS010"),
-    ("max_length is required", "LS009"),
-)
+#: Rules about the hooks of a plugin; the path of such an error is the name of the plugin.
+HOOK_RULES = frozenset({"LS002", "LS003", "LS004"})
 
 
 @dataclass(eq=False)
@@ -113,7 +104,8 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
         found_target.findings += _check_taken_ids(found_target.sensors, file)
         if not found_target.sensors:
             raise SpecError(
-                "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor"
+                "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
+                rule="LS006",
             )
     except SourceError:
         raise
@@ -190,7 +182,7 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
     failing = [
         plugin
         for plugin in registry().plugins
-        if _normalize(plugin.distribution) in names and _strip_markup(plugin.error) == "LS010"
+        if _normalize(plugin.distribution) in names and plugin.rule == "LS010"
     ]
     found_target.findings += [
         Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing
@@ -208,7 +200,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
     refused = [
         plugin
         for plugin in registry().plugins
-        if _strip_markup(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names
+        if plugin.rule == "LS005" and plugin.error.partition(":")[0] in names
     ]
     return [
         Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point)
@@ -280,7 +272,7 @@ def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
     if isinstance(cause, SyntaxError) and cause.filename:
         own = [(cause.filename, cause.lineno or 0)]
     file, line = own[-1] if own else (str(files[0]) if len(files) == 1 else "", 0)
-    if isinstance(error, SpecError) and error.rule:
+    if isinstance(error, SpecError) and error.rule and error.rule not in HOOK_RULES:
         path = error.path
     else:
         path = ""
@@ -300,14 +292,10 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
     if isinstance(cause, SpecError):
-        return _strip_markup(str(cause)) or "LS007"
+        return cause.rule or "LS007"
     if "lidarspec_sensors" in functions:
         return "LS006"
     return "LS001"
-
-
-def _strip_markup(text: str) -> str:
-    return next((code for words, code in LOADING_MESSAGES if words in text), "")
 
 
 def module_files(value: str) -> list[Path]:
