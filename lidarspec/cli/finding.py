@@ -165,8 +165,7 @@ def crc(
     if not matches:
         note(
             f"no checksum found in {len(frames)} frame{'s' * (len(frames) != 1)}: check that each"
-            " is"
-            " complete and begins at its first byte"
+            " is complete and begins at its first byte"
         )
         raise click.exceptions.Exit(FINDINGS)
     if matches[0].evidence_bits < WEAK_BITS:
@@ -451,7 +450,7 @@ def _iter_conclusions(
                 for name in verdict.candidates[0].sensor.configure.files
                 if verdict.candidates[0].sensor.recognise is not None
             ]:
-                yield (f"the packets do not contain beam angles: pass -O {files[0]}=FILE")
+                yield f"the packets do not contain beam angles: pass -O {files[0]}=FILE"
             options = format_sensor_options(verdict.candidates[0].sensor)
             yield f"next: lidarspec {_find_verb(verdict)} {_format_source(verdict)} {options}"
         elif verdict.others:
@@ -466,7 +465,8 @@ def _iter_conclusions(
     if any(verdict.scores for verdict in verdicts):
         return
     size = sum(verdict.sample.size for verdict in verdicts)
-    for verdict in (faulty := [verdict for verdict in verdicts if verdict.fault]):
+    faulty = [verdict for verdict in verdicts if verdict.fault]
+    for verdict in faulty:
         yield f"{_describe_place(verdict.sample)}: {verdict.fault}"
         yield f"next: lidarspec crc {quote(verdict.sample.source)}"
     if faulty:
@@ -487,13 +487,14 @@ def _iter_conclusions(
         yield f"{size} bytes{kind} without a frame of an installed sensor{structure_note}"
         yield f"next: {_find_next_command(source, unknown)}"
         return
+    has_warnings = any(verdict.sample.warnings for verdict in verdicts)
     if source is not None and live_address(source) is None:
-        yield from [no_bytes(source, ())] * (
-            not any(verdict.sample.warnings for verdict in verdicts)
-        )
+        if not has_warnings:
+            yield no_bytes(source, ())
         yield "next: lidarspec sensors"
         return
-    yield from [] if any(verdict.sample.warnings for verdict in verdicts) else ["no data received"]
+    if not has_warnings:
+        yield "no data received"
     is_serial = source is None or (
         (address := live_address(source)) is not None and address.scheme == "serial"
     )
@@ -657,7 +658,7 @@ def doctor(
     else:
         diagnoses = list(examine(source, sensor, seconds=duration))
     if as_json:
-        emit_json([vars(finding) for finding in diagnoses], output)
+        emit_json([finding.to_dict() for finding in diagnoses], output)
     else:
         lines = [
             f"{'ok   ' if one.ok else 'wrong'}  {one.text}"

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 from lidarspec.detect.identification import (
     CLEAR_SHARE,
@@ -35,7 +36,11 @@ from lidarspec.transports.addresses import SourceAddress, with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.protocol import no_bytes
-from lidarspec.transports.udp import REQUESTED_BUFFER_BYTES, warn_of_small_buffer
+from lidarspec.transports.udp import (
+    REQUESTED_BUFFER_BYTES,
+    describe_small_buffer,
+    enlarge_buffer_command,
+)
 
 LOOPBACK = "lo"
 
@@ -48,11 +53,17 @@ class Diagnosis:
         ok: whether no problem was found.
         text: a description of the result.
         fix: the command that fixes the problem; "" if there is no command for it.
+        is_silence: whether the problem is that no data was received.
     """
 
     ok: bool
     text: str
     fix: str = ""
+    is_silence: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as a JSON object."""
+        return {"ok": self.ok, "text": self.text, "fix": self.fix}
 
 
 def examine(
@@ -180,7 +191,7 @@ def _examine_udp(
     began = time.monotonic()
     findings = list(_examine_bytes(source, sensor, seconds))
     yield from findings
-    if any("no data received" in finding.text for finding in findings):
+    if any(finding.is_silence for finding in findings):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
             for name, count in ports.received_per_interface().items()
@@ -224,10 +235,12 @@ def _check_buffer() -> Iterator[Diagnosis]:
         granted = int(limit.read_text(encoding="ascii"))
     except (OSError, ValueError):
         return
-    for text in warn_of_small_buffer(REQUESTED_BUFFER_BYTES, min(granted, REQUESTED_BUFFER_BYTES)):
-        problem, _, command = text.partition("; next: ")
-        problem = problem.replace("the system gave", "the system gives at most")
-        yield Diagnosis(False, problem, command)
+    if granted < REQUESTED_BUFFER_BYTES:
+        yield Diagnosis(
+            False,
+            describe_small_buffer(REQUESTED_BUFFER_BYTES, granted),
+            enlarge_buffer_command(REQUESTED_BUFFER_BYTES),
+        )
 
 
 def _check_interfaces(
@@ -394,12 +407,13 @@ def _diagnose_silence(source: str, sensor: Sensor | None) -> Diagnosis:
     if sensor is not None and sensor in list_start_required():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)
         text = f"no data received; {sensor.id} sends nothing until it is started"
-        return Diagnosis(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
+        fix = f"lidarspec send {quoted} {start} -s {sensor.id}"
+        return Diagnosis(False, text, fix, is_silence=True)
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = (
             "no data received: start the sensor, or check its power, and that its transmit line is"
             " connected to our receive line"
         )
-        return Diagnosis(False, text, f"lidarspec detect {quoted} --start")
-    return Diagnosis(False, "no data received within the listening time")
+        return Diagnosis(False, text, f"lidarspec detect {quoted} --start", is_silence=True)
+    return Diagnosis(False, "no data received within the listening time", is_silence=True)

@@ -574,11 +574,21 @@ def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
     """
     if granted >= requested:
         return []
-    text = (
+    text = describe_small_buffer(requested, granted)
+    return [f"{text}; next: {enlarge_buffer_command(requested)}"]
+
+
+def describe_small_buffer(requested: int, granted: int) -> str:
+    """Return the problem of a receive buffer that is smaller than requested, in bytes."""
+    return (
         f"the system granted a receive buffer of {granted >> 10} KiB instead of"
         f" {requested >> 10}: packets may be lost under load"
     )
-    return [f"{text}; next: sudo sysctl -w net.core.rmem_max={requested}"]
+
+
+def enlarge_buffer_command(requested: int) -> str:
+    """Return the command that lets programs request a buffer of this size, in bytes."""
+    return f"sudo sysctl -w net.core.rmem_max={requested}"
 
 
 def _enlarge_buffer(opened: socket.socket) -> int:
