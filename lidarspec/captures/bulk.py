@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
 from lidarspec.captures.records import (
-    LARGEST_BLOCK,
+    MAX_BLOCK_BYTES,
     DamagedRecordError,
     Form,
     NoPacketReason,
@@ -31,20 +31,20 @@ from lidarspec.frames.layout import gather_rows
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
-#: Maximum size of the headers of a record that are compared, in bytes. Records with longer headers
-#: are read singly.
-WIDEST = 128
+#: Maximum size of the headers of a record that are compared. Records with longer headers are read
+#: singly.
+MAX_HEADER_BYTES = 128
 
-#: Largest size of a buffer in bytes.
-LARGEST = 2 * LARGEST_BLOCK
-_TRAILER = 4
+#: Largest size of a buffer.
+MAX_BUFFER_BYTES = 2 * MAX_BLOCK_BYTES
+_TRAILER_BYTES = 4
 #: Number of bytes at the start of a record, in both formats, that determine its length.
-_HEAD = 16
+_MIN_HEAD_BYTES = 16
 #: Smallest number of records of one length in a row for which a vectorized check pays.
-_RUN = 16
+_MIN_RUN_RECORDS = 16
 #: Largest number of kinds that are compared, and that one batch adds. It bounds the work per batch
 #: for any file.
-MOST_KNOWN = 16
+MAX_KINDS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class RecordKind:
         """Return which of n records are of this kind, and their times.
 
         Args:
-            storage: the buffer, with at least `WIDEST` bytes from each start on.
+            storage: the buffer, with at least `MAX_HEADER_BYTES` from each start on.
 
         Returns:
             An (n,) mask, or None if all records match; and the times of the matching records, ns.
@@ -97,7 +97,7 @@ class RecordKind:
         at, good = self.times.ns(heads)
         if self.trailer is not None:
             ends = (
-                _windows(storage, starts + (self.length - _TRAILER), _TRAILER)
+                _windows(storage, starts + (self.length - _TRAILER_BYTES), _TRAILER_BYTES)
                 .view(self.trailer)
                 .ravel()
             )
@@ -131,7 +131,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
         return None
     head = pattern.head
     start = pattern.head + headers.size
-    if start > WIDEST or not pattern.times.fits():
+    if start > MAX_HEADER_BYTES or not pattern.times.fits():
         return None
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
@@ -169,15 +169,19 @@ def find_records(
     singles_left = 0  # records to read one by one after a run that ended early
     length = -1
     view = storage.data
-    if stop - at < _HEAD:
+    if stop - at < _MIN_HEAD_BYTES:
         return np.array([at], np.intp), False
-    while stop - at >= _HEAD and (length := form.find_length(view, at)) and at + length <= stop:
-        if length == before and not singles_left and stop - at >= _RUN * length:
+    while (
+        stop - at >= _MIN_HEAD_BYTES
+        and (length := form.find_length(view, at))
+        and at + length <= stop
+    ):
+        if length == before and not singles_left and stop - at >= _MIN_RUN_RECORDS * length:
             run = _count_equal_lengths(storage, at, (stop - at) // length, length, form)
             pieces += [np.array(single, np.intp), np.arange(at, at + run * length, length)]
             single = []
             at = at + run * length
-            singles_left = 2 * _RUN if run < _RUN else 0
+            singles_left = 2 * _MIN_RUN_RECORDS if run < _MIN_RUN_RECORDS else 0
             continue
         single.append(at)
         at = at + length
@@ -304,7 +308,7 @@ class CaptureBatches(CaptureReader):
     Iteration yields single datagrams as in `CaptureReader`. Use only one of both ways.
     """
 
-    largest = LARGEST
+    largest = MAX_BUFFER_BYTES
 
     def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the file, one batch for each buffer that was read."""
@@ -355,10 +359,8 @@ class _RecordBlock:
         self._known = kinds
         number = max(len(starts) - 1, 1)
         self._are_whole = len(starts) > 1
-        self._starts, self._lengths = (
-            starts,
-            starts[1:] - starts[:-1] if self._are_whole else np.zeros(1, np.intp),
-        )
+        self._starts = starts
+        self._lengths = starts[1:] - starts[:-1] if self._are_whole else np.zeros(1, np.intp)
         self._kinds = np.full(number, -1, np.intp)  # indices into `_known`
         self._at = np.zeros(number, np.int64)
         self._singles: dict[int, Datagram] = {}
@@ -400,7 +402,7 @@ class _RecordBlock:
             return self._known
         counts = np.bincount(self._kinds[self._kinds >= 0], minlength=len(self._known))
         return [
-            self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MOST_KNOWN].tolist()
+            self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MAX_KINDS].tolist()
         ]
 
     def batch(self) -> CapturedDatagrams:
@@ -483,7 +485,7 @@ class _RecordBlock:
         if datagram is None or isinstance(packet, NoPacketReason):
             return
         self._singles[index] = datagram
-        if self._kinds_added == MOST_KNOWN or not self._are_whole:
+        if self._kinds_added == MAX_KINDS or not self._are_whole:
             return
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
         kind = make_record_kind(record, datagram, self._form)

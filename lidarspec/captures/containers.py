@@ -4,7 +4,7 @@ Files without raw sensor data are refused with a message that names their kind.
 
 Nothing is decompressed as a whole: `UnpackedFile` is a file that decompresses as it is read. If the
 compressed bytes are truncated or damaged, it ends there, and `find_damage` has the reason. All data
-before the damage is read, except for at most `STEP` bytes, or a block of bzip2. The table of a zip
+before the damage is read, except for at most `STEP_BYTES`, or a block of bzip2. The table of a zip
 archive is at its end, so archives can be read from files but not from pipes.
 """
 
@@ -27,15 +27,15 @@ from lidarspec.recording.format import MAGIC
 from lidarspec.remote_files import open_stored
 
 #: bytes at the start that determine the kind of a file.
-HEAD = 512
-#: maximum bytes decompressed in one step, and by one read of a file; a pipe returns the bytes that
-#: have arrived.
-STEP = 1 << 13
-FILLED = 1 << 20
+HEAD_BYTES = 512
+#: maximum bytes decompressed in one step.
+STEP_BYTES = 1 << 13
+#: maximum bytes decompressed by one read of a file; a pipe returns the bytes that have arrived.
+READ_BYTES = 1 << 20
 #: maximum nesting of compression: a compressed capture in a zip archive.
-DEEPEST = 2
+MAX_NESTING = 2
 #: maximum number of files of an archive in a message.
-NAMED = 6
+MAX_NAMES = 6
 
 
 class Packing(NamedTuple):
@@ -127,7 +127,7 @@ class UnpackedFile(io.RawIOBase):
         self._packed = packed
         self._file = file
         self.damage: Damage | None = None
-        self._step = FILLED if packed.seekable() else HEAD
+        self._step = READ_BYTES if packed.seekable() else HEAD_BYTES
         self._count = 0
 
     def readable(self) -> bool:
@@ -152,19 +152,18 @@ class UnpackedFile(io.RawIOBase):
         if self.damage is not None:
             return b""
         try:
-            data: bytes = self._file.read1(min(STEP, size))
+            data: bytes = self._file.read1(min(STEP_BYTES, size))
             self._count += len(data)
             return data
         except EOFError:
             self.damage = Damage(f"{self.name} is truncated{self._read}", 0)
-        except (
-            Exception
-        ) as error:  # each library raises its own for damaged bytes, and bz2 and gzip raise OSError
+        except Exception as error:
+            # Each library raises its own for damaged bytes, and bz2 and gzip raise OSError.
             if isinstance(error, OSError) and error.errno is not None:
                 raise
             place = self._packed.tell() if self._packed.seekable() else 0
             size = self._packed.seek(0, os.SEEK_END) if place else 0
-            where = f" before byte {place} of {size}" * bool(place)
+            where = f" before byte {place} of {size}" if place else ""
             self.damage = Damage(
                 f"{self.name} is corrupt{where} ({error}){self._read}", max(size - place, 1)
             )
@@ -209,7 +208,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         SourceError: for an archive that cannot be decompressed, or contains no capture.
         UsageError: for an archive with several captures, or if a library is missing.
     """
-    for _ in range(DEEPEST):
+    for _ in range(MAX_NESTING):
         packing = _packing(peek_head(file))
         if packing is None:
             break
@@ -218,7 +217,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
             member = ""
         else:
             content = import_library(packing.module, "zstd").open(file)
-        file = cast(BinaryIO, io.BufferedReader(UnpackedFile(name, file, content), FILLED))
+        file = cast(BinaryIO, io.BufferedReader(UnpackedFile(name, file, content), READ_BYTES))
     if member:
         raise UsageError(f"{name} is not a zip archive, so it does not contain {member}")
     return file
@@ -270,7 +269,10 @@ def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member
     readable = [item for item in names if _is_readable(archive, item)]
     if len(readable) == 1:
         return readable[0]
-    shown = ", ".join((readable or names)[:NAMED]) + ", ..." * (len(readable or names) > NAMED)
+    candidates = readable or names
+    shown = ", ".join(candidates[:MAX_NAMES])
+    if len(candidates) > MAX_NAMES:
+        shown += ", ..."
     if not readable:
         raise SourceError(f"the zip archive {name} contains no capture, only {shown or 'nothing'}")
     raise suggest(
@@ -282,7 +284,7 @@ def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member
 def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
     """Return whether a member begins like a capture, a recording or a compressed file."""
     with archive.open(member) as file:
-        start = file.read(HEAD)
+        start = file.read(HEAD_BYTES)
     return is_capture(start) or start.startswith(MAGIC) or _packing(start) is not None
 
 
@@ -291,7 +293,7 @@ def refuse_container(path: str, start: bytes) -> None:
 
     Args:
         path: of the file, for the message.
-        start: its first `HEAD` bytes, decompressed.
+        start: its first `HEAD_BYTES`, decompressed.
 
     Raises:
         SourceError: with the kind of the file, and the command that extracts the data.
@@ -301,17 +303,15 @@ def refuse_container(path: str, start: bytes) -> None:
             error = SourceError(
                 f"{path} is {what}: expected a capture, a recording or the raw bytes of a sensor"
             )
-            raise (
-                suggest(error, command.format(quote(path)))
-                if command and Path(path).exists()
-                else error
-            )
+            if command and Path(path).exists():
+                raise suggest(error, command.format(quote(path)))
+            raise error
 
 
 def peek_head(file: BinaryIO) -> bytes:
     """Return the first bytes of a file or pipe, without consuming them."""
     if isinstance(file, io.BufferedReader):
-        return file.peek(HEAD)[:HEAD]
-    start = file.read(HEAD)
+        return file.peek(HEAD_BYTES)[:HEAD_BYTES]
+    start = file.read(HEAD_BYTES)
     file.seek(-len(start), os.SEEK_CUR)
     return start

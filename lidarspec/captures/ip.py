@@ -240,7 +240,7 @@ def build_udp_frame(
     """Return an Ethernet frame with an IP header, a UDP header and the payload.
 
     Args:
-        payload: at most `MAX_PAYLOAD_BYTES` bytes, and 20 more over IPv6.
+        payload: at most `MAX_PAYLOAD_BYTES`, and 20 more over IPv6.
         source, destination: address and port; both addresses have 4 bytes, or both have 16.
     """
     length = _UDP_HEADER.size + len(payload)

@@ -40,7 +40,7 @@ from lidarspec.captures.records import (
     seek_time,
     skip_damage,
 )
-from lidarspec.captures.source import SMALLEST, BufferedInput, TruncatedError
+from lidarspec.captures.source import MIN_BUFFER_BYTES, BufferedInput, TruncatedError
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import ClosingContext
 
@@ -146,7 +146,7 @@ class CaptureReader(ClosingContext):
             does not raise.
     """
 
-    largest = SMALLEST
+    largest = MIN_BUFFER_BYTES
 
     def __init__(self, file: BinaryIO | str | os.PathLike[str]) -> None:
         self.stats = CaptureStats()

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from lidarspec.captures.source import BufferedInput, TruncatedError
 from lidarspec.errors import UsageError
 
-LARGEST_PACKET = 1 << 18  # the limit of libpcap and Wireshark for the supported link types
+MAX_PACKET_BYTES = 1 << 18  # the limit of libpcap and Wireshark for the supported link types
 NANOSECOND_MAGIC = b"\x4d\x3c\xb2\xa1"
 
 _PCAP = {  # magic: byte order, nanoseconds per unit of the fraction field
@@ -57,23 +57,23 @@ _LAST_KIND = 10  # the largest block type of the draft, apart from the section h
 _TIME_RESOLUTION = 9
 _TIME_OFFSET = 14
 
-LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are skipped
+MAX_BLOCK_BYTES = 1 << 20  # a packet with its options; longer blocks are skipped
 #: Number of offsets that one step of the search for the next record covers.
-_STEP = 1 << 16
+_STEP_BYTES = 1 << 16
 #: Number of bytes after each of these offsets that the search needs: a packet, its options and the
 #: next header.
-_REACH = LARGEST_PACKET + (1 << 12)
+_REACH_BYTES = MAX_PACKET_BYTES + (1 << 12)
 #: `seek_time` stops at most this many bytes before the packet.
-NEAR = 1 << 21
-#: Largest plausible difference of the times of two adjacent packets, in seconds.
-_DAY = 86_400
-#: Largest plausible difference of the times of any two packets of a file, in seconds.
-_YEAR = 31_536_000
-_MOST_INTERFACES = 1024
-_SECOND = 1_000_000_000
-#: Latest time that `TimeEncoding.ns` converts, in seconds. Records with later times are read one by
+NEAR_BYTES = 1 << 21
+#: Largest plausible difference of the times of two adjacent packets: a day.
+_MAX_RECORD_STEP_S = 86_400
+#: Largest plausible difference of the times of any two packets of a file: a year.
+_MAX_FILE_SPAN_S = 31_536_000
+_MAX_INTERFACES = 1024
+_SECOND_NS = 1_000_000_000
+#: Latest time that `TimeEncoding.ns` converts. Records with later times are read one by
 #: one, so that no int64 overflows.
-_FURTHEST = 4_000_000_000
+_MAX_TIME_S = 4_000_000_000
 
 
 class DamagedRecordError(Exception):
@@ -128,8 +128,8 @@ class TimeEncoding:
     offset: int = 0
 
     def fits(self) -> bool:
-        """Return whether all times up to `_FURTHEST` fit into 64 bits."""
-        return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
+        """Return whether all times up to `_MAX_TIME_S` fit into 64 bits."""
+        return self.ticks <= 9 * _SECOND_NS and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
         """Return the times of n records, and which of them are valid.
@@ -144,12 +144,12 @@ class TimeEncoding:
         high = words[:, self.high].astype(np.int64)
         low = words[:, self.low]
         if self.is_split:
-            high *= _SECOND
-            high += low * np.int64(_SECOND // self.ticks)
+            high *= _SECOND_NS
+            high += low * np.int64(_SECOND_NS // self.ticks)
             return high, None
         seconds, fraction = np.divmod(high << 32 | low, self.ticks)
-        right = (high < 1 << 31) & (seconds < _FURTHEST)
-        return seconds * _SECOND + fraction * _SECOND // self.ticks + self.offset, right
+        right = (high < 1 << 31) & (seconds < _MAX_TIME_S)
+        return seconds * _SECOND_NS + fraction * _SECOND_NS // self.ticks + self.offset, right
 
 
 class RecordLayout(NamedTuple):
@@ -213,7 +213,7 @@ class PcapRecords:
 
     def find_layout(self, record: bytes) -> RecordLayout:
         """Return the layout of a record."""
-        times = TimeEncoding(f"{self.order}u4", 0, 1, _SECOND // self._unit, True)
+        times = TimeEncoding(f"{self.order}u4", 0, 1, _SECOND_NS // self._unit, True)
         return RecordLayout(self._head.size, tuple(range(8)), tuple(range(12, 16)), times, None)
 
     def read(self) -> CapturedPacket:
@@ -226,7 +226,7 @@ class PcapRecords:
         if len(head) < self._head.size:
             raise TruncatedError
         seconds, fraction, captured, original = self._head.unpack(head)
-        if captured > LARGEST_PACKET or not any(head):  # a hole in a file reads as zeros
+        if captured > MAX_PACKET_BYTES or not any(head):  # a hole in a file reads as zeros
             raise DamagedRecordError
         if not self._is_sure(captured, original) and self._is_false(captured, original):
             raise DamagedRecordError
@@ -234,7 +234,7 @@ class PcapRecords:
         self._source.skip(self._head.size)
         return CapturedPacket(
             self.link,
-            seconds * _SECOND + fraction * self._unit,
+            seconds * _SECOND_NS + fraction * self._unit,
             self._source.take(captured),
             original,
         )
@@ -255,12 +255,12 @@ class PcapRecords:
         )
         likely = (
             (captured[:stop] <= original[:stop])
-            & (original[:stop] <= LARGEST_PACKET)
+            & (original[:stop] <= MAX_PACKET_BYTES)
             & (captured[:stop] > 0)
         )
-        places = np.flatnonzero(likely & (fractions[:stop] < _SECOND // self._unit))
+        places = np.flatnonzero(likely & (fractions[:stop] < _SECOND_NS // self._unit))
         if self._began is not None:
-            places = places[abs(seconds[places].astype(np.int64) - self._began) <= _YEAR]
+            places = places[abs(seconds[places].astype(np.int64) - self._began) <= _MAX_FILE_SPAN_S]
         behind = places + self._head.size + captured[places]
         right = (behind == len(data)) & (captured[places] == original[places]) & is_end
         followed = behind < count
@@ -268,17 +268,19 @@ class PcapRecords:
         after = behind[followed]
         right[followed] = (
             (captured[after] <= original[after])
-            & (original[after] <= LARGEST_PACKET)
+            & (original[after] <= MAX_PACKET_BYTES)
             & (captured[after] > 0)
         )
-        right[followed] &= abs(seconds[after].astype(np.int64) - seconds[before]) <= _DAY
+        right[followed] &= (
+            abs(seconds[after].astype(np.int64) - seconds[before]) <= _MAX_RECORD_STEP_S
+        )
         if right.any():
             return int(places[right.argmax()])
         return None
 
     def _is_sure(self, captured: int, original: int) -> bool:
         """Return whether two lengths agree: the packet is whole or cut at the snap length."""
-        return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
+        return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
         """Return whether the length of a record is wrong.
@@ -287,9 +289,9 @@ class PcapRecords:
         before the end of the original packet.
         """
         size = self._head.size + captured
-        within = max(captured, min(original, LARGEST_PACKET) + 1)
-        data = self._source.peek(self._head.size + within + _REACH)
-        is_end = len(data) < self._head.size + within + _REACH
+        within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
+        data = self._source.peek(self._head.size + within + _REACH_BYTES)
+        is_end = len(data) < self._head.size + within + _REACH_BYTES
         if len(data) == size or self.find_next_record(data[size:], 1, is_end=is_end) is not None:
             return False
         return self.find_next_record(data[self._head.size :], within, is_end=is_end) is not None
@@ -322,21 +324,22 @@ class PcapngBlocks:
     def reopen(self, source: BufferedInput) -> PcapngBlocks:
         """Return a reader with the same interfaces for another position in the file."""
         other = copy.copy(self)
-        other._source, other._interfaces = source, list(self._interfaces)
+        other._source = source
+        other._interfaces = list(self._interfaces)
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
         """Return the length of the block at an offset; 0 if only `read` can handle it.
 
         It is 0 at the start of a section, for an invalid length, and for a block longer than
-        `LARGEST_BLOCK`.
+        `MAX_BLOCK_BYTES`.
         """
+        kind: int
+        length: int
         kind, length = struct.unpack_from(self.order + "II", data, at)
-        return (
-            0
-            if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _is_possible_length(length)
-            else length
-        )
+        if kind == _SECTION_KIND or length > MAX_BLOCK_BYTES or not _is_possible_length(length):
+            return 0
+        return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
         """Return the offset, type and value of the length field of a block."""
@@ -372,12 +375,12 @@ class PcapngBlocks:
         if self._is_false(kind, length):
             self._knows_all = self._knows_all and kind != _INTERFACE
             raise DamagedRecordError
-        if length > LARGEST_BLOCK:
+        if length > MAX_BLOCK_BYTES:
             self._source.skip(length)
             return NoPacketReason.NO_PACKET
         body = self._source.take(length)[8:-4]
         if kind == _INTERFACE:
-            if len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
+            if len(body) < 8 or len(self._interfaces) == _MAX_INTERFACES:
                 self._knows_all = False
                 raise DamagedRecordError
             self._interfaces.append(_interface(self.order, body))
@@ -402,7 +405,7 @@ class PcapngBlocks:
         kinds = words[:-8][:stop]
         lengths = words[4:-4][:stop]
         places = np.flatnonzero(
-            (kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH)
+            (kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH_BYTES)
         )
         ends = places + lengths[places]
         places = places[ends <= len(data)]
@@ -418,10 +421,10 @@ class PcapngBlocks:
         block.
         """
         if not _is_possible_length(length) or (
-            length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}
+            length > MAX_BLOCK_BYTES and kind in _PACKETS | {_INTERFACE}
         ):
             return True
-        size = _REACH if length > LARGEST_BLOCK else length
+        size = _REACH_BYTES if length > MAX_BLOCK_BYTES else length
         data = self._source.peek(size)
         if len(data) == length:
             return data[-4:] != data[4:8]
@@ -450,9 +453,11 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
         False at the end of the input, if no record was found.
     """
     source.skip(len(source.peek(1)))
-    while data := source.peek(_STEP + _REACH):
-        offset = form.find_next_record(data, _STEP, is_end=len(data) < _STEP + _REACH)
-        source.skip(min(_STEP, len(data)) if offset is None else offset)
+    while data := source.peek(_STEP_BYTES + _REACH_BYTES):
+        offset = form.find_next_record(
+            data, _STEP_BYTES, is_end=len(data) < _STEP_BYTES + _REACH_BYTES
+        )
+        source.skip(min(_STEP_BYTES, len(data)) if offset is None else offset)
         if offset is not None:
             return True
     return False
@@ -461,7 +466,7 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     """Seek to shortly before the first packet captured at a time or later.
 
-    The position is at most `NEAR` bytes before the packet. The search assumes that packets are in
+    The position is at most `NEAR_BYTES` before the packet. The search assumes that packets are in
     the order of their times, and that all sections of a pcapng file have the interfaces of the
     current section. It does not skip the start of a section, nor times that are years away, because
     another section may encode times differently.
@@ -478,10 +483,14 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     if high is None:
         return False
     first = _find_timed_packet(source.open_at(here), form, high)
-    while first is not None and high - low > NEAR:
+    while first is not None and high - low > NEAR_BYTES:
         middle = (low + high) // 2
         packet = _find_timed_packet(source.open_at(middle), form, high)
-        if packet is None or packet[0] >= at or abs(packet[0] - first[0]) > _YEAR * _SECOND:
+        if (
+            packet is None
+            or packet[0] >= at
+            or abs(packet[0] - first[0]) > _MAX_FILE_SPAN_S * _SECOND_NS
+        ):
             high = middle
         else:
             low = packet[1]
@@ -494,7 +503,8 @@ def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[in
 
     Returns None if none begins before `stop`, or before the start of another section.
     """
-    form, section = form.reopen(source), form.sections
+    section = form.sections
+    form = form.reopen(source)
     while skip_damage(source, form) and source.begin_record() and source.record < stop:
         try:
             packet = form.read()
@@ -533,7 +543,7 @@ def _interface(order: str, body: bytes) -> Interface:
             else:
                 ticks = 10 ** value[0]
         elif code == _TIME_OFFSET and size == 8:
-            offset = struct.unpack(order + "q", value)[0] * _SECOND
+            offset = struct.unpack(order + "q", value)[0] * _SECOND_NS
         at += 4 + size + -size % 4
     return Interface(link, snap_length, ticks, offset)
 
@@ -561,7 +571,7 @@ def _block_packet(
     if number >= len(interfaces) or captured > len(body) - 20:
         return None
     interface = interfaces[number]
-    at = (high << 32 | low) * _SECOND // interface.ticks + interface.offset
+    at = (high << 32 | low) * _SECOND_NS // interface.ticks + interface.offset
     if not -(1 << 63) <= at < 1 << 63:
         return None
     return CapturedPacket(interface.link, at, body[20 : 20 + captured], original)
@@ -573,7 +583,7 @@ def capture_head(link: int) -> bytes:
     Args:
         link: the link type: `ip.ETHERNET` for datagrams, USER0 for bytes without a protocol header.
     """
-    return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link)
+    return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, MAX_PACKET_BYTES, link)
 
 
 def packet_record(data: bytes, at: int) -> bytes:
@@ -586,7 +596,7 @@ def packet_record(data: bytes, at: int) -> bytes:
     Raises:
         UsageError: if a record cannot hold the packet or the time.
     """
-    seconds, nanoseconds = divmod(at, _SECOND)
+    seconds, nanoseconds = divmod(at, _SECOND_NS)
     if not 0 <= seconds < 1 << 32:
         raise UsageError(
             f"capture time {at} ns is out of range: pcap supports the years 1970 to 2106"
@@ -596,9 +606,9 @@ def packet_record(data: bytes, at: int) -> bytes:
 
 
 def _refuse_size(data: bytes) -> None:
-    if len(data) > LARGEST_PACKET:
+    if len(data) > MAX_PACKET_BYTES:
         raise UsageError(
-            f"a packet has {len(data)} bytes, and a record holds at most {LARGEST_PACKET}"
+            f"a packet has {len(data)} bytes, and a record holds at most {MAX_PACKET_BYTES}"
         )
 
 
@@ -634,7 +644,7 @@ def _pcapng_head(link: int) -> bytes:
     section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
     return section + _block(
         _INTERFACE,
-        struct.pack("<HHIHHB3xHH", link, 0, LARGEST_PACKET, _TIME_RESOLUTION, 1, 9, 0, 0),
+        struct.pack("<HHIHHB3xHH", link, 0, MAX_PACKET_BYTES, _TIME_RESOLUTION, 1, 9, 0, 0),
     )
 
 

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SourceError
 
-#: initial size of a buffer, and the largest step of `skip`, in bytes.
-SMALLEST = 1 << 16
+#: initial size of a buffer, and the largest step of `skip`.
+MIN_BUFFER_BYTES = 1 << 16
 #: bytes after the filled part that callers may read, with any value, so that they can compare
 #: records in words of several bytes.
-SLACK = 256
-#: the number of lent buffers that are remembered for reuse.
-MOST_KEPT = 2
+SLACK_BYTES = 256
+#: the number of buffers with a view that are remembered for reuse.
+MAX_VIEWED_BUFFERS = 2
 
 
 class TruncatedError(Exception):
@@ -43,13 +43,13 @@ class BufferedInput:
             grows further only for a record that does not fit.
 
     Attributes:
-        storage: the current buffer; its last `SLACK` bytes are never filled.
+        storage: the current buffer; its last `SLACK_BYTES` are never filled.
         at: offset of the next byte in `storage`.
         record: file offset of the current record, set by `begin_record`.
         offset: file offset of the next byte.
     """
 
-    def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
+    def __init__(self, file: BinaryIO, *, largest: int = MIN_BUFFER_BYTES) -> None:
         self._file = file
         self._read_into = _read_into(file)
         self._largest = largest
@@ -58,7 +58,7 @@ class BufferedInput:
         self._data = memoryview(b"")
         self._bytes_dropped = 0  # bytes of the file before `storage`
         self.record = self.at = 0
-        self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
+        self._adopt(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the state for pickling: the copy continues at the same offset."""
@@ -78,7 +78,7 @@ class BufferedInput:
 
         Both sources share the file position: call `seek` on this one before it is used again.
         """
-        return _source_at(self._file, SMALLEST, place)
+        return _source_at(self._file, MIN_BUFFER_BYTES, place)
 
     def seek(self, place: int) -> None:
         """Continue at an offset of a seekable file."""
@@ -128,7 +128,7 @@ class BufferedInput:
             TruncatedError: if fewer bytes are left.
         """
         while size:
-            step = min(size, SMALLEST)
+            step = min(size, MIN_BUFFER_BYTES)
             if not self._has(step):
                 raise TruncatedError
             self.at += step
@@ -157,10 +157,10 @@ class BufferedInput:
             return True
         self._move_unread(have)
         while have < size:
-            if have == len(self.storage) - SLACK:
+            if have == len(self.storage) - SLACK_BYTES:
                 self._move_unread(have)
             try:
-                count = self._read_into(self._view[have : len(self.storage) - SLACK])
+                count = self._read_into(self._view[have : len(self.storage) - SLACK_BYTES])
             except OSError as error:
                 raise SourceError(f"cannot read the capture: {error}") from error
             if not count:
@@ -174,7 +174,7 @@ class BufferedInput:
 
         The buffer is the current one unless it was lent, or is too small.
         """
-        size = len(self.storage) - SLACK
+        size = len(self.storage) - SLACK_BYTES
         tail = self.storage[self.at : self.at + have]
         at = self.at
         if len(self._data) == size:
@@ -184,7 +184,7 @@ class BufferedInput:
                 size = max(size, min(2 * size, self._largest))
         if self._last_view is not None:
             self._viewed_buffers = [
-                *self._viewed_buffers[1 - MOST_KEPT :],
+                *self._viewed_buffers[1 - MAX_VIEWED_BUFFERS :],
                 (self.storage, self._last_view),
             ]
         spare = self._spare(size)
@@ -193,14 +193,14 @@ class BufferedInput:
         self._adopt(spare, have)
 
     def _spare(self, size: int) -> NDArray[np.uint8]:
-        if self._last_view is None and len(self.storage) - SLACK == size:
+        if self._last_view is None and len(self.storage) - SLACK_BYTES == size:
             return self.storage
         self._last_view = None
         for index, (storage, lent) in enumerate(self._viewed_buffers):
-            if lent() is None and len(storage) - SLACK == size:
+            if lent() is None and len(storage) - SLACK_BYTES == size:
                 del self._viewed_buffers[index]
                 return storage
-        return np.empty(size + SLACK, np.uint8)
+        return np.empty(size + SLACK_BYTES, np.uint8)
 
     def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
         self.storage = storage
@@ -239,7 +239,7 @@ def _first_size(file: BinaryIO, largest: int) -> int:
     try:
         status = os.fstat(file.fileno())
     except (AttributeError, OSError):
-        return SMALLEST
+        return MIN_BUFFER_BYTES
     if stat.S_ISREG(status.st_mode):
-        return min(max(status.st_size, SMALLEST), largest)
-    return SMALLEST
+        return min(max(status.st_size, MIN_BUFFER_BYTES), largest)
+    return MIN_BUFFER_BYTES

@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from lidarspec.captures.bulk import CaptureBatches, CapturedDatagrams, StreamBatches
 from lidarspec.captures.containers import (
-    HEAD,
+    HEAD_BYTES,
     find_damage,
     open_capture,
     peek_head,
@@ -419,7 +419,7 @@ def _open_by_content(
         return CaptureTransport(name, file, sender=sender)
     suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
     is_text = suffixes & HEX_SUFFIXES or (
-        suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD)
+        suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD_BYTES)
     )
     if is_text:
         return HexTransport(name, file)
