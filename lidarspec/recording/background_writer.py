@@ -23,14 +23,15 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: the limits after which records are written to the file, and after which fsync is called.
+#: the limits after which records are written to the file.
 FLUSH_BYTES = 1 << 16
-FLUSH_SECONDS = 0.2
-DISK_SECONDS = 1.0
+FLUSH_PERIOD_S = 0.2
+#: the time after which fsync is called.
+SYNC_PERIOD_S = 1.0
 #: how many bytes may wait for a slow disk; further records are dropped and counted.
-BACKLOG = 1 << 26
-#: how long `sync` and `close` wait for the disk, seconds.
-PATIENCE = 60.0
+MAX_WAITING_BYTES = 1 << 26
+#: how long `sync` and `close` wait for the disk.
+DISK_TIMEOUT_S = 60.0
 
 #: (bytes, offset) -> length of the record at this offset; 0 or less without a complete record.
 Size = Callable[[bytes | bytearray, int], int]
@@ -52,9 +53,8 @@ class RecordFile:
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
         self._place = Path(os.path.realpath(path))
-        self.replaces = (
-            overwrite and self._place.is_file() and os.name != "nt"
-        )  # systems that can rename open files
+        can_rename_open_files = os.name != "nt"
+        self.replaces = overwrite and self._place.is_file() and can_rename_open_files
         self._opened = self._place
         if self.replaces:
             remove_abandoned(self._place)
@@ -92,10 +92,10 @@ class RecordFile:
 
     def _whole(self, records: bytes | bytearray, limit: int) -> int:
         """Return the total size of the records that end within a limit."""
-        end = limit if self._size_at is None else 0
-        while (
-            self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end
-        ):
+        if self._size_at is None:
+            return limit
+        end = 0
+        while 0 < (size := self._size_at(records, end)) <= limit - end:
             end += size
         return end
 
@@ -188,11 +188,10 @@ class BackgroundWriter:
         self._unreported_drops = 0
         self._has_raised = False
         self._closing = False
+        # counts of records added, requested to be on the disk, and on the disk
         self._records_added = 0
         self._records_requested = 0
-        self._records_synced = (
-            0  # counts of records added, requested to be on the disk, and on the disk
-        )
+        self._records_synced = 0
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
@@ -216,10 +215,11 @@ class BackgroundWriter:
             self._changed.notify_all()
             if not self._changed.wait_for(
                 lambda: self._records_synced >= target or self.error or not self._thread.is_alive(),
-                PATIENCE,
+                DISK_TIMEOUT_S,
             ):
                 raise SourceTimeout(
-                    f"{self.path}: the disk did not store the recording within {PATIENCE:.0f} s"
+                    f"{self.path}: the disk did not store the recording within"
+                    f" {DISK_TIMEOUT_S:.0f} s"
                 )
         self._raise_failure()
 
@@ -229,7 +229,7 @@ class BackgroundWriter:
         Raises:
             SourceError: as `sync`.
         """
-        if len(self._waiting) > BACKLOG // 4 or self.error:
+        if len(self._waiting) > MAX_WAITING_BYTES // 4 or self.error:
             self.sync()
 
     def close(self) -> None:
@@ -278,7 +278,7 @@ class BackgroundWriter:
             size: the number of data bytes in it; None if it is not counted as a record.
         """
         with self._changed:
-            if self.error or self._closing or len(self._waiting) + len(record) > BACKLOG:
+            if self.error or self._closing or len(self._waiting) + len(record) > MAX_WAITING_BYTES:
                 self.dropped += 1
                 self._unreported_drops += 1
                 return
@@ -307,13 +307,13 @@ class BackgroundWriter:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join(PATIENCE)
+        self._thread.join(DISK_TIMEOUT_S)
         atexit.unregister(self._finish)
 
     def _work(self) -> None:
         """Write the waiting records until the end or a failure; runs in the thread."""
         try:
-            due = time.monotonic() + DISK_SECONDS
+            due = time.monotonic() + SYNC_PERIOD_S
             while not (
                 self._closing and not self._waiting and self._records_synced == self._records_added
             ):
@@ -325,7 +325,7 @@ class BackgroundWriter:
                             or self._closing
                         )
                     )
-                    self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
+                    self._changed.wait_for(self._is_urgent, FLUSH_PERIOD_S)
                     waiting = self._waiting
                     self._waiting = bytearray()
                     taken = self._records_added
@@ -336,7 +336,7 @@ class BackgroundWriter:
                     self._file.settle()
                 if asked or time.monotonic() >= due:
                     self._file.keep()
-                    due = time.monotonic() + DISK_SECONDS
+                    due = time.monotonic() + SYNC_PERIOD_S
                     with self._changed:
                         self._records_synced = taken
                         self._changed.notify_all()

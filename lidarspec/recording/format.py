@@ -61,7 +61,7 @@ DATAGRAM = 1
 GAP = 2
 QUIET = 4
 #: maximum data bytes in one record.
-LARGEST = 0xFFFF
+MAX_DATA_BYTES = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
 _CRC = struct.Struct("<I")
 _PORT = struct.Struct("<H")
@@ -115,24 +115,22 @@ class Header:
                 as a file in another folder.
             UnknownSensor: if the sensor is not installed.
         """
+        if not self.sensor:
+            raise UsageError("it does not name a sensor")
         if not _ID.fullmatch(self.sensor):
-            raise UsageError(
-                f"its header contains the invalid sensor id {self.sensor[:40]!r}"
-                if self.sensor
-                else "it does not name a sensor"
-            )
+            raise UsageError(f"its header contains the invalid sensor id {self.sensor[:40]!r}")
         installed = named_sensor(self.sensor)
+        if not self.options:
+            return installed
         try:
-            return (
-                installed.configure(**installed.configure.options_of_file(self.options, folder))
-                if self.options
-                else installed
-            )
+            options = installed.configure.options_of_file(self.options, folder)
+            configured: Sensor = installed.configure(**options)
         except UsageError as error:
             raise UsageError(
                 "it was recorded with an option that must be passed again, as in -s"
                 f" {self.sensor} -O ...: {error}"
             ) from None
+        return configured
 
 
 _BLANK = Header()
@@ -309,7 +307,7 @@ class Recording(ClosingContext):
             return False
         with system_errors(self.path):
             high = self._file.seek(0, os.SEEK_END)
-            while high - low > 2 * (LARGEST + _BLOCK):
+            while high - low > 2 * (MAX_DATA_BYTES + _BLOCK):
                 middle = (low + high) // 2
                 record = self._find_received(middle, high)
                 if record is None or record[0] >= at:
@@ -478,10 +476,15 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
     place = 0
     while len(addresses) < 2 and place < len(data):
         length = data[place]
-        host = data[place + 1 : place + 1 + length].decode("utf-8", "replace")
-        end = place + 1 + length + 2 * bool(length)
-        addresses.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
-        place = end
+        place += 1
+        if not length:
+            addresses.append(None)
+            continue
+        host = data[place : place + length].decode("utf-8", "replace")
+        place += length
+        port = data[place : place + _PORT.size]
+        addresses.append((host, int.from_bytes(port, "little")))
+        place += _PORT.size
     if place == len(data) and len(addresses) != 1:
         return addresses or [None, None]
     return None

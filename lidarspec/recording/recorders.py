@@ -1,7 +1,8 @@
 """Recorders: write received and sent data to a file while it is captured.
 
 The suffix selects the format: .lsr for all data, .pcap and .pcapng for packets that Wireshark
-opens, .bin for raw bytes. All of them grow by whole records, written by a thread (`appending`).
+opens, .bin for raw bytes. All of them grow by whole records, written by a thread
+(`background_writer`).
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from lidarspec.recording.format import (
     EVENT,
     GAP,
     HEADER,
-    LARGEST,
     MAGIC,
+    MAX_DATA_BYTES,
     QUIET,
     RECEIVED,
     SENT,
@@ -43,7 +44,7 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")
 #: maximum bytes between frames in one packet.
-LARGEST_GAP = 1 << 16
+MAX_GAP_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -112,17 +113,19 @@ class Recorder(BackgroundWriter):
         More than 65,535 bytes of a stream become several records.
         """
         kind = RECEIVED if direction == "in" else SENT
-        for start in range(0, len(chunk.data) or 1, LARGEST):
-            data = chunk.data[start : start + LARGEST]
-            flags = DATAGRAM * self.header.datagrams | (GAP * chunk.gap | QUIET * chunk.quiet) * (
-                not start
+        for start in range(0, len(chunk.data) or 1, MAX_DATA_BYTES):
+            data = chunk.data[start : start + MAX_DATA_BYTES]
+            flags = 0
+            if self.header.datagrams:
+                flags |= DATAGRAM
+            if chunk.gap and not start:
+                flags |= GAP
+            if chunk.quiet and not start:
+                flags |= QUIET
+            record = pack_record(
+                kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver
             )
-            self._put(
-                pack_record(
-                    kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver
-                ),
-                len(data),
-            )
+            self._put(record, len(data))
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """Record an event of the line, such as "disconnect" or "reconnect".
@@ -206,7 +209,7 @@ class FrameRecorder(BackgroundWriter):
 
     def _skip(self, size: int) -> None:
         while size > 0:
-            part = min(size, LARGEST_GAP)
+            part = min(size, MAX_GAP_BYTES)
             self._packet(part, self._at)
             size -= part
 
@@ -306,29 +309,27 @@ def get_recorder(
 
     A recorder that was made here has to be closed by the caller of this function.
     """
-    if isinstance(target, str | Path):
-        return open_recorder(
-            target, sensor, source, datagrams=opened.datagrams, baud=opened.baud
-        ), True
     if isinstance(target, BackgroundWriter):
         return target, False
-    return target.make(opened, sensor) if isinstance(target, RecorderFactory) else target(
-        opened
-    ), True
+    if isinstance(target, RecorderFactory):
+        return target.make(opened, sensor), True
+    if not isinstance(target, str | Path):
+        return target(opened), True
+    recorder = open_recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud)
+    return recorder, True
 
 
 def _header(
     sensor: Sensor | str | None, source: str, *, datagrams: bool | None, baud: int | None
 ) -> Header:
-    known = (
-        named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
-    )
-    if isinstance(known, Sensor):
-        name = known.id
-        options = dict(known.options)
-        link = known.datagrams
+    if isinstance(sensor, str) and sensor and datagrams is None:
+        sensor = named_sensor(sensor)
+    if isinstance(sensor, Sensor):
+        name = sensor.id
+        options = dict(sensor.options)
+        link = sensor.datagrams
     else:
-        name = known or ""
+        name = sensor or ""
         options = {}
         link = False
     homes = {

@@ -25,8 +25,8 @@ from lidarspec.recording import background_writer
 from lidarspec.recording.format import (
     _HEAD,
     HEADER,
-    LARGEST,
     MAGIC,
+    MAX_DATA_BYTES,
     Header,
     Record,
     Recording,
@@ -141,9 +141,9 @@ def test_the_header_describes_the_source(path: Path) -> None:
 
 
 def test_long_reads_become_several_records(path: Path) -> None:
-    data = random.Random(1).randbytes(3 * LARGEST + 1)
+    data = random.Random(1).randbytes(3 * MAX_DATA_BYTES + 1)
     found = read(record(path, [Chunk(data, 5, gap=True)]))
-    assert [len(item.data) for item in found] == [LARGEST, LARGEST, LARGEST, 1]
+    assert [len(item.data) for item in found] == [MAX_DATA_BYTES, MAX_DATA_BYTES, MAX_DATA_BYTES, 1]
     assert b"".join(item.data for item in found) == data
     assert [item.gap for item in found] == [True, False, False, False]
 
@@ -362,7 +362,7 @@ def test_kill_9_loses_no_acknowledged_record(tmp_path: Path, times: int) -> None
             numbers = [item.at for item in recording]
             assert numbers == list(range(len(numbers)))
             assert len(numbers) > last
-            assert recording.leftover <= LARGEST
+            assert recording.leftover <= MAX_DATA_BYTES
 
 
 @contextlib.contextmanager
@@ -431,7 +431,7 @@ def test_a_recording_that_cannot_even_begin_says_so() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a named pipe")
 def test_a_slow_disk_does_not_block_writers(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(background_writer, "BACKLOG", 300_000)
+    monkeypatch.setattr(background_writer, "MAX_WAITING_BYTES", 300_000)
     os.mkfifo(path)
     taken = bytearray()
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", 0) as slow:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.recording.format import LARGEST, MARK, RECEIVED, Recording, pack_record
+from lidarspec.recording.format import MARK, MAX_DATA_BYTES, RECEIVED, Recording, pack_record
 from lidarspec.recording.recorders import Recorder
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.protocol import Chunk
@@ -42,7 +42,7 @@ def test_seeking_reads_everything_after_a_time_and_little_before(
     assert left[0].at <= START + min(number, NUMBER - 1) * STEP
     assert left[-1].at == START + (NUMBER - 1) * STEP
     assert [record.at for record in left] == [left[0].at + step * STEP for step in range(len(left))]
-    assert len(left) * 340 < (NUMBER - min(number, NUMBER)) * 340 + 4 * LARGEST + (1 << 17)
+    assert len(left) * 340 < (NUMBER - min(number, NUMBER)) * 340 + 4 * MAX_DATA_BYTES + (1 << 17)
 
 
 def test_seeking_interrupts_the_stream(recording: Path) -> None:
