@@ -19,12 +19,9 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import broadcast_value
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clocks import Times
-from lidarspec.packets.pace import read_paces, shortest_pace
+from lidarspec.packets.pace import MAX_STEP_NS, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
 from lidarspec.spec.timing import Clock
-
-#: a clock that advances by more from one packet to the next was set.
-MAX_STEP_NS = 3600 * 10**9
 
 
 class ArrivalOrder:

@@ -32,7 +32,7 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters, Numbers
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
-from lidarspec.packets.pace import Paces, read_paces, shortest_pace
+from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.spec.timing import Clock
 
 #: the number of places that a packet may be late. If the clock goes back further, it was set or the
@@ -40,8 +40,6 @@ from lidarspec.spec.timing import Clock
 MAX_PLACES_LATE = 64
 #: the time that a packet may be late if the pace is unknown.
 MAX_LATE_NS = 10**9
-#: if the clock advances by more from one packet to the next, it was set.
-MAX_STEP_NS = 3600 * 10**9
 #: the number of packets with a remembered checksum. An older packet with the same time counts as a
 #: duplicate without comparing bytes.
 REMEMBERED_CHECKSUMS = 16
@@ -88,9 +86,8 @@ class ClockOrder:
         self._neighbours = list[RecentPacket]()  # in the order of their times
         self._offset = 0  # added to a time to get an order
         self._gaps = gaps
-        self._leap: tuple[int, RecentPacket] | None = (
-            None  # the time before the clock's last leap, ns, and the packet after it
-        )
+        # the time before the clock's last leap, ns, and the packet after it
+        self._leap: tuple[int, RecentPacket] | None = None
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
         """Return the index and the order of each packet, (n,), and mark the breaks.

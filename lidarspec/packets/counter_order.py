@@ -27,7 +27,7 @@ from lidarspec.expressions.graph import header_function
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
-from lidarspec.packets.pace import Paces, read_paces, shortest_pace
+from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, Sequence
@@ -43,8 +43,6 @@ LONG_PERIOD = 1 << 16
 MAX_SIGNED_PERIOD = 1 << 63
 #: limit of the first index and of its steps, so that it fits 64 bits for any counter.
 MAX_INDEX_STEP = 1 << 32
-#: if the clock advances by more from one packet to the next, it was set.
-MAX_STEP_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,9 +133,8 @@ class CounterOrder:
         self._index = -1  # of the newest packet
         self._first = 0  # index of the first packet since the sensor started
         self._missing = dict[int, CountedLoss]()  # by index
-        self._suspect: tuple[int, int] | None = (
-            None  # number and time of a packet that may be damaged
-        )
+        # number and time of a packet that may be damaged
+        self._suspect: tuple[int, int] | None = None
         self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:

@@ -18,6 +18,9 @@ from lidarspec.spec.timing import Clock
 
 Paces = NDArray[np.float64]
 
+#: if the clock advances by more from one packet to the next, it was set.
+MAX_STEP_NS = 3600 * 10**9
+
 
 def read_paces(clock: Clock, batch: Batch) -> Paces:
     """Return the nanoseconds that each packet takes, (n,); nan if not declared.

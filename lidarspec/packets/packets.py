@@ -249,9 +249,8 @@ class Packets:
         axis, kind, below = place
         table, which = self.table.parts(axis, kind)
         columns = self._columns_at(which)
-        columns["breaks"] = (
-            np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0
-        )  # a break before a frame without parts counts too
+        # a break before a frame without parts counts too
+        columns["breaks"] = np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0
         columns["time_ns"] = part_times(self.sensor, (axis, kind), table, which, columns["time_ns"])
         state = {
             name: (frames, chosen[which])
@@ -368,9 +367,8 @@ def _nested_dtype(
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
-        is_array = (
-            columns[path].ndim > 1
-        )  # values that are not numbers are lists, without array axes
+        # values that are not numbers are lists, without array axes
+        is_array = columns[path].ndim > 1
         shape = tuple(columns[path].shape[1 + index] for index in own if is_array)
         if below:
             kind = _nested_dtype(schema, columns, f"{here}.")
