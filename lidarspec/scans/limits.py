@@ -26,6 +26,15 @@ MAX_BYTES = 1 << 26
 MAX_GROWTH = 1.125
 
 
+def longest_scan_s(sensor: SensorDescription) -> float | None:
+    """Return the seconds of the slowest scan; None if the sensor does not declare them."""
+    if isinstance(sensor.scan, Every):
+        return sensor.scan.seconds
+    if sensor.turn:
+        return 1 / sensor.turn[0]
+    return None
+
+
 class ScanLimits:
     """The limits of the scans of one sensor.
 
@@ -36,12 +45,7 @@ class ScanLimits:
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
-        turn_s = SLOWEST_TURN_S
-        if isinstance(sensor.scan, Every):
-            turn_s = sensor.scan.seconds
-        elif sensor.turn:
-            turn_s = 1 / sensor.turn[0]
-        self.seconds = 2 * turn_s
+        self.seconds = 2 * (longest_scan_s(sensor) or SLOWEST_TURN_S)
         if sensor.clock is None:
             self.seconds = max(self.seconds, MIN_LIMIT_S)
         self.longest_ns = int(self.seconds * 1e9)

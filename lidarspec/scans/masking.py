@@ -24,14 +24,13 @@ from lidarspec.packets.masked_sector import (
     SectorFinder,
 )
 from lidarspec.packets.packets import Packets, join_packets
+from lidarspec.scans.limits import SLOWEST_TURN_S
 from lidarspec.spec.sensor import SensorDescription
 
 #: the number of revolutions within which a leap has to recur.
 MAX_TURNS = 4
 #: the largest number of packets that are held.
 MAX_HELD = 1 << 15
-#: the time of the slowest revolution, if the sensor does not declare it.
-SLOWEST_TURN_S = 1.0
 
 
 class Masking:
@@ -50,9 +49,8 @@ class Masking:
     def __init__(self, sensor: SensorDescription) -> None:
         self._reader = AngleReader(sensor)
         self._is_settled = False
-        self._longest_ns = int(
-            MAX_TURNS / (sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S) * 1e9
-        )
+        slowest_rate_hz = sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S
+        self._longest_ns = int(MAX_TURNS / slowest_rate_hz * 1e9)
         self._finder: SectorFinder | None = None
         self._turned = 0.0  # turns since the start
         self._smallest_step = np.inf

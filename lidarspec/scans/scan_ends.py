@@ -62,9 +62,8 @@ class EndFinder:
         self._rule = sensor.scan
         self._reader = AngleReader(sensor)
         self._wraps = WrapDetector()
-        self._passes: PassDetector | None = (
-            None  # if scans are cut at an angle that packets may skip
-        )
+        # if scans are cut at an angle that packets may skip
+        self._passes: PassDetector | None = None
         self._cut: float | None = None  # the angle that the user has configured, in turns
         if "cut" in sensor.options:
             self._cut = sensor.options["cut"] / 360 % 1

@@ -220,9 +220,8 @@ class ScanStream:
         if following is not None:
             end_ns = following.time_ns
         if is_foreign and self._imu is not None:
-            self._imu.take_until(
-                end_ns
-            )  # these samples belong to the scan that another stream makes
+            # these samples belong to the scan that another stream makes
+            self._imu.take_until(end_ns)
         if is_foreign or not runs:
             return []
         assert start is not None  # since there are points

@@ -6,7 +6,7 @@ fragments that overwrite each other there, and with best effort most clouds are 
 brings a profile with a larger segment. Subscribers need no profile.
 
 Fast DDS reads the profile from a file in an environment variable, once, when the first participant
-of a process is created. `profile_in_use` sets the variable for that moment only.
+of a process is created. `use_profile` sets the variable for that moment only.
 
 The profile lists the transports that Fast DDS would use anyway, shared memory and UDP. If discovery
 is limited to this computer, ROS adds its own UDP transport to the profile, which then contains only
@@ -25,9 +25,9 @@ from pathlib import Path
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.formats.messages import make_records
+from lidarspec.scans.limits import longest_scan_s
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import frame_simulation, make_opening_frame, simulate
-from lidarspec.spec.timing import Every
 
 #: The variable that names the file of profiles, of Fast DDS 3 (Kilted and later) and Fast DDS 2.
 PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
@@ -174,7 +174,7 @@ def largest_cloud_bytes(sensor: Sensor) -> int | None:
     interval_s = frame_simulation(sensor, sensor.data_frame).interval * 1e-9
     if not interval_s:
         return None
-    scan_s = _longest_scan_s(sensor)
+    scan_s = longest_scan_s(sensor)
     if scan_s is None:
         count = min(math.ceil(PROBED_S / interval_s), MAX_PROBED_PACKETS)
         scans = sensor.scans(_simulate_packets(sensor, count))
@@ -184,13 +184,6 @@ def largest_cloud_bytes(sensor: Sensor) -> int | None:
     cloud = sensor.decode(_simulate_packets(sensor, PROBED_PACKETS)).points()
     packet_bytes = make_records(cloud, every_point=True).nbytes / PROBED_PACKETS
     return math.ceil(packet_bytes * scan_s / interval_s)
-
-
-def _longest_scan_s(sensor: Sensor) -> float | None:
-    """Return the seconds of the slowest scan; None if they are not declared."""
-    if isinstance(sensor.scan, Every):
-        return sensor.scan.seconds
-    return 1 / sensor.turn[0] if sensor.turn else None
 
 
 def _simulate_packets(sensor: Sensor, count: int) -> bytes | list[bytes]:
