@@ -68,14 +68,15 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
-#: the size in bytes of a piece that is written to a file, and of a partition in memory.
-PIECE = 256_000_000
-PARTITION = 32_000_000
+#: the size of a piece that is written to a file.
+PIECE_BYTES = 256_000_000
+#: the size of a piece that becomes a partition in memory.
+PARTITION_BYTES = 32_000_000
 MANIFEST = "manifest.jsonl"
-#: the number of tasks that an executor has at a time; and the seconds between two writes of
-#: a manifest that cannot be appended to.
-AHEAD = 1000
-PERIOD = 2.0
+#: the number of tasks that an executor has at a time.
+MAX_RUNNING_TASKS = 1000
+#: the time between two writes of a manifest that cannot be appended to.
+MANIFEST_PERIOD_S = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
 
 Record = dict[str, Any]
@@ -121,7 +122,7 @@ class FilePiece:
         return f"{self.target.removesuffix(suffix)}-{self.number:05d}{suffix}"
 
     @property
-    def asked(self) -> Record:
+    def settings(self) -> Record:
         """The settings that its result depends on, apart from the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
@@ -151,20 +152,17 @@ class FilePiece:
             "source": self.source,
             "piece": self.number,
             "last": self.is_last,
-            **self.asked,
+            **self.settings,
             "versions": VERSIONS,
             **more,
         }
 
     def describe_failure(self, error: Exception) -> Record:
         """Return the record of the piece after an error."""
-        return self.record(
-            error=(
-                str(error)
-                if isinstance(error, LidarSpecError)
-                else f"{type(error).__name__}: {error}"
-            )
-        )
+        reason = str(error)
+        if not isinstance(error, LidarSpecError):
+            reason = f"{type(error).__name__}: {error}"
+        return self.record(error=reason)
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
         """Yield the selected scans of the piece, with their numbers in the file."""
@@ -320,7 +318,9 @@ class Manifest:
         self._due = 0.0
         self._is_stored = is_remote(folder)
         self._lines = [
-            line for number, line in enumerate(self._read_lines(), 1) if self._known(line, number)
+            line
+            for number, line in enumerate(self._read_lines(), 1)
+            if self._store_line(line, number)
         ]
         self._outputs = files_in(folder)
         self.is_new = not self.has(self.path)
@@ -339,7 +339,7 @@ class Manifest:
         except SourceError:
             return []
 
-    def _known(self, line: str, number: int) -> bool:
+    def _store_line(self, line: str, number: int) -> bool:
         """Store the record of a line; return False if the line is incomplete or damaged.
 
         Raises:
@@ -362,13 +362,13 @@ class Manifest:
         """Return whether a file was in the folder at the beginning."""
         return normalise_path(path) in self._outputs
 
-    def done(self, piece: FilePiece) -> Record | None:
+    def find_finished(self, piece: FilePiece) -> Record | None:
         """Return the record of a piece that does not have to be converted again, else None."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
             record is None
             or "error" in record
-            or any(record.get(name) != value for name, value in piece.asked.items())
+            or any(record.get(name) != value for name, value in piece.settings.items())
         ):
             return None
         is_there = record["output"] is None or self.has(record["output"])
@@ -388,7 +388,7 @@ class Manifest:
         """Return the records of all pieces of a file; empty if one is missing."""
         records = list[Record]()
         for number in itertools.count():
-            if (record := self.done(replace(piece, number=number))) is None:
+            if (record := self.find_finished(replace(piece, number=number))) is None:
                 return []
             records.append(record)
             if record["last"]:
@@ -399,7 +399,11 @@ class Manifest:
         """Remove the outputs of a file that has changed or has other settings now."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
-            if output and self.has(output) and self.done(replace(piece, number=number)) is None:
+            if (
+                output
+                and self.has(output)
+                and self.find_finished(replace(piece, number=number)) is None
+            ):
                 remove(output)
 
     def add(self, record: Record) -> None:
@@ -408,7 +412,7 @@ class Manifest:
         if self._is_stored:
             self._lines.append(line)
             if (now := time.monotonic()) >= self._due:
-                self._due = now + PERIOD
+                self._due = now + MANIFEST_PERIOD_S
                 self._put()
             return
         self._file.write(f"{line}\n")
@@ -498,7 +502,7 @@ def convert(
     scheduler: str = "",
     every_point: bool = False,
     select: Selection = EVERYTHING,
-    size: int = PIECE,
+    size: int = PIECE_BYTES,
     force: bool = False,
 ) -> Iterator[tuple[Record, bool]]:
     """Write the points of many files into a folder.
@@ -549,7 +553,7 @@ def convert(
             manifest.clear(piece)
         with _without_partial_files(folder, to), _executor(jobs, scheduler) as executor:
             for record, is_old in _iter_results(
-                executor, todo, (lambda _: None) if force else manifest.done
+                executor, todo, (lambda _: None) if force else manifest.find_finished
             ):
                 if not is_old:
                     manifest.add(record)
@@ -566,7 +570,7 @@ def _iter_results(
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
-    ahead = 1 if isinstance(executor, _InProcessExecutor) else AHEAD
+    most_running = 1 if isinstance(executor, _InProcessExecutor) else MAX_RUNNING_TASKS
 
     def hand_over(function: Callable[[FilePiece], Any], piece: FilePiece) -> None:
         executor.submit(function, piece).add_done_callback(
@@ -574,7 +578,7 @@ def _iter_results(
         )
 
     while tasks or running:
-        while tasks and running < ahead:
+        while tasks and running < most_running:
             hand_over(*tasks.popleft())
             running += 1
         piece, future = ended.get()
@@ -639,7 +643,7 @@ def read(
     *,
     every_point: bool = False,
     select: Selection = EVERYTHING,
-    size: int = PARTITION,
+    size: int = PARTITION_BYTES,
 ) -> Any:
     """Return the points of many files as a Dask dataframe, one partition per piece.
 

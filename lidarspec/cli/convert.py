@@ -195,7 +195,7 @@ def convert(
             sensor_id,
             jobs=jobs or 1,
             scheduler=scheduler or "",
-            size=int(piece_size or batch.PIECE),
+            size=int(piece_size or batch.PIECE_BYTES),
             every_point=every_point,
             select=selection,
             force=force,
