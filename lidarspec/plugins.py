@@ -159,10 +159,10 @@ def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """Return the file formats that the plugin adds."""
 
 
-#: how long a plugin loads before this is reported, seconds.
-PATIENCE = 5.0
-#: how long a plugin loads before it counts as hanging, seconds.
-LIMIT = 10.0
+#: how long a plugin loads before this is reported.
+LOAD_WARNING_S = 5.0
+#: how long a plugin loads before it counts as hanging.
+LOAD_TIMEOUT_S = 10.0
 #: the reason by module, for modules whose import hangs.
 _hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
@@ -212,12 +212,9 @@ class Plugin:
     @property
     def home(self) -> Home:
         """Its distribution and module."""
-        return (
-            self.distribution,
-            EntryPoint(
-                "", self.entry_point.partition(" = ")[2], self.distribution, self.version
-            ).module,
-        )
+        value = self.entry_point.partition(" = ")[2]
+        entry = EntryPoint("", value, self.distribution, self.version)
+        return self.distribution, entry.module
 
 
 class Registry:
@@ -250,9 +247,8 @@ class Registry:
         self._manager.add_hookspecs(sys.modules[__name__])
         self._named_owners = functools.cache(owners)
         self._sensors: dict[Home, dict[str, Sensor]] = {}
-        self._claims: dict[
-            str, dict[Home, bool]
-        ] = {}  # name -> the claiming plugins, and whether each claims it before it is loaded
+        # name -> the claiming plugins, and whether each claims it before it is loaded
+        self._claims: dict[str, dict[Home, bool]] = {}
         self._ready: dict[str, Sensor] = {}
         self._offered: dict[Home, list[EntryPoint]] = {}
         self._tried: dict[EntryPoint, Plugin] = {}
@@ -287,10 +283,10 @@ class Registry:
                 others = [holder]
             else:
                 others = [other for other in self._claims[lost[0]] if other != home]
-            whose = ", ".join(":".join(other) for other in others)
+            owners = ", ".join(":".join(other) for other in others)
             plugin = replace(
                 plugin,
-                error=f"{lost[0]}: another sensor has this id already: that of {whose}",
+                error=f"{lost[0]}: another sensor has this id already: that of {owners}",
                 rule="LS005",
             )
         return replace(plugin, sensors=tuple(own))
@@ -414,10 +410,10 @@ class Registry:
         if home is None:
             if name not in self._claims:
                 return None
-            whose = [home[0] for home in self._claims[name]]
-            owners = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
+            claiming = list(dict.fromkeys(home[0] for home in self._claims[name]))
             error = UsageError(
-                f'{name}: {owners}; choose one in {own_settings()}: [owners] {name} = "{whose[0]}"'
+                f"{name}: {' and '.join(claiming)} each have a sensor of this name; choose one in"
+                f' {own_settings()}: [owners] {name} = "{claiming[0]}"'
             )
             raise suggest(error, "lidarspec plugins")
         for entry in self._offered.get(home, []):
@@ -428,7 +424,7 @@ class Registry:
             None,
         )
 
-    def _found(self) -> dict[str, Sensor]:
+    def _loaded_sensors(self) -> dict[str, Sensor]:
         """Return the loaded sensors by id, without ids that another plugin claimed."""
         return {
             name: one
@@ -463,7 +459,7 @@ class Registry:
         Sensors with a claimed id that has no owner are left out.
         """
         self._load_all()
-        return {name: self.sensor(name) for name in sorted(self._found())}
+        return {name: self.sensor(name) for name in sorted(self._loaded_sensors())}
 
     @property
     def failures(self) -> list[Plugin]:
@@ -487,7 +483,7 @@ class Registry:
                 if (entry.distribution, entry.name) not in names:
                     self._load(entry)
         rows = {row.id: row for row in described if self._has_name(row.distribution, row.id)}
-        for name, sensor in self._found().items():
+        for name, sensor in self._loaded_sensors().items():
             home = self._holder(name)
             if name not in rows and home is not None:
                 rows[name] = make_row(sensor, home[0], self._version(home[0]))
@@ -533,15 +529,14 @@ class Registry:
             if plugin_sensor is None or plugin_sensor.id != own.id:
                 plugin_sensor = None
         if plugin_sensor is None:
-            known = self._found()
+            known = self._loaded_sensors()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
             raise self._load_error(name) or unknown_sensor_error(
                 name, known, aliases, self._failed_modules()
             )
         if name not in self._ready:
-            self._ready.setdefault(
-                name, self.apply_hooks(plugin_sensor)
-            )  # another thread may have stored it first
+            # another thread may have stored it first
+            self._ready.setdefault(name, self.apply_hooks(plugin_sensor))
         return self._ready[name]
 
     def _load_error(self, name: str) -> UnknownSensor | None:
@@ -709,17 +704,17 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
     thread = threading.Thread(target=load, name=f"import of {entry.module}", daemon=True)
     thread.start()
-    thread.join(PATIENCE)
+    thread.join(LOAD_WARNING_S)
     if thread.is_alive():
         warnings.warn(
-            f"{entry.distribution}: {entry.module} has been loading for {PATIENCE:g} s; next:"
+            f"{entry.distribution}: {entry.module} has been loading for {LOAD_WARNING_S:g} s; next:"
             " lidarspec plugins",
             stacklevel=2,
         )
-        thread.join(max(LIMIT - PATIENCE, 0))
+        thread.join(max(LOAD_TIMEOUT_S - LOAD_WARNING_S, 0))
     if not outcome:
         _hanging[entry.module] = (
-            f"it hangs: loading took more than {LIMIT:g} s{_describe_place(thread)}"
+            f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s{_describe_place(thread)}"
         )
         warnings.warn(
             f"{entry.distribution}: {_hanging[entry.module]}; the plugin is ignored",
@@ -868,14 +863,14 @@ def _trial(*homes: Home) -> tuple[str, str]:
     code = "from lidarspec.plugins import load_alone; load_alone()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     names = [name for home in homes for name in home]
-    command = [sys.executable, "-P", "-c", code, *names, mark, str(LIMIT)]
-    hangs = f"it hangs: loading took more than {LIMIT:g} s"
+    command = [sys.executable, "-P", "-c", code, *names, mark, str(LOAD_TIMEOUT_S)]
+    hangs = f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s"
     pipe = subprocess.PIPE
     try:
         done = subprocess.run(
             command,
             env=environment,
-            timeout=9 * LIMIT,
+            timeout=9 * LOAD_TIMEOUT_S,
             stdin=pipe,
             stdout=pipe,
             stderr=pipe,
@@ -886,18 +881,15 @@ def _trial(*homes: Home) -> tuple[str, str]:
     output, complaints = (stream.decode(errors="replace") for stream in (done.stdout, done.stderr))
     printed, ended, threads = output.partition(mark)
     if not ended:
-        return (
-            (
-                hangs
-                if "Timeout (" in complaints
-                else f"it ends the process with code {done.returncode}"
-            ),
-            "",
-        )
+        if "Timeout (" in complaints:  # of `faulthandler.dump_traceback_later`
+            return hangs, ""
+        return f"it ends the process with code {done.returncode}", ""
     text = " ".join((printed + complaints).split())
-    effects = [f"it prints {shown(text)}"] * bool(text) + [
-        f"it starts a thread that keeps running: {threads}"
-    ] * bool(threads)
+    effects = list[str]()
+    if text:
+        effects.append(f"it prints {shown(text)}")
+    if threads:
+        effects.append(f"it starts a thread that keeps running: {threads}")
     return "", "; ".join(effects)
 
 

@@ -482,7 +482,7 @@ def test_a_plugin_that_takes_long_is_named_while_it_does(
     end = threading.Event()
     monkeypatch.setitem(sys.modules, "its_end", SimpleNamespace(come=end))  # type: ignore[arg-type]
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("lidarspec.plugins.PATIENCE", 0.01)
+    monkeypatch.setattr("lidarspec.plugins.LOAD_WARNING_S", 0.01)
     told: list[str] = []
 
     def tell(message: Warning | str, *_: Any, **more: Any) -> None:
@@ -504,8 +504,8 @@ def test_a_plugin_that_hangs_is_left_out_and_the_others_work(
     end, gone = threading.Event(), threading.Event()
     monkeypatch.setitem(sys.modules, "its_end", SimpleNamespace(come=end, gone=gone))  # type: ignore[arg-type]
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("lidarspec.plugins.PATIENCE", 0.01)
-    monkeypatch.setattr("lidarspec.plugins.LIMIT", 0.02)
+    monkeypatch.setattr("lidarspec.plugins.LOAD_WARNING_S", 0.01)
+    monkeypatch.setattr("lidarspec.plugins.LOAD_TIMEOUT_S", 0.02)
     monkeypatch.setattr("lidarspec.plugins._hanging", {})
     hanging = [
         EntryPoint("a", "hanging_lidars", "hanging-lidars", "1"),
@@ -573,7 +573,7 @@ def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
         (tmp_path / f"odd_{name}.py").write_text(code, encoding="utf-8")
         distribution(tmp_path, f"odd_{name}", "1", f"[lidarspec]\n{name} = odd_{name}\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("lidarspec.plugins.LIMIT", limit_s)
+    monkeypatch.setattr("lidarspec.plugins.LOAD_TIMEOUT_S", limit_s)
     entries = entry_points("lidarspec")
     monkeypatch.setattr(
         "lidarspec.plugins.entry_points", lambda group: entries if group == "lidarspec" else []
