@@ -73,7 +73,9 @@ class CloudAppearance:
 
 def list_ramps(cloud: PointCloud) -> list[str]:
     """Return the names of the values that colours can show for a cloud."""
-    return ["range", *["intensity"] * (cloud.intensity is not None), *cloud.extra]
+    if cloud.intensity is None:
+        return ["range", *cloud.extra]
+    return ["range", "intensity", *cloud.extra]
 
 
 def choose_appearance(

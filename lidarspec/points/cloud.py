@@ -257,7 +257,8 @@ class PointCloud:
             else:
                 what = "points that are not organised"
             raise UsageError(f"expected shifts for {what}, got {np.size(shifts)}")
-        grid, (columns, rows) = grid_of(self), self.shape
+        grid = grid_of(self)
+        columns, rows = self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
         places = source * rows + np.arange(rows)
         return replace(
@@ -488,7 +489,7 @@ class ExtraColumns(Mapping[str, NDArray[Any]]):
             f"{name} [{kind.unit}]" if kind.unit else name
             for name, kind in self._lazy.source.extra.items()
         ]
-        return f"Extras({', '.join(names)})"
+        return f"{type(self).__name__}({', '.join(names)})"
 
 
 class _LazyColumn:

@@ -252,9 +252,10 @@ class ExtraType(NamedTuple):
             dtype = np.dtype(bool if array.dtype.kind == "b" else as_sent or np.float32)
         else:
             dtype = extra.dtype
-        return cls(
-            dtype, (info.unit if info is not None else "") if extra.unit is None else extra.unit
-        )
+        unit = extra.unit
+        if unit is None:
+            unit = "" if info is None else info.unit
+        return cls(dtype, unit)
 
     def column(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values converted to the type, of the same shape."""
@@ -321,7 +322,6 @@ def narrow_angle(angle: NDArray[np.float64]) -> Floats:
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     far = np.abs(angle) > _MAX_SUBTRACTED_RAD
     if far.any():
-        turned[far] = (
-            np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi
-        )  # exact for any number of turns, but slow
+        # exact for any number of turns, but slow
+        turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi
     return np.clip(turned.astype(np.float32), -_PI, _PI)

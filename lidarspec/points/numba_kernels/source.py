@@ -592,9 +592,8 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     else:
         directed = [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
-    if not all(
-        is_number(value, plan.layout.leaves) for value in directed
-    ):  # then a nan in one coordinate makes all of them nan
+    if not all(is_number(value, plan.layout.leaves) for value in directed):
+        # a nan in one coordinate makes all of them nan
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:
         assembly.together(places)

@@ -180,10 +180,8 @@ def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable |
     last = float(values[raw == high][0])
     slope = (last - first) / (high - low)
     start = first - slope * low
-    slope, start = (
-        float(f"{slope:.12g}"),
-        0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}"),
-    )
+    start = 0.0 if abs(start) < 1e-9 * abs(slope) else float(f"{start:.12g}")
+    slope = float(f"{slope:.12g}")
     wanted = values[good].astype(np.float32)
     some = raw[good]
     limits = (low if (raw < low).any() else None, high if (raw > high).any() else None)
