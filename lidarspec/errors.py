@@ -127,10 +127,9 @@ def printable(text: str) -> str:
     """
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
-    from unicodedata import (
-        category,
-    )  # control, format and half characters; separators of lines and paragraphs
+    from unicodedata import category
 
+    # control, format and half characters; separators of lines and paragraphs
     steering = {
         character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
     } - {"\n", "\t"}

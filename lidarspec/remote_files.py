@@ -70,10 +70,10 @@ def open_stored(path: str) -> BinaryIO:
             return open(path, "rb")
     system = find_file_system(path)
     with _failures(path):
-        file = system.open(path, "rb")
-        return (
-            io.BytesIO(file.getbuffer()) if isinstance(file, io.BytesIO) else file
-        )  # all readers of a BytesIO would share one offset
+        file: BinaryIO = system.open(path, "rb")
+        if isinstance(file, io.BytesIO):
+            return io.BytesIO(file.getbuffer())  # all readers of one BytesIO share its offset
+        return file
 
 
 def find_files(pattern: str) -> list[tuple[str, str]]:

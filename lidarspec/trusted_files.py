@@ -17,10 +17,10 @@ from lidarspec.errors import UsageError, system_errors
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: maximum size of a file in bytes. JSON may contain frames; reading TOML takes more than linear
+#: maximum size of a file. JSON may contain frames; reading TOML takes more than linear
 #: time.
-LARGEST = {"JSON": 1 << 22, "TOML": 1 << 18}
-#: a key with so many parts that reading it would take minutes.
+MAX_BYTES = {"JSON": 1 << 22, "TOML": 1 << 18}
+#: a key with at least 32 parts: reading a very long one would take minutes.
 _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
 #: the name of a settings file.
 FILE = "lidarspec.toml"
@@ -148,10 +148,10 @@ def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
 
     parse = json.loads if kind == "JSON" else tomllib.loads
     with system_errors(path), path.open("rb") as file:
-        data = file.read(LARGEST[kind] + 1)
-    reason: object = f"it is longer than {LARGEST[kind] >> 10} kB"
+        data = file.read(MAX_BYTES[kind] + 1)
+    reason: object = f"it is longer than {MAX_BYTES[kind] >> 10} kB"
     try:
-        if len(data) <= LARGEST[kind]:
+        if len(data) <= MAX_BYTES[kind]:
             if kind == "TOML" and _ENDLESS_KEY.search(data):
                 raise ValueError("a key has more than 32 parts")
             return parse(data.decode())
