@@ -88,7 +88,9 @@ class MessageStamps:
     """
 
     def __init__(self, wall: HostClock | None) -> None:
-        self.clock, self._wall, self._wall_step_ns = DeviceClock(), wall, 0
+        self.clock = DeviceClock()
+        self._wall = wall
+        self._wall_step_ns = 0
 
     def learn(self, device_ns: Times, host_ns: Times) -> None:
         """Update the conversion with packets, and note a step of the computer's clock.
@@ -100,7 +102,8 @@ class MessageStamps:
         is_known = host_ns > 0
         self.clock.observe(device_ns[is_known], host_ns[is_known])
         step = None if self._wall is None else self._wall.find_step()
-        self._wall_step_ns = self._wall_step_ns if step is None else step
+        if step is not None:
+            self._wall_step_ns = step
 
     def stamp_scan(self, device_ns: int, host_ns: int, settings: Settings) -> int:
         """Return the stamp of the next scan, ns.
@@ -118,7 +121,9 @@ class MessageStamps:
             time_ns: its time, by the sensor's clock or the host's.
             by_clock: whether the time is by the sensor's clock; otherwise it is the arrival time.
         """
-        host_ns = time_ns + self.clock.offset_ns * by_clock
+        host_ns = time_ns
+        if by_clock:
+            host_ns += self.clock.offset_ns
         return self._choose_stamp(time_ns, host_ns, host_ns, settings)
 
     def _choose_stamp(
@@ -131,12 +136,12 @@ class MessageStamps:
             converted_ns: the sensor's time converted to the host's clock.
             arrival_ns: the arrival time.
         """
-        if settings["use_device_time"] and settings["device_time_is_ros_time"]:
+        if not settings["use_device_time"]:
+            stamp = arrival_ns + self._wall_step_ns
+        elif settings["device_time_is_ros_time"]:
             stamp = device_ns
         else:
-            stamp = (
-                converted_ns if settings["use_device_time"] else arrival_ns
-            ) + self._wall_step_ns
+            stamp = converted_ns + self._wall_step_ns
         offset: float = settings["time_offset"]
         return stamp + round(offset * 1e9)
 
@@ -154,13 +159,13 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._stamp = -(1 << 62)
-        self.jumps, self.jump = 0, ""
-        self._min_delays, self._outliers, self._first_outlier_ns = (
-            deque[ClockSample](maxlen=PARTS),
-            deque[ClockSample](maxlen=LATE_OUTLIERS),
-            0,
-        )
-        self._line, self._reliable_slope = ClockLine(0, 0, 0.0), 0.0
+        self.jumps = 0
+        self.jump = ""
+        self._min_delays = deque[ClockSample](maxlen=PARTS)
+        self._outliers = deque[ClockSample](maxlen=LATE_OUTLIERS)
+        self._first_outlier_ns = 0
+        self._line = ClockLine(0, 0, 0.0)
+        self._reliable_slope = 0.0
         self._last_stamped: ClockSample | None = None
 
     @property
@@ -197,12 +202,10 @@ class DeviceClock:
             host_ns: when its packet arrived, ns.
         """
         self.observe(device_ns, host_ns)
+        offset = host_ns - device_ns
         went_back = self._last_stamped is not None and device_ns <= self._last_stamped.device
-        offset = (
-            host_ns - device_ns
-            if went_back
-            else min(self._slewed_delay(device_ns), host_ns - device_ns)
-        )
+        if not went_back:
+            offset = min(self._slewed_delay(device_ns), offset)
         self._last_stamped = ClockSample(device_ns, offset)
         self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
@@ -213,27 +216,23 @@ class DeviceClock:
             return self._line.delay_at(device)
         step = device - self._last_stamped.device
         unchanged = self._last_stamped.delay + round(self._line.slope * step)
-        correction, limit = (
-            (self._line.delay_at(device) - unchanged) * min(step / SLEW_TIME_NS, 1.0),
-            MAX_SLEW * step,
-        )
+        correction = (self._line.delay_at(device) - unchanged) * min(step / SLEW_TIME_NS, 1.0)
+        limit = MAX_SLEW * step
         return unchanged + round(min(max(correction, -limit), limit))
 
     def _add_sample(self, sample: ClockSample) -> None:
         """Update the line, or count an outlier, with the sample of smallest delay."""
-        deviation, has_paused = (
-            self._deviation(sample),
-            bool(self._min_delays) and sum(sample) - sum(self._min_delays[-1]) > PARTS * PART_NS,
+        deviation = self._deviation(sample)
+        has_paused = (
+            bool(self._min_delays) and sum(sample) - sum(self._min_delays[-1]) > PARTS * PART_NS
         )
-        if (
-            has_paused and abs(deviation) < UNSETTLED_LIMIT_NS
-        ):  # the drift is not known well enough for such a pause
-            self._forget_offset()
-        early_limit, late_limit = (
-            (EARLY_LIMIT_NS, LATE_LIMIT_NS)
-            if len(self._min_delays) >= SETTLED_PARTS
-            else (UNSETTLED_LIMIT_NS, UNSETTLED_LIMIT_NS)
-        )
+        if has_paused and abs(deviation) < UNSETTLED_LIMIT_NS:
+            self._forget_offset()  # the drift is not known well enough for such a pause
+        early_limit = UNSETTLED_LIMIT_NS
+        late_limit = UNSETTLED_LIMIT_NS
+        if len(self._min_delays) >= SETTLED_PARTS:
+            early_limit = EARLY_LIMIT_NS
+            late_limit = LATE_LIMIT_NS
         if not self._min_delays or -early_limit < deviation < late_limit:
             self._outliers.clear()
             self._update_line(sample)
@@ -259,7 +258,8 @@ class DeviceClock:
 
         `lasting` is the time since the first outlier, ns.
         """
-        newest, outliers = self._min_delays[-1].device, list(self._outliers)
+        newest = self._min_delays[-1].device
+        outliers = list(self._outliers)
         are_early = [
             self._deviation(sample) < 0 or sample.device < newest
             for sample in outliers[-CERTAIN_OUTLIERS:]
@@ -311,8 +311,10 @@ def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
         samples: one or more samples in order.
         slope_before: the previous slope; the result is the nearest slope that the samples allow.
     """
-    hull, last = lower_hull(samples), samples[-1]
-    slope, middle = slope_before, (len(samples) - 1) / 2
+    hull = lower_hull(samples)
+    last = samples[-1]
+    slope = slope_before
+    middle = (len(samples) - 1) / 2
     if len(samples) >= MIN_PARTS_FOR_SLOPE:
         slope = min(
             max(slope, slope_at(middle - MIDDLE_PARTS, samples, hull)),
@@ -331,7 +333,8 @@ def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
     hull: list[int] = []
     for index, (device, delay) in enumerate(samples):
         while len(hull) > 1:
-            (left, low), (right, high) = samples[hull[-2]], samples[hull[-1]]
+            left, low = samples[hull[-2]]
+            right, high = samples[hull[-1]]
             if (high - low) * (device - left) < (delay - low) * (right - left):
                 break
             hull.pop()
@@ -345,5 +348,6 @@ def slope_at(index: float, samples: Sequence[ClockSample], hull: Sequence[int]) 
     The index may be between two samples.
     """
     end = min(max(bisect_left(hull, index), 1), len(hull) - 1)
-    (left, low), (right, high) = samples[hull[end - 1]], samples[hull[end]]
+    left, low = samples[hull[end - 1]]
+    right, high = samples[hull[end]]
     return (high - low) / (right - left)

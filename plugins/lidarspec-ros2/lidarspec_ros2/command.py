@@ -113,7 +113,8 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     from lidarspec_ros2.node import LidarNode
     from lidarspec_ros2.shared_memory import use_profile
 
-    signals, nodes = list[int](), list[LidarNode]()
+    signals = list[int]()
+    nodes = list[LidarNode]()
 
     def handle_signal(number: int, frame: object) -> None:
         """Note the signal, and interrupt only a node that waits for a sensor."""
@@ -184,9 +185,8 @@ def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
             if node.autostarts and not signals:
                 node.start()
             serving.start()
-            while not signals and not node.ended.wait(
-                SIGNAL_CHECK_S
-            ):  # a signal that comes just before it waits does not end the wait
+            # A signal that arrives just before the wait does not end it, so the wait is short.
+            while not signals and not node.ended.wait(SIGNAL_CHECK_S):
                 pass
     finally:
         executor.shutdown()

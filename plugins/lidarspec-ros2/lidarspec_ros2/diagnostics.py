@@ -38,13 +38,11 @@ def make_status(
         **device.info,
         **{f"warning {n + 1}": text for n, text in enumerate(warnings)},
     }
-    level = (
-        DiagnosticStatus.ERROR
-        if device.state in LOST_STATES
-        else DiagnosticStatus.WARN
-        if warnings
-        else DiagnosticStatus.OK
-    )
+    level = DiagnosticStatus.OK
+    if device.state in LOST_STATES:
+        level = DiagnosticStatus.ERROR
+    elif warnings:
+        level = DiagnosticStatus.WARN
     return DiagnosticStatus(
         level=level,
         name=f"{name}: {device.sensor.id}",

@@ -68,11 +68,13 @@ class LidarNode(LifecycleNode):
         )
         self._max_cloud_bytes = max_cloud_bytes
         self.failure: Exception | None = None
-        self.ended, self.opening = threading.Event(), False
+        self.ended = threading.Event()
+        self.opening = False
         self._device: Device | None = None
         self._topics: Topics | None = None
         self._thread: threading.Thread | None = None
-        self._stopping, self._was_lost = threading.Event(), False
+        self._stopping = threading.Event()
+        self._was_lost = False
         self._services_of_sensor: list[Any] = []
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         try:
@@ -107,14 +109,16 @@ class LidarNode(LifecycleNode):
     def close(self) -> None:
         """Stop reading and close the sensor; a second call has no effect."""
         self._stopping.set()
-        device, self._device = self._device, None
+        device = self._device
+        self._device = None
         if device is not None:
             if device.is_live:  # this ends the reading thread's wait for data
                 device.close()
             if self._thread is not None:
                 self._thread.join()
             device.close()
-        topics, self._topics = self._topics, None
+        topics = self._topics
+        self._topics = None
         if topics is not None:
             topics.close()
         for service in self._services_of_sensor:
@@ -189,20 +193,19 @@ class LidarNode(LifecycleNode):
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish scans, packets and IMU samples until the node stops or the input ends."""
         speed = self._settings["replay_speed"]
-        feed = LiveScans(
-            device, played=speed > 0, speed=speed, ahead=None
-        )  # all read data updates the clock's conversion before a scan is published
-        next_diagnostics, scan_end = time.monotonic(), 0.0
+        # Without a limit of `ahead`, all read data updates the clock before a scan is published.
+        feed = LiveScans(device, played=speed > 0, speed=speed, ahead=None)
+        next_diagnostics = time.monotonic()
+        scan_end = 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.read(0.0 if device.is_live else time.monotonic() + LOOK_S)
                 self._publish(feed, topics)
                 scan_end = _predict_scan_end(scan_end, feed)
-                device.delay_decoding(
-                    min(scan_end, time.monotonic() + MAX_IMU_DELAY_S)
-                    if device.sensor.imu_frames
-                    else scan_end
-                )
+                next_decoding = scan_end
+                if device.sensor.imu_frames:
+                    next_decoding = min(scan_end, time.monotonic() + MAX_IMU_DELAY_S)
+                device.delay_decoding(next_decoding)
                 self._check_connection(device)
                 if (now := time.monotonic()) >= next_diagnostics:
                     next_diagnostics = now + DIAGNOSTICS_PERIOD_S
@@ -351,9 +354,11 @@ class LidarNode(LifecycleNode):
             ]
             reply = device.send(name, **parse_arguments(device.sensor, name, words))
         except LidarSpecError as error:
-            response.success, response.message = False, str(error)
+            response.success = False
+            response.message = str(error)
         else:
-            response.success, response.message = True, reply_text(device.sensor, reply)
+            response.success = True
+            response.message = reply_text(device.sensor, reply)
         return response
 
 

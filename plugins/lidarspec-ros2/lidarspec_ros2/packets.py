@@ -58,7 +58,9 @@ class PacketTransport(LiveTransport):
     """
 
     def __init__(self, label: str, topic: str, *, datagrams: bool) -> None:
-        self.label, self.datagrams, self._chunks = label, datagrams, list[Chunk]()
+        self.label = label
+        self.datagrams = datagrams
+        self._chunks = list[Chunk]()
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node(
@@ -77,7 +79,8 @@ class PacketTransport(LiveTransport):
         while count < len(self._chunks) < MAX_WAITING_PACKETS:
             count = len(self._chunks)
             self._executor.spin_once(timeout_sec=0.0 if count else timeout)
-        chunks, self._chunks = self._chunks, []
+        chunks = self._chunks
+        self._chunks = []
         return chunks
 
     def reopen(self) -> None:

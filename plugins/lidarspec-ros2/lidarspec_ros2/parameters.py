@@ -239,8 +239,10 @@ class Settings:
 
     def make_planar_scans(self) -> PlanarScans:
         """Return the object that projects scans to planar scans."""
-        first, width = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
-        low, high = self["scan_z_min"], self["scan_z_max"]
+        first = self["angle_min"]
+        width = (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
+        low = self["scan_z_min"]
+        high = self["scan_z_max"]
         return PlanarScans(
             field=(first, first + width) if width else None,
             ring=self["scan_ring"] if self["scan_ring"] >= 0 else None,
@@ -280,8 +282,10 @@ class Settings:
     def find_mount(self) -> Mount | None:
         """Return the mount of the parameters or of `lidarspec.toml`; None if neither."""
         mount = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
+        if mount != Mount():
+            return mount
         device = find_device(self["source"])
-        return mount if mount != Mount() else None if device is None else device.mount
+        return None if device is None else device.mount
 
     def open_device(self, record: Callable[[Transport], TrafficLog]) -> Device:
         """Return the open device.

@@ -80,11 +80,9 @@ class Topics:
         max_cloud_bytes: int | None = None,
     ) -> None:
         self._max_cloud_bytes = max_cloud_bytes
-        self._node, self._sensor, self.stamps = (
-            node,
-            sensor,
-            MessageStamps(None if played else HostClock()),
-        )
+        self._node = node
+        self._sensor = sensor
+        self.stamps = MessageStamps(None if played else HostClock())
         self._messages = RosMessages("ROS2_HUMBLE")
         self._reliability = (
             ReliabilityPolicy.RELIABLE
@@ -92,9 +90,12 @@ class Topics:
             else ReliabilityPolicy.BEST_EFFORT
         )
         self._publishers: dict[str, Any] = {}
-        self.sent, self._publishing = Counter[str](), threading.Lock()
+        self.sent = Counter[str]()
+        self._publishing = threading.Lock()
         self._plain_publishers = list[Any]()
-        self.active, self.latency_s, self.fault = False, 0.0, ""
+        self.active = False
+        self.latency_s = 0.0
+        self.fault = ""
         self._arrival_ns = 0
         self.use_settings(settings)
         self._publisher(CLOUD)
@@ -113,11 +114,9 @@ class Topics:
 
     def use_settings(self, settings: Settings) -> None:
         """Apply the parameters to all later messages."""
-        self._settings, self._planar_scans, self._selector = (
-            settings,
-            settings.make_planar_scans(),
-            ScanSelector(settings.make_selection()),
-        )
+        self._settings = settings
+        self._planar_scans = settings.make_planar_scans()
+        self._selector = ScanSelector(settings.make_selection())
 
     def learn(self, packets: Packets) -> None:
         """Update the conversion of the sensor's clock with packets."""
@@ -128,14 +127,17 @@ class Topics:
         """Publish a scan on the topics with subscribers."""
         selected = self._selector.select(scan)
         assert selected is not None  # nothing is selected by number or time
-        stamp, settings = self._stamp(scan), self._settings
+        stamp = self._stamp(scan)
+        settings = self._settings
         if self._has_subscribers(CLOUD):
             organised = settings["organized"] and selected.points.shape is not None
             self._send(self._messages.cloud(selected, stamp, every_point=organised))
         try:
-            planar, self.fault = self._planar_scans.project(selected), ""
+            planar = self._planar_scans.project(selected)
+            self.fault = ""
         except UsageError as error:  # a ring that the sensor lacks: it is set at run time
-            planar, self.fault = None, str(error)
+            planar = None
+            self.fault = str(error)
         if planar is not None and self._has_subscribers(SCAN):
             self._send(
                 self._messages.laserscan(
@@ -148,7 +150,9 @@ class Topics:
 
     def publish_imu(self, samples: ImuSamples) -> None:
         """Publish samples of the IMU."""
-        for index in range(len(samples)) if len(samples) and self._has_subscribers(IMU) else ():
+        if not len(samples) or not self._has_subscribers(IMU):
+            return
+        for index in range(len(samples)):
             stamp = self.stamps.stamp_sample(
                 int(samples.time_ns[index]), self._settings, by_clock=self._is_imu_by_clock
             )
@@ -219,12 +223,12 @@ class Topics:
         return self.active and self._publisher(kind).get_subscription_count() > 0
 
     def _send(self, message: RosMessage) -> None:
-        publisher, data = self._publisher(message.kind), bytes(message.data)
+        publisher = self._publisher(message.kind)
+        data = bytes(message.data)
         if message.kind == CLOUD:
             self._warn_of_large_cloud(len(data))
-        with (
-            self._publishing
-        ):  # packets come from a thread of their own, transitions from another one
+        # Packets come from a thread of their own, transitions from another one.
+        with self._publishing:
             if self.active:
                 publisher.publish(data)
                 self.sent[TOPICS[message.kind][0]] += 1
@@ -258,7 +262,8 @@ def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
         w=cr * cp * cy + sr * sp * sy,
     )
     stamped = TransformStamped(child_frame_id=settings["frame_id"])
-    stamped.header.stamp, stamped.header.frame_id = stamp, settings["parent_frame"]
+    stamped.header.stamp = stamp
+    stamped.header.frame_id = settings["parent_frame"]
     stamped.transform = Transform(
         translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=rotation
     )
