@@ -100,7 +100,6 @@ def make_packet(
             known coverage.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
-    safety_struct = make_safety_part(crc)
     fine_azimuth = [] if block is None else ["fine_azimuth" / block]
     body = Struct(
         "blocks"
@@ -110,6 +109,15 @@ def make_packet(
         ),
         "crc" / crc,
     )
+    safety_part: list[Construct] = []
+    if safety:
+        safety_struct = make_safety_part(crc)
+        if verify_crc:
+            safety_struct = Checksummed(safety_struct, "crc", CRC, over=SAFETY_CRC_FIELDS)
+        safety_part = ["safety" / If(this.flags.safety == 1, safety_struct)]
+    imu_part = ["imu" / If(this.flags.imu == 1, IMU)] if imu else []
+    # the tail CRC covers these parts
+    covered = (*tail, "sequence" / If(this.flags.sequence == 1, Int32ul), *imu_part)
     frame = Struct(
         "sync" / Const(b"\xee\xff"),
         *version,
@@ -124,28 +132,14 @@ def make_packet(
         "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if verify_crc else body),
-        *(
-            [
-                "safety"
-                / If(
-                    this.flags.safety == 1,
-                    Checksummed(safety_struct, "crc", CRC, over=SAFETY_CRC_FIELDS)
-                    if verify_crc
-                    else safety_struct,
-                )
-            ]
-            if safety
-            else []
-        ),
-        *tail,
-        "sequence" / If(this.flags.sequence == 1, Int32ul),
-        *(["imu" / If(this.flags.imu == 1, IMU)] if imu else []),
+        *safety_part,
+        *covered,
         "tail_crc" / crc,
         "signature" / If(this.flags.signature == 1, Bytes(32)),
     )
-    names = [part.name for part in frame.subcons]
-    covered = names[names.index("body") + 1 + safety : names.index("tail_crc")]
-    return Checksummed(frame, "tail_crc", CRC, over=covered) if verify_crc else frame
+    if not verify_crc:
+        return frame
+    return Checksummed(frame, "tail_crc", CRC, over=[part.name for part in covered])
 
 
 def max_packet_bytes(blocks: int, block: int) -> int:
