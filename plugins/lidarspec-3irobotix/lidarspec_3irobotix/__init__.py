@@ -157,6 +157,10 @@ def describe_difference(own: int, other: int) -> str | Relative:
 def make_lidar(name: str) -> Sensor:
     """Return the sensor of one row of `MODELS`."""
     model, packets, count, bauds = MODELS[name]
+    has_vectors = model == "Delta-2A"
+    source = "kaiaai/LDS and lds2d"
+    if has_vectors:
+        source += "; two packets of a unit"
     return Sensor(
         name,
         vendor="3iRobotix",
@@ -172,10 +176,8 @@ def make_lidar(name: str) -> Sensor:
             for other, row in MODELS.items()
             if other != name
         },
-        status="vectors" if model == "Delta-2A" else "manual",
-        source="kaiaai/LDS and lds2d"
-        + "; two packets of a unit" * (model == "Delta-2A")
-        + ". Range limits are assumed",
+        status="vectors" if has_vectors else "manual",
+        source=f"{source}. Range limits are assumed",
     )
 
 

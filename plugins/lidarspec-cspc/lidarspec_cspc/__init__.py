@@ -241,14 +241,12 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
 def points(f: Fields, zero: str = "data") -> Polar:
     """Return the points of a packet, with times from the latest reported speed."""
     raw, clockwise = directions(f, zero)
-    rate = (
-        last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360
-    )  # degrees per second
+    rate_hz = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0))
     return Polar(
         range=f.samples.distance,
         azimuth=-np.deg2rad(clockwise),  # clockwise (manual, section 1a)
         intensity=f.samples.intensity,
-        time=np.nan_to_num((raw - f.fsa.angle) / rate),
+        time=np.nan_to_num((raw - f.fsa.angle) / (rate_hz * 360)),
     )
 
 

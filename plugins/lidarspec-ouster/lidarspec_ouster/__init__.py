@@ -174,7 +174,8 @@ def make_nominal_unit(model: str, rows: int, turn: int, profile: str) -> Unit:
     line, low, high, beam_origin, height, _ = MODELS[model]
     beam_transform = np.eye(4)
     lidar_transform = np.diag([-1.0, -1.0, 1.0, 1.0])
-    beam_transform[0, 3], lidar_transform[2, 3] = beam_origin, height
+    beam_transform[0, 3] = beam_origin
+    lidar_transform[2, 3] = height
     imu_transform = np.array(IDENTITY).reshape(4, 4)
     azimuth = np.zeros(rows)
     shifts = np.zeros(rows, np.int64)

@@ -96,9 +96,9 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
     has_header = profile != "LEGACY"
     if has_header and not (packets[:, 0] == 1).all():
         return None
-    if has_header and (packets[:, 1] == 0).all() == profile.startswith(
-        "FUSA"
-    ):  # of the type, or of the number of the start
+    # byte 1 is the high byte of the type, 0; with FUSA it is the low byte of `init_id`
+    is_byte_1_zero = bool((packets[:, 1] == 0).all())
+    if has_header and is_byte_1_zero == profile.startswith("FUSA"):
         return None
     body = packets[:, 32:-32] if has_header else packets
     columns = body.reshape(len(packets) * COLUMNS, -1)

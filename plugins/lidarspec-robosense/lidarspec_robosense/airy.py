@@ -85,15 +85,17 @@ def make_firing_times(*times: float) -> Any:
     return np.tile(np.repeat(times, 8).reshape(2, HALF_LASERS), (BLOCKS // 2, 1)) * 1e-6
 
 
+# Table 32
 UPRIGHT_DELAY_S = make_firing_times(
     0, 5.712, 12.376, 19.04, 25.704, 33.32, 41.888, 50.456, 59.024, 70.448, 81.872, 93.296
-)  # Table 32
+)
+# rs_driver
 SIDEWAYS_DELAY_S = make_firing_times(
     0, 11.424, 22.848, 34.272, 45.696, 54.264, 62.832, 71.4, 79.016, 85.68, 92.344, 99.008
-)  # rs_driver
+)
 AIRY_M_DELAY_S = make_firing_times(
     0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104
-)  # rs_driver
+)
 # fmt: off
 ELEVATION_DEG = np.array([  # Table 32
     -0.07, 0.88, 1.81, 2.76, 3.69, 4.62, 5.54, 6.48, 7.41, 8.34, 9.27, 10.21, 11.15, 12.09, 13.03, 13.98, 14.92, 15.87, 16.82, 17.77, 18.72,

@@ -271,9 +271,9 @@ def encode_ultra(polar: Polar) -> Mapping[str, Any]:
 def nearest_codes(mm: Any) -> Any:
     """Return the codes with the distances nearest to `mm`, 0 for no return."""
     above = np.clip(np.searchsorted(CODE_MILLIMETRES, mm), 1, len(CODE_MILLIMETRES) - 1)
-    return np.where(
-        mm - CODE_MILLIMETRES[above - 1] < CODE_MILLIMETRES[above] - mm, above - 1, above
-    ) * (mm > 0)
+    is_nearer_below = mm - CODE_MILLIMETRES[above - 1] < CODE_MILLIMETRES[above] - mm
+    nearest = np.where(is_nearer_below, above - 1, above)
+    return np.where(mm > 0, nearest, 0)
 
 
 def encode_prediction(mm: Any, code: Any) -> Any:

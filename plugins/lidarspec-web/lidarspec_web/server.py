@@ -184,7 +184,7 @@ class PageSite:
         self._open_pages.add(page)
         self._opened_count += 1
         number = self._opened_count
-        client = "nobody" if socket.client is None else socket.client.host
+        client = "an unknown address" if socket.client is None else socket.client.host
         self._report(f"page {number} opened by {client}; {len(self._open_pages)} open")
         ending = "closed"
         try:

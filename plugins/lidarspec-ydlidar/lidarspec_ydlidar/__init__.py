@@ -125,14 +125,12 @@ def points(f: Fields, form: Form) -> Polar:
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = raw if form.correction is None else raw + form.correction(f.samples.distance)
-    rate = (
-        last(f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > form.slowest)) * 360
-    )  # degrees per second
+    rate_hz = last(f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > form.slowest))
     return Polar(
         range=f.samples.distance,
         azimuth=-np.deg2rad(clockwise),
         intensity=f.samples.intensity if form.has_intensity else None,
-        time=np.nan_to_num((raw - f.fsa.angle) / rate),
+        time=np.nan_to_num((raw - f.fsa.angle) / (rate_hz * 360)),
     )
 
 
@@ -201,6 +199,9 @@ def make_lidar(name: str) -> Sensor:
     """Return the sensor of one model."""
     model = MODELS[name]
     has_requests = not model.one_channel
+    source = "YDLIDAR SDK: communication protocol, data set of models"
+    if model.status == "capture":
+        source += "; packets of a unit"
     return Sensor(
         make_id(name),
         vendor="YDLIDAR",
@@ -226,8 +227,7 @@ def make_lidar(name: str) -> Sensor:
         relatives=relatives(name),
         info={"serial": "info.serial", "model": "info.model"} if has_requests else {},
         status=model.status,
-        source="YDLIDAR SDK: communication protocol, data set of models"
-        + "; packets of a unit" * (model.status == "capture"),
+        source=source,
     )
 
 
