@@ -41,7 +41,9 @@ HOSTILE = 100_000  # bytes of a hostile stream
 
 def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
     """Return the workload of computing scans from a capture, compared with packets in memory."""
-    sensor, rows, path = inputs.sensor(key), inputs.array(key), inputs.capture(key)
+    sensor = inputs.sensor(key)
+    rows = inputs.array(key)
+    path = inputs.capture(key)
     points = len(sensor.decode(rows).points())
 
     def scans(backend: str) -> int:
@@ -64,7 +66,8 @@ def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = Non
 
 
 def m1_pcap(inputs: Inputs) -> Work:
-    path, points = inputs.capture("m1"), 125 * len(inputs.frames("m1"))
+    path = inputs.capture("m1")
+    points = 125 * len(inputs.frames("m1"))
     return from_capture(
         inputs,
         "m1",
@@ -74,7 +77,8 @@ def m1_pcap(inputs: Inputs) -> Work:
 
 
 def vlp16_pcap(inputs: Inputs) -> Work:
-    path, points = inputs.capture("vlp16"), 384 * len(inputs.frames("vlp16"))
+    path = inputs.capture("vlp16")
+    points = 384 * len(inputs.frames("vlp16"))
     return from_capture(
         inputs,
         "vlp16",
@@ -92,7 +96,8 @@ def vlp16_long(inputs: Inputs) -> Work:
 
 
 def payloads(inputs: Inputs) -> Work:
-    path, packets = inputs.capture("m1"), len(inputs.frames("m1"))
+    path = inputs.capture("m1")
+    packets = len(inputs.frames("m1"))
     others: Others = {
         "dpkt": lambda: libraries.dpkt_payloads(path, packets),
         "ouster-sdk": lambda: beside_ouster_sdk(libraries.ouster_payloads, path, packets),
@@ -126,7 +131,8 @@ def live(inputs: Inputs) -> Work:
 
     It is compared with the cost of decoding each packet separately.
     """
-    sensor, frames = inputs.sensor("m1"), inputs.frames("m1")
+    sensor = inputs.sensor("m1")
+    frames = inputs.frames("m1")
 
     def alone(backend: str) -> dict[str, Contender]:
         return {
@@ -176,7 +182,8 @@ def parse(inputs: Inputs, key: str, title: str) -> Work:
 
     It is compared with construct on a plain struct.
     """
-    sensor, frames = inputs.sensor(key), inputs.frames(key)[:FEW]
+    sensor = inputs.sensor(key)
+    frames = inputs.frames(key)[:FEW]
     others: Others = {
         "construct": lambda: Contender(one_by_one(STRUCTS[key].parse, frames), len(frames)),
         "compiled": lambda: Contender(

@@ -69,7 +69,9 @@ def make_sensor(
 def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
     """Return a telegram of one module, as `lidarspec_sick.compact` has it."""
     (module,) = sensor.parse(frame).modules
-    layers, beams, echoes = module.layer_count, module.beam_count, module.echo_count
+    layers = module.layer_count
+    beams = module.beam_count
+    echoes = module.echo_count
     echo = Struct("distance" / Scaled(Int16ul, 0.001, "m"), "strength" / Int16ul)
     azimuth = "azimuth" / Scaled(
         Int16ul,
@@ -158,7 +160,8 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
     )
 
     def points(f: Fields) -> Polar:
-        first, second = f.dist1, f.rssi1
+        first = f.dist1
+        second = f.rssi1
         return Polar(
             range=first.samples * first.scale + first.offset * 0.001,
             azimuth=np.deg2rad(

@@ -28,13 +28,14 @@ from packet_workloads import Facts, Work
 import lidarspec as ls
 from lidarspec import formats
 
-#: what holds all points at once is given so many times less, and many captures are so many of this
-#: size.
+#: code that holds all points in memory gets a capture of 1/8 of the size, and 8 such captures are
+#: converted together.
 SMALLER = 8
 
 #: Runs a command and prints the seconds that passed, those of the processors, and the bytes of
-#: memory of its largest process. It stands in between, as a child begins with the peak of its
-#: parent, which holds the inputs of all works; on Linux it waits for the workers' parents.
+#: memory of its largest process. The command is not started directly, because a child begins with
+#: the peak of its parent, which holds the inputs of all workloads. On Linux the launcher also waits
+#: for workers without a parent.
 LAUNCHER = """
 import ctypes, json, os, resource, subprocess, sys, time
 if sys.platform == "linux":
@@ -152,7 +153,8 @@ def process(*command: object) -> Spent:
 
 def capture(inputs: Inputs, key: str, size: int) -> Path:
     """Return a simulated capture of about `size` bytes."""
-    path, made = inputs.folder / f"{key}-{size}.pcap", CAPTURES[key]
+    path = inputs.folder / f"{key}-{size}.pcap"
+    made = CAPTURES[key]
     if path.exists():
         return path
     if not made.period:
@@ -189,7 +191,8 @@ def write_repeated_capture(once: Path, path: Path, size: int, period: int) -> Pa
     Each repetition is one period later. All records must have the same length.
     """
     data = np.fromfile(once, np.uint8)
-    head, records = data[:24], data[24:]
+    head = data[:24]
+    records = data[24:]
     rows = records.reshape(-1, 16 + int(records[8:12].view("<u4")[0]))
     with path.open("wb") as file:
         file.write(head.tobytes())
@@ -241,7 +244,7 @@ class Beside(NamedTuple):
     modules: tuple[str, ...] = ()
 
 
-def written(
+def compare_conversion(
     title: str,
     out: Path,
     amount: int,
@@ -305,13 +308,12 @@ def written(
     )
 
 
-def converting(inputs: Inputs, key: str, suffix: str) -> Work:
+def convert_one(inputs: Inputs, key: str, suffix: str) -> Work:
     """Return the workload of converting a capture, compared with code of a user."""
-    made, out = CAPTURES[key], inputs.folder / "out" / f"points{suffix}"
-    path, part = (
-        capture(inputs, key, inputs.size // made.share),
-        capture(inputs, key, inputs.size // SMALLER),
-    )
+    made = CAPTURES[key]
+    out = inputs.folder / "out" / f"points{suffix}"
+    path = capture(inputs, key, inputs.size // made.share)
+    part = capture(inputs, key, inputs.size // SMALLER)
     try:
         with ls.open(part, made.sensor) as device:
             formats.write(inputs.folder / f"one{suffix}", itertools.islice(device.scans(), 1))
@@ -330,7 +332,7 @@ def converting(inputs: Inputs, key: str, suffix: str) -> Work:
                 line, amount, ("velodyne_decoder", *needed)
             )
     command = (path, out, "-s", made.sensor)
-    return written(
+    return compare_conversion(
         f"{made.title} capture to {suffix}",
         out,
         points_of(path, made.sensor),
@@ -340,10 +342,12 @@ def converting(inputs: Inputs, key: str, suffix: str) -> Work:
     )
 
 
-def many(inputs: Inputs, suffix: str) -> Work:
+def convert_many(inputs: Inputs, suffix: str) -> Work:
     """Return the workload of converting several captures with four processes or with one."""
-    made, out = CAPTURES["m1"], inputs.folder / "out" / "points"
-    part, folder = capture(inputs, "m1", inputs.size // SMALLER), inputs.folder / f"many{suffix}"
+    made = CAPTURES["m1"]
+    out = inputs.folder / "out" / "points"
+    part = capture(inputs, "m1", inputs.size // SMALLER)
+    folder = inputs.folder / f"many{suffix}"
     folder.mkdir(exist_ok=True)
     for number in range(SMALLER):
         (folder / f"{number}.pcap").hardlink_to(part)
@@ -351,7 +355,7 @@ def many(inputs: Inputs, suffix: str) -> Work:
     command = (*sorted(folder.iterdir()), out, "-s", made.sensor, "--to", suffix[1:], "--jobs")
     alone = Beside(("-m", "lidarspec", "convert", *command, 1), amount)
     size = SMALLER * part.stat().st_size
-    return written(
+    return compare_conversion(
         f"{SMALLER} captures to {suffix}, 4 processes",
         out,
         amount,
@@ -363,9 +367,9 @@ def many(inputs: Inputs, suffix: str) -> Work:
 
 CONVERSIONS: Mapping[str, Callable[[Inputs], Work]] = {
     **{
-        f"to-{key}{suffix}": partial(converting, key=key, suffix=suffix)
+        f"to-{key}{suffix}": partial(convert_one, key=key, suffix=suffix)
         for key, made in CAPTURES.items()
         for suffix in made.suffixes
     },
-    **{f"to-many{suffix}": partial(many, suffix=suffix) for suffix in (".parquet", ".csv")},
+    **{f"to-many{suffix}": partial(convert_many, suffix=suffix) for suffix in (".parquet", ".csv")},
 }

@@ -104,12 +104,14 @@ def vlp16_points(packets: Bytes) -> Floats:
     lows = np.stack([blocks.ravel(), np.where(np.abs(ahead) < 0.995, ahead, before)], axis=1)
     channels = np.ndarray((len(packets), 12), "V96", packets.data, 4, (1206, 100))
     found = np.empty((4, len(packets) * 384), np.float32)
-    compact, scratch = np.empty((VLP_CHUNK, 12), "V96"), Scratch(VLP_CHUNK * 384)
+    compact = np.empty((VLP_CHUNK, 12), "V96")
+    scratch = Scratch(VLP_CHUNK * 384)
     for start in range(0, len(packets), VLP_CHUNK):
         rows = min(VLP_CHUNK, len(packets) - start)
         count = rows * 384
         np.copyto(compact[:rows], channels[start : start + rows])
-        distance, flat = scratch.single[0][:count], scratch.single[1][:count]
+        distance = scratch.single[0][:count]
+        flat = scratch.single[1][:count]
         lookup(_metres(0.002), column(compact, 0, "<u2", 3, count), scratch, distance)
         east, north = scratch.directions(
             np.matmul(lows[start * 12 : (start + rows) * 12], shares), count
@@ -130,7 +132,8 @@ def xt32_points(packets: Bytes) -> Floats:
     Returns:
         float32, (4, n * 256); NaN if there is no return.
     """
-    elevation, offset = np.deg2rad(15.0 - np.arange(32)), np.zeros(32)
+    elevation = np.deg2rad(15.0 - np.arange(32))
+    offset = np.zeros(32)
     level, rise = (
         np.tile(row.astype(np.float32), XT_CHUNK * 8)
         for row in (np.cos(elevation), np.sin(elevation))
@@ -143,12 +146,14 @@ def xt32_points(packets: Bytes) -> Floats:
     )
     channels = np.ndarray((len(packets), 8), "V128", packets.data, 14, (1080, 130))
     found = np.empty((4, len(packets) * 256), np.float32)
-    compact, scratch = np.empty((XT_CHUNK, 8), "V128"), Scratch(XT_CHUNK * 256)
+    compact = np.empty((XT_CHUNK, 8), "V128")
+    scratch = Scratch(XT_CHUNK * 256)
     for start in range(0, len(packets), XT_CHUNK):
         rows = min(XT_CHUNK, len(packets) - start)
         count = rows * 256
         np.copyto(compact[:rows], channels[start : start + rows])
-        distance, flat = scratch.single[0][:count], scratch.single[1][:count]
+        distance = scratch.single[0][:count]
+        flat = scratch.single[1][:count]
         lookup(_metres(0.004), column(compact, 0, "<u2", 4, count), scratch, distance)
         east, north = scratch.directions(
             azimuth[start : start + rows].reshape(-1, 1) + offset, count

@@ -13,7 +13,8 @@ from handwritten_packets import CODES, Bytes, Floats, Scratch, column, lookup
 from numpy.typing import NDArray
 
 STL_CHUNK = 4096  # frames: 49,152 points
-STL_FRAME, STL_POINTS = 47, 12
+STL_FRAME = 47
+STL_POINTS = 12
 M1C1_CHUNK = 1 << 16  # points
 NODE_CHUNK = 1 << 16  # nodes
 
@@ -45,7 +46,9 @@ def _good(frames: Bytes) -> NDArray[np.bool_]:
     crc = np.zeros(len(frames), np.uint8)
     for spot, table in enumerate(_crc_tables()):
         crc ^= table.take(pairs[:, spot], mode="wrap")
-    start, end, time = pairs[:, 2], pairs[:, 21], pairs[:, 22]
+    start = pairs[:, 2]
+    end = pairs[:, 21]
+    time = pairs[:, 22]
     good: NDArray[np.bool_] = (
         (crc == frames[:, 46]) & (start < 36000) & (end < 36000) & (time <= 30_000)
     )
@@ -96,7 +99,8 @@ def stl27l_stream(data: bytes) -> Floats:
     here = here[stream[here + 1] == 0x2C]
     windows = np.lib.stride_tricks.sliding_window_view(stream, STL_FRAME)
     found = np.empty((3, len(here) * STL_POINTS), np.float32)
-    free, end = 0, 0
+    free = 0
+    end = 0
     for start in range(0, len(here), STL_CHUNK):
         spots = here[start : start + STL_CHUNK]
         rows = windows[spots]
@@ -132,7 +136,8 @@ def m1c1_points(packets: Bytes) -> Floats:
     """
     count = (packets.shape[1] - 10) // 3
     step = max(M1C1_CHUNK // count, 1)
-    scratch, end = Scratch(step * count), 0
+    scratch = Scratch(step * count)
+    end = 0
     found = np.empty((3, len(packets) * count), np.float32)
     for start in range(0, len(packets), step):
         rows = packets[start : start + step]
@@ -175,9 +180,11 @@ def _m1c1_chunk(packets: Bytes, found: Floats, start: int, scratch: Scratch) -> 
     angle = np.matmul(
         lows, np.stack([np.ones(count), np.arange(count) / max(count - 1, 1)])
     ).reshape(-1)
-    samples, size = np.ascontiguousarray(packets[:, 10:]), len(packets) * count
+    samples = np.ascontiguousarray(packets[:, 10:])
+    size = len(packets) * count
     x, y, intensity = found[:, start : start + size]
-    distance, correction = scratch.single[0][:size], scratch.single[1][:size]
+    distance = scratch.single[0][:size]
+    correction = scratch.single[1][:size]
     metres, corrections, levels = _m1c1_tables()
     lookup(metres, column(samples, 1, "<u2", 3, size), scratch, distance)
     corrections.take(scratch.index[:size], out=correction, mode="wrap")
@@ -248,11 +255,13 @@ def m1c1_stream(data: bytes) -> Floats:
 
 def rplidar_points(nodes: Bytes) -> Floats:
     """Return x, y and intensity of valid RPLIDAR nodes, (n, 5): float32, (3, n)."""
-    head, check = nodes[:, 0], nodes[:, 1]
+    head = nodes[:, 0]
+    check = nodes[:, 1]
     angle = column(nodes, 1, "<u2", 5, len(nodes))
     good = ((head ^ head >> 1) & 1 == 1) & (check & 1 == 1) & (angle < 46080)
     nodes = nodes if good.all() else np.ascontiguousarray(nodes[good])
-    found, scratch = np.empty((3, len(nodes)), np.float32), Scratch(NODE_CHUNK)
+    found = np.empty((3, len(nodes)), np.float32)
+    scratch = Scratch(NODE_CHUNK)
     cosine, sine, metres, quality = _node_tables()
     for start in range(0, len(nodes), NODE_CHUNK):
         rows = nodes[start : start + NODE_CHUNK]

@@ -19,15 +19,15 @@ from lidarspec.framing.example_frames import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Examples of each frame type that streams are made of.
+#: Number of examples of each frame type in the streams.
 EXAMPLES = 6
 #: Frames with random headers.
 RANDOM_HEADERS = 60
 #: Bytes of the head of a frame, at most.
 MAX_HEAD_BYTES = 12
-#: Random bytes behind a head, at most.
+#: Random bytes after a head, at most.
 MAX_NOISE_BYTES = 3
-#: One in so many frames comes behind its announcement if its type needs one.
+#: One in 40 frames follows its announcement, if its type needs one.
 ANNOUNCED_INTERVAL = 40
 
 

@@ -20,7 +20,7 @@ from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.simulation.simulator import make_opening_frame, simulate
 
-#: sensor, frames of a full run, what it is configured for.
+#: sensor, frames of a full run, options of the sensor.
 SENSORS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "m1": ("robosense-m1", 6300, {}),
     "stl27l": ("ldrobot-stl27l", 40_000, {}),
@@ -71,7 +71,9 @@ class Inputs:
     """
 
     def __init__(self, folder: Path, *, quick: bool = False, size: int = 0) -> None:
-        self.folder, self.is_quick, self.size = folder, quick, size
+        self.folder = folder
+        self.is_quick = quick
+        self.size = size
         self.frames: Callable[[str], list[bytes]] = functools.cache(self._frames)
         self.capture: Callable[[str], Path] = functools.cache(self._capture)
 
@@ -100,7 +102,8 @@ class Inputs:
         """
         random = np.random.default_rng(SEED)
         pieces: list[bytes | bytearray] = []
-        intact, offset = [], 0
+        intact = []
+        offset = 0
         for frame in self.frames(key):
             noise = (
                 random.bytes(int(random.integers(1, 2 * len(frame))))
@@ -123,7 +126,8 @@ class Inputs:
     def _capture(self, key: str) -> Path:
         """Return a pcap file of the frames, one datagram each."""
         path = self.folder / f"{key}.pcap"
-        sender, receiver = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
+        sender = ("192.168.1.200", 6699)
+        receiver = ("192.168.1.102", 6699)
         with path.open("wb") as file:
             file.write(capture_head(ETHERNET))
             for index, frame in enumerate(self.frames(key)):

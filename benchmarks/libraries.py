@@ -44,8 +44,10 @@ def velodyne_packets(key: str, frames: Sequence[bytes], points: int) -> Contende
 
     Its vectors of packets are made in advance.
     """
-    vd, (model, rate) = library("velodyne_decoder"), VELODYNE[key]
-    config, turn = vd.Config(), -(-rate // 10)
+    vd = library("velodyne_decoder")
+    (model, rate) = VELODYNE[key]
+    config = vd.Config()
+    turn = -(-rate // 10)
     config.model = getattr(vd.Model, model)
     packets = [vd.VelodynePacket(index / rate, frame) for index, frame in enumerate(frames)]
     scans = [
@@ -84,10 +86,11 @@ def ouster_payloads(path: Path, packets: int) -> Contender:
 
     def run() -> int:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", FutureWarning
-            )  # its successor gives packets of Ouster sensors only
-            capture, info, total = pcap.replay_initialize(str(path)), pcap.PacketInfo(), 0
+            # its successor gives packets of Ouster sensors only
+            warnings.simplefilter("ignore", FutureWarning)
+            capture = pcap.replay_initialize(str(path))
+            info = pcap.PacketInfo()
+            total = 0
             while pcap.next_packet_info(capture, info):
                 total += pcap.read_packet(capture, buffer)
             pcap.replay_uninitialize(capture)
@@ -111,13 +114,16 @@ def ouster_scans(
         for key, value in section.items()
     }
     info = core.SensorInfo(json.dumps({**flat, "data_format": metadata["lidar_data_format"]}))
-    form, table = core.PacketFormat(info), core.XYZLut(info)
+    form = core.PacketFormat(info)
+    table = core.XYZLut(info)
     packets = [core.LidarPacket(form) for _ in frames]
     for packet, frame in zip(packets, frames, strict=True):
         packet.buf[:] = np.frombuffer(frame, np.uint8)
 
     def run() -> int:
-        scan, batcher, made = core.LidarFrame(info), core.FrameBatcher(info), 0
+        scan = core.LidarFrame(info)
+        batcher = core.FrameBatcher(info)
+        made = 0
         for packet in packets:
             if batcher.batch(packet, scan):
                 made += len(table(scan))
@@ -142,7 +148,8 @@ class _Recorded:
     """A serial port for lds2d that returns recorded bytes."""
 
     def __init__(self, data: bytes) -> None:
-        self._data, self._spot = data, 0
+        self._data = data
+        self._spot = 0
 
     def read(self, size: int) -> bytes:
         if self._spot >= len(self._data):

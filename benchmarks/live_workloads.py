@@ -27,7 +27,8 @@ import lidarspec as ls
 
 SENDING = Path(__file__).with_name("rate_sender.py")
 #: seconds of one run.
-SECONDS, QUICK_SECONDS = 2.0, 0.2
+SECONDS = 2.0
+QUICK_SECONDS = 0.2
 
 
 class Line:
@@ -47,20 +48,19 @@ class Line:
         seconds: float,
         opened: Callable[[], contextlib.AbstractContextManager[Any]],
     ) -> None:
-        self._sensor, self._frames, self._rate, self._seconds, self._opened = (
-            sensor,
-            frames,
-            rate,
-            seconds,
-            opened,
-        )
+        self._sensor = sensor
+        self._frames = frames
+        self._rate = rate
+        self._seconds = seconds
+        self._opened = opened
         self.late: dict[str, list[float]] = {}
         self.share: dict[str, list[float]] = {}
 
     def run(self, backend: str) -> None:
         """Receive everything, and record the median delay in ms and the share of a core."""
         with tempfile.TemporaryDirectory() as folder, self._opened() as (source, words, kept):
-            path, times = Path(folder, "frames"), Path(folder, "times")
+            path = Path(folder, "frames")
+            times = Path(folder, "times")
             path.write_bytes(b"".join(self._frames))
             arguments = [path, len(self._frames[0]), self._rate, self._seconds, 1, times, *words]
             with ls.open(source, self._sensor, backend=backend) as device:
@@ -69,7 +69,8 @@ class Line:
                         self._frames[:2] if self._sensor.datagrams else b"".join(self._frames[:2])
                     ).points()
                 )
-                began, used = time.monotonic(), time.process_time()
+                began = time.monotonic()
+                used = time.process_time()
                 with subprocess.Popen(
                     [sys.executable, SENDING, *map(str, arguments)],
                     pass_fds=kept,
@@ -136,7 +137,8 @@ def live(
     """Return the workload of a connection at its sensor's rate for some seconds."""
     seconds = QUICK_SECONDS if inputs.is_quick else SECONDS
     frames = [row.tobytes() for row in inputs.array(key)]
-    line, number = Line(inputs.sensor(key), frames, rate, seconds, opened), int(rate * seconds)
+    line = Line(inputs.sensor(key), frames, rate, seconds, opened)
+    number = int(rate * seconds)
     return Work(
         title,
         "packets",

@@ -86,11 +86,7 @@ def columns(cloud: ls.PointCloud) -> tuple[Any, ...]:
     An engine that computes columns on access computes them here.
     """
     if cloud.shape is None:
-        return (
-            cloud.x,
-            cloud.y,
-            cloud.intensity,
-        )  # only planar sensors have no shape here
+        return cloud.x, cloud.y, cloud.intensity  # only planar sensors have no shape here
     return cloud.x, cloud.y, cloud.z, cloud.intensity
 
 
@@ -126,7 +122,8 @@ def beside_construct(inputs: Inputs, key: str) -> Others:
 
 def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
     """Return the workload of packets of one length in an array."""
-    sensor, rows = inputs.sensor(key), inputs.array(key)
+    sensor = inputs.sensor(key)
+    rows = inputs.array(key)
     points = len(sensor.decode(rows).points())
     others: Others = {
         **beside_construct(inputs, key),
@@ -195,7 +192,8 @@ def beside_velodyne_decoder(inputs: Inputs, key: str) -> Others:
 
 def velodyne(inputs: Inputs, key: str, title: str) -> Work:
     """Return the workload of packets of a model without a handwritten decoder."""
-    sensor, rows = inputs.sensor(key), inputs.array(key)
+    sensor = inputs.sensor(key)
+    rows = inputs.array(key)
     points = len(rows) * 384
     others: Others = {
         "plain": lambda: Contender(plainly(sensor, rows), points),
@@ -216,7 +214,8 @@ def ouster(inputs: Inputs) -> Work:
 
     CRCs are not verified, because ouster-sdk does not verify them.
     """
-    sensor, rows = inputs.sensor("ouster"), inputs.array("ouster").copy()
+    sensor = inputs.sensor("ouster")
+    rows = inputs.array("ouster").copy()
     rows[:, -8:] = 0
     frames = [row.tobytes() for row in rows]
     points = len(sensor.decode(rows).points())
@@ -257,7 +256,8 @@ FIXED: Mapping[str, tuple[str, Callable[[ls.Sensor, bytes], ls.Sensor], bool]] =
 def beside_fixed(inputs: Inputs, key: str) -> Work:
     """Return the workload of the sensor's frames, compared with fields at fixed offsets."""
     title, made, is_stream = FIXED[key]
-    sensor, simple = inputs.sensor(key), made(inputs.sensor(key), inputs.frames(key)[0])
+    sensor = inputs.sensor(key)
+    simple = made(inputs.sensor(key), inputs.frames(key)[0])
     data: Any = b"".join(inputs.frames(key)) if is_stream else inputs.array(key)
     points = len(sensor.decode(data).points())
     return Work(
@@ -275,7 +275,8 @@ def beside_fixed(inputs: Inputs, key: str) -> Work:
 
 def in_text(inputs: Inputs, key: str, title: str) -> Work:
     """Return the workload of a stream of frames in text."""
-    sensor, data = inputs.sensor(key), b"".join(inputs.frames(key))
+    sensor = inputs.sensor(key)
+    data = b"".join(inputs.frames(key))
     points = len(sensor.decode(data).points())
     others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}
     return Work(
@@ -295,7 +296,8 @@ def stl27l_stream(inputs: Inputs) -> Work:
 
     Undamaged frames that are not found are counted.
     """
-    noisy, sensor = inputs.noisy("stl27l"), inputs.sensor("stl27l")
+    noisy = inputs.noisy("stl27l")
+    sensor = inputs.sensor("stl27l")
     frames = inputs.frames("stl27l")[:FEW]
     more: Others = {
         "lds2d": lambda: libraries.lds2d_stream("LD14P", b"".join(frames), 12 * len(frames))

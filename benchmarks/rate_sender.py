@@ -35,10 +35,16 @@ def main(
     path: str, size: str, rate: str, seconds: str, burst: str, times: str, kind: str, where: str
 ) -> None:
     """Send the frames, print their number, and wait a moment before closing."""
-    data, step, per_second = Path(path).read_bytes(), int(size), float(rate)
+    data = Path(path).read_bytes()
+    step = int(size)
+    per_second = float(rate)
     frames = [data[start : start + step] for start in range(0, len(data), step)]
-    number, together, send = int(per_second * float(seconds)), int(burst), sender(kind, where)
-    sent_at, began, sent = array("q"), time.monotonic(), 0
+    number = int(per_second * float(seconds))
+    together = int(burst)
+    send = sender(kind, where)
+    sent_at = array("q")
+    began = time.monotonic()
+    sent = 0
     while sent < number:
         due = min(
             int((time.monotonic() - began) * per_second) // together * together + together, number

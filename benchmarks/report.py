@@ -53,7 +53,8 @@ def _caption(versions: Mapping[str, str]) -> str:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    ratios, share = row["times"], row["share_of_memcpy"]
+    ratios = row["times"]
+    share = row["share_of_memcpy"]
     return [
         row["title"],
         row["backend"],

@@ -33,7 +33,7 @@ import lidarspec as ls
 from lidarspec.framing.decoder import BACKENDS
 
 WORKS = {**ON_BYTES, **ELSEWHERE, **ON_LINES, **CONVERSIONS}
-#: distributions whose versions are shown.
+#: distributions to show with their versions.
 LIBRARIES = (
     "construct",
     "numpy",
@@ -48,10 +48,12 @@ LIBRARIES = (
 LEAST_RUNS = 5
 RUNS = 7
 LEAST_SECONDS = 0.05  # of a run
-SIZE, QUICK_SIZE = 1000, 20  # MB of a capture that is converted
+#: the size of a capture that is converted.
+SIZE_MB = 1000
+QUICK_SIZE_MB = 20
 
 
-def working() -> list[str]:
+def find_backends() -> list[str]:
     """Return the back ends available here; "auto" represents one of them."""
     sensor = ls.sensor("ldrobot-stl27l")
     found = []
@@ -80,7 +82,9 @@ def rows(
     """Yield the rows of a workload, one for each back end, measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.prepare_others()
-    runs, least = (1, 0.0) if work.after else (runs, least)
+    if work.after:
+        runs = 1
+        least = 0.0
     ours = {
         backend: {
             "ours": Contender(work.ours(backend), work.amount, work.after),
@@ -195,7 +199,10 @@ def arguments() -> argparse.Namespace:
         "--best", action="store_true", help="show the best run of each contender, not the median"
     )
     parser.add_argument(
-        "--size", metavar="MB", type=int, help=f"of each capture that is converted; default: {SIZE}"
+        "--size",
+        metavar="MB",
+        type=int,
+        help=f"of each capture that is converted; default: {SIZE_MB}",
     )
     parser.add_argument(
         "--quick",
@@ -205,7 +212,7 @@ def arguments() -> argparse.Namespace:
     given = parser.parse_args()
     if given.runs < LEAST_RUNS:
         parser.error(f"--runs is {LEAST_RUNS} or more")
-    given.size = 1_000_000 * (given.size or (QUICK_SIZE if given.quick else SIZE))
+    given.size = 1_000_000 * (given.size or (QUICK_SIZE_MB if given.quick else SIZE_MB))
     if given.only:
         given.works = [name for name in WORKS if name.startswith(tuple(given.only))]
     else:
@@ -218,13 +225,11 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Run the benchmarks; return 1 if an undamaged frame was lost, otherwise 0."""
     given = arguments()
-    backends = given.backend or working()
+    backends = given.backend or find_backends()
     found: list[dict[str, Any]] = []
     copy = memcpy(quick=given.quick)
-    least, clock = (
-        (0.0 if given.quick else LEAST_SECONDS),
-        (cpu_seconds if given.cpu else time.perf_counter),
-    )
+    least = 0.0 if given.quick else LEAST_SECONDS
+    clock = cpu_seconds if given.cpu else time.perf_counter
     with tempfile.TemporaryDirectory() as folder:
         for name in given.works:
             print(f"{name} ...", file=sys.stderr)
@@ -234,11 +239,15 @@ def main() -> int:
                 print(f"{name}: left out: {missing}", file=sys.stderr)
                 continue
             found += rows(name, work, backends, copy, runs=given.runs, least=least, clock=clock)
-    what = f"{'best runs' if given.best else 'medians'}{', processor time' if given.cpu else ''}"
+    title = "best runs" if given.best else "medians"
+    if given.cpu:
+        title += ", processor time"
+    if given.quick:
+        title = "quick: these figures mean nothing"
     print_rows(
         found,
         versions(),
-        title="quick: these figures mean nothing" if given.quick else what,
+        title=title,
         best=given.best,
     )
     if given.json:
