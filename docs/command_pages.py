@@ -24,8 +24,10 @@ from lidarspec import __version__
 from lidarspec.cli.root import COMMON_OPTIONS, VERBS, main as root
 
 DOCS = Path(__file__).parent
-PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
-BEGIN, END = "<!--generated-->", "<!--end-->"
+PAGE = "reference/command-line.md"
+NODE = "reference/ros2.md"
+BEGIN = "<!--generated-->"
+END = "<!--end-->"
 SHARED = "Shared options"
 #: Options with one meaning in all verbs; they are described once. "output" belongs to verbs that
 #: print a result: `-o` of the others has a row of its own.
@@ -160,24 +162,25 @@ def node(text: str) -> str:
         is_empty = parameter.default in ("", [""], 0.0) and parameter.default is not False
         default = "" if is_empty else f" [default: {json.dumps(parameter.default)}]"
         rows.append(f"* {name}: {parameter.text}{default}")
-    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    before = text.partition(BEGIN)[0]
+    after = text.partition(END)[2]
     return "\n".join([f"{before}{BEGIN}", "", *rows, "", f"{END}{after}"])
 
 
 def manual(verb: str) -> str:
     """Return the manual page of a verb; of the command itself if the name is ""."""
     name = f"lidarspec-{verb}" if verb else "lidarspec"
-    said = paragraphs(verb)
+    description = paragraphs(verb)
     lines = [
         f'.TH {name.upper()} 1 "" "lidarspec {__version__}" "lidarspec"',
         ".SH NAME",
-        f"{name} \\- {_roff(said[0])}",
+        f"{name} \\- {_roff(description[0])}",
     ]
     lines += [
         ".SH SYNOPSIS",
         _roff(usage(verb)),
         ".SH DESCRIPTION",
-        "\n.PP\n".join(map(_roff, said)),
+        "\n.PP\n".join(map(_roff, description)),
     ]
     terms = [(".SH OPTIONS", options(verb))] if options(verb) else []
     if not verb:

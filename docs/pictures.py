@@ -33,9 +33,14 @@ from lidarspec.view.svg import svg
 from lidarspec.view.terminal_window import FIGURES_PERIOD_S, Window
 
 HERE = Path(__file__).parent / "pictures"
-#: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.
-SIZE, SCHEME, SETTLED, COLOURS = (1280, 800), "dark", 9_000, 256
-#: of Chromium, which draws in software.
+#: the size of the page, pixels.
+SIZE = (1280, 800)
+SCHEME = "dark"
+#: how long the page runs before the screenshot, milliseconds.
+RUN_MS = 10_800
+#: the number of colours of the PNG.
+COLOURS = 256
+#: options of Chromium: it draws in software.
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -56,9 +61,7 @@ def terminal(folder: Path) -> str:
         feed = LiveScans(device)
         window = Window(feed, "/dev/ttyUSB0")
         feed.read(0.0)
-        time.sleep(
-            FIGURES_PERIOD_S
-        )  # after which the window reads its figures, which are by the packets' own times
+        time.sleep(FIGURES_PERIOD_S)  # then the window reads its figures
         return drawn(window.cells(92, 28))
 
 
@@ -80,11 +83,12 @@ def packet() -> str:
     return diagram(select_frame(ls.sensor("ldrobot-stl27l"), "data"))
 
 
-def page(folder: Path, target: Path) -> None:
-    """Return a screenshot of the page while it plays a file, with the newest frame.
+def write_page(folder: Path, target: Path) -> None:
+    """Write a screenshot of the page while it plays a file, as PNG with few colours.
 
-    Returns:
-        PNG with few colours.
+    Args:
+        folder: folder for the file that is played.
+        target: the PNG.
     """
     from PIL import Image
     from playwright.sync_api import sync_playwright
@@ -116,8 +120,7 @@ def page(folder: Path, target: Path) -> None:
                 viewport={"width": SIZE[0], "height": SIZE[1]}, color_scheme=SCHEME
             )
             seen.goto(serving.stdout.readline().strip())
-            seen.wait_for_timeout(SETTLED)
-            seen.wait_for_timeout(SETTLED / 5)
+            seen.wait_for_timeout(RUN_MS)
             seen.screenshot(path=target)
         finally:
             browser.close()
@@ -139,7 +142,7 @@ def main() -> None:
     given.into.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         if given.page:
-            page(Path(folder), given.into / "page.png")
+            write_page(Path(folder), given.into / "page.png")
             return
         pictures = {"terminal": terminal(Path(folder)), "cloud": cloud(), "packet": packet()}
     for name, text in pictures.items():

@@ -28,9 +28,13 @@ from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.terminal_window import Window
 
 HERE = Path(__file__).parent / "how-to" / "screens"
-#: pixels of a cell, of the margin, and of a dot.
-ACROSS, DOWN, MARGIN, DOT = 8, 16, 12, 2.3
-GROUND, PLAIN = "#101218", "#d8dae0"
+#: the size of a cell, of the margin, and of a dot, pixels.
+CELL_WIDTH = 8
+CELL_HEIGHT = 16
+MARGIN = 12
+DOT = 2.3
+BACKGROUND = "#101218"
+FOREGROUND = "#d8dae0"
 #: The sensor's port in the pages' commands.
 PORT = "/dev/ttyUSB0"
 
@@ -62,7 +66,8 @@ def svg(cells: CellGrid) -> str:
     Braille is drawn dot by dot, because in few fonts it is as wide as letters.
     """
     columns, lines = cells.size
-    width, height = columns * ACROSS + 2 * MARGIN, lines * DOWN + 2 * MARGIN
+    width = columns * CELL_WIDTH + 2 * MARGIN
+    height = lines * CELL_HEIGHT + 2 * MARGIN
     return "\n".join(
         [
             (
@@ -71,7 +76,7 @@ def svg(cells: CellGrid) -> str:
                 ' monospace" font-size="13">'
             ),
             (
-                f'<rect width="100%" height="100%" rx="8" fill="{GROUND}"/><g'
+                f'<rect width="100%" height="100%" rx="8" fill="{BACKGROUND}"/><g'
                 f' transform="translate({MARGIN} {MARGIN})">'
             ),
             *_dots(cells),
@@ -90,7 +95,7 @@ def _dots(cells: CellGrid) -> Iterator[str]:
         for bit, (across, down) in enumerate(places):
             found = np.argwhere((bits >> bit & 1) & (cells.inks == ink)).tolist()
             path += [
-                f"M{column * ACROSS + across * 4 + 2} {row * DOWN + down * 4 + 2}h0"
+                f"M{column * CELL_WIDTH + across * 4 + 2} {row * CELL_HEIGHT + down * 4 + 2}h0"
                 for row, column in found
             ]
         yield (
@@ -112,8 +117,8 @@ def _texts(cells: CellGrid) -> Iterator[str]:
             if ink >= 0:
                 weight = ' font-weight="bold"' if INKS[ink].bold else ""
                 yield (
-                    f'<text x="{start * ACROSS}" y="{row * DOWN + 12}"'
-                    f' textLength="{(end - start) * ACROSS}" lengthAdjust="spacingAndGlyphs"'
+                    f'<text x="{start * CELL_WIDTH}" y="{row * CELL_HEIGHT + 12}"'
+                    f' textLength="{(end - start) * CELL_WIDTH}" lengthAdjust="spacingAndGlyphs"'
                     f' fill="{_colour(ink)}"{weight}>{escape(line[start:end])}</text>'
                 )
             start = end
@@ -121,7 +126,7 @@ def _texts(cells: CellGrid) -> Iterator[str]:
 
 def _colour(ink: int) -> str:
     rgb = INKS[ink].rgb
-    return PLAIN if rgb is None else "#" + "".join(f"{part:02x}" for part in rgb)
+    return FOREGROUND if rgb is None else "#" + "".join(f"{part:02x}" for part in rgb)
 
 
 def main() -> None:

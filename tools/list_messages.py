@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 _PROSE = re.compile(r"[A-Za-z]\S*\s+\S*[a-z]|[a-z]{3,}\S*\s+\S")
 #: characters of regular expressions, formats of code and SQL, which are no prose.
 _CODE = re.compile(r"\(\?|\\[dswb]|\[\^|^\s*(?:SELECT|CREATE|INSERT|PRAGMA)\b|[{};]\s*\n|^\s*<|</")
-#: calls whose strings nobody reads as text.
+#: calls with strings that are not text for a reader.
 _NOT_READ = {"compile", "sub", "match", "fullmatch", "split", "strip", "replace", "writelines"}
 
 
@@ -67,7 +67,8 @@ def _text(node: ast.AST) -> str | None:
         ]
         return "".join(parts)
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        left, right = _text(node.left), _text(node.right)
+        left = _text(node.left)
+        right = _text(node.right)
         if left is None and right is None:
             return None
         return (left or "{}") + (right or "{}")
