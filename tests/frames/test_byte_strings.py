@@ -459,7 +459,7 @@ def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str)
         sensor(Struct("k" / Int8ub, part))
     assert instead in str(caught.value)
     for named in ("v" / part, "v" / Sequence(Int8ub, part)):
-        with pytest.raises(SpecError, match="^v: ") as caught:
+        with pytest.raises(SpecError, match=r"^v: ") as caught:
             sensor(Struct("k" / Int8ub, named))
         assert instead in str(caught.value)
 
