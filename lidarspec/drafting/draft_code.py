@@ -458,7 +458,7 @@ def _iter_sensor_arguments(angles: Sequence[str], counters: Sequence[RisingField
         if counter.wraps:
             limits = f", first={counter.first}, last={counter.circle - 1}"
         alternatives = _format_alternatives(";", [other.name for other in counters[1:]])
-        yield f'sequence=Sequence("{counter.name}"{limits}),  # a jump is a loss{alternatives}'
+        yield f'sequence=PacketCounter("{counter.name}"{limits}),  # a jump is a loss{alternatives}'
 
 
 def _format_alternatives(begin: str, names: Sequence[str]) -> str:
@@ -488,7 +488,8 @@ def _make_imports(text: dict[str, str]) -> dict[str, str]:
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}
     )
     names = re.findall(
-        r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b",
+        r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|PacketCounter|Scaled|Serial|Sum|Udp|WordXor"
+        r"|Xor)\b",
         code,
     )
     own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *names}

@@ -30,7 +30,7 @@ from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.timing import Clock, Sequence
+from lidarspec.spec.timing import Clock, PacketCounter
 
 #: the number of places that a packet may be late; if it is further back, the sensor restarted.
 MAX_PLACES_LATE = 64
@@ -121,7 +121,7 @@ class CounterOrder:
 
     def __init__(self, sensor: SensorDescription, stats: Counters, clock: Clock | None) -> None:
         assert sensor.sequence is not None
-        self._rule: Sequence = sensor.sequence
+        self._rule: PacketCounter = sensor.sequence
         self._clock = clock if clock is not None and clock.pace is not None else None
         self._stats = stats
         self._gaps = MaskedGaps(sensor)

@@ -79,7 +79,7 @@ if TYPE_CHECKING:
         OnJump as OnJump,
         OnRewind as OnRewind,
         OnWrap as OnWrap,
-        Sequence as Sequence,
+        PacketCounter as PacketCounter,
         unix_time as unix_time,
     )
     from lidarspec.spec.vocabulary import (
@@ -128,7 +128,7 @@ _NAMES = {
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": (
         "Clock",
-        "Sequence",
+        "PacketCounter",
         "OnWrap",
         "OnFlag",
         "OnChange",

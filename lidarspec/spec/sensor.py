@@ -42,7 +42,7 @@ from lidarspec.spec.description import (
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
-from lidarspec.spec.timing import Clock, OnChange, OnWrap, Sequence, Split
+from lidarspec.spec.timing import Clock, OnChange, OnWrap, PacketCounter, Split
 from lidarspec.trusted_files import resolve_beside
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class SensorDescription:
     links: Mapping[str, Link] = field(kw_only=True)
     commands: Mapping[str, Command] = field(default_factory=dict, kw_only=True)
     clock: Clock | None = field(default=None, kw_only=True)
-    sequence: Sequence | None = field(default=None, kw_only=True)
+    sequence: PacketCounter | None = field(default=None, kw_only=True)
     fillers: bytes = field(default=b"", kw_only=True)
     state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
     simulation: Simulation = field(default_factory=Simulation, kw_only=True)

@@ -142,7 +142,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class PacketCounter:
     """A counter of packets. A jump is a loss.
 
     If a clock with a declared pace shows no gap, the jump is not a loss.

@@ -108,7 +108,7 @@ LS506 angles are not in order | scans are cut in the wrong places | use the manu
 LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`
 LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail | return the raw angles and counters of packet i
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
-LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare Sequence(field, first=, last=)
+LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare PacketCounter(field, first=, last=)
 LS511 points turn the other way | left and right are exchanged, or vendor_axes differ from the manual
       | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds

@@ -19,7 +19,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import errors, plugins as hookspecs, spec
 from lidarspec.cli.root import VERBS
-from lidarspec.spec import Checksummed, Clock, Command, Frame, Polar, Scaled, Sequence
+from lidarspec.spec import Checksummed, Clock, Command, Frame, PacketCounter, Polar, Scaled
 from tests.docs import pages
 from tests.docs.pages import DOCS
 
@@ -144,7 +144,7 @@ def public_errors() -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar]
+    "value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, PacketCounter, Polar]
 )
 def test_every_argument_of_the_authors_api_is_documented(value: type) -> None:
     arguments = (inspect.getdoc(value) or "").partition("Args:")[2]

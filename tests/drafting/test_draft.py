@@ -20,7 +20,7 @@ from lidarspec.drafting.periods import find_rising_fields
 from lidarspec.drafting.samples import ChecksumPlace
 from lidarspec.expressions.columns import align
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
+from lidarspec.spec import Checksum, Crc, Fold15, PacketCounter, Sum, WordXor, Xor
 from lidarspec.transports.open_url import open_transport
 from tests.cli.running import ran
 from tests.evidence import capture
@@ -225,7 +225,7 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
         "this.count",
         "class Check(Checksum):",
         "deg2rad(f.angle_4)",
-        "Sequence(",
+        "PacketCounter(",
         "confirm=2",
         "over=(",
     ):
@@ -306,7 +306,7 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
     (tmp_path / "some.bin").write_bytes(data)
     sensor = module(tmp_path, tmp_path / "some.bin")
     assert (sensor.sequence, share(sensor, tmp_path / "some.bin")) == (
-        Sequence("counter_1", first=0xA0, last=0xF9),
+        PacketCounter("counter_1", first=0xA0, last=0xF9),
         1.0,
     )
     assert sensor.decode(data[: 22 * 50] + data[22 * 53 :]).stats.lost == 3
@@ -463,7 +463,7 @@ def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> N
         for i in range(200)
     ]
     assert (
-        'sequence=Sequence("counter_4"),  # a jump is a loss; or counter_2'
+        'sequence=PacketCounter("counter_4"),  # a jump is a loss; or counter_2'
         in written(frames)["arguments"]
     )
 

@@ -13,7 +13,7 @@ import pytest
 from construct import Array, Const, Int8ub, Int16ub, Int32ub, Struct, this
 
 from lidarspec import PointCloud, SpecError
-from lidarspec.spec import Clock, Fields, OnChange, Polar, Scaled, Sequence, running, take
+from lidarspec.spec import Clock, Fields, OnChange, PacketCounter, Polar, Scaled, running, take
 from tests.by_construct import reader
 from tests.engine import against_construct
 
@@ -81,7 +81,7 @@ def test_elements_of_arrays_are_fields(engine: str) -> None:
 @pytest.mark.parametrize("engine", ["construct", "auto"])
 def test_clocks_counters_and_cuts_are_elements_too_in_integers(engine: str) -> None:
     times = [4_000_000_001, 4_000_000_004, 4_000_000_013, 4_000_000_016]
-    counted = replace(SENSOR, sequence=Sequence("columns[3].number"))
+    counted = replace(SENSOR, sequence=PacketCounter("columns[3].number"))
     packets = reader(counted, engine).decode(
         b"".join(frame(1, time, number) for number, time in zip([0, 1, 4, 5], times, strict=True)),
     )

@@ -11,7 +11,7 @@ from construct import Array, Int8ub, Int16ul, Int64ul, Struct
 
 from lidarspec import SpecError
 from lidarspec.packets.clocks import Unwrapper
-from lidarspec.spec import Clock, Scaled, Sequence
+from lidarspec.spec import Clock, PacketCounter, Scaled
 from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, sensor
 
@@ -95,7 +95,7 @@ def wide(numbers: Iterable[int]) -> list[bytes]:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_counter_of_64_bits_counts_losses_and_starts_again(first: int, backend: str) -> None:
     counted = dataclasses.replace(
-        sensor(Struct("n" / Int64ul, "d" / Int8ub)), sequence=Sequence("n", first=first)
+        sensor(Struct("n" / Int64ul, "d" / Int8ub)), sequence=PacketCounter("n", first=first)
     )
     turn = [2**63 - 1, 2**63, 2**64 - 2, 2**64 - 1, first, first + 1]
     for numbers, lost in (

@@ -14,7 +14,7 @@ from construct import Array, Const, Int8ul, Struct, this
 
 import lidarspec
 from lidarspec import Sensor, SpecError, simulate
-from lidarspec.spec import Cartesian, Fields, Frame, Polar, Sequence, Simulation
+from lidarspec.spec import Cartesian, Fields, Frame, PacketCounter, Polar, Simulation
 from tests.by_construct import reader
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths
@@ -80,7 +80,7 @@ def test_only_frames_with_the_counter_are_counted() -> None:
 
 
 def test_a_counter_that_no_data_frame_has_is_an_error_of_the_plugin() -> None:
-    wrong = replace(lengths.SENSOR, sequence=Sequence("countre"))
+    wrong = replace(lengths.SENSOR, sequence=PacketCounter("countre"))
     assert wrong.decode(simulate(PLAIN, 2)).stats.plugin_errors == 2  # packets
 
 

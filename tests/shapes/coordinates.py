@@ -19,8 +19,8 @@ from lidarspec.spec import (
     Every,
     Fields,
     Frame,
+    PacketCounter,
     Scaled,
-    Sequence,
     Simulation,
     Udp,
 )
@@ -52,7 +52,7 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
         scan=Every(0.1),
         links={"data": Udp(56_300)},
         clock=Clock("time", wraps_at=655.36),
-        sequence=Sequence("number"),
+        sequence=PacketCounter("number"),
         simulation=Simulation(
             lambda i: dict(number=i % 65_536, time=i / RATE % 655.36, count=POINTS),
             directions=directions,

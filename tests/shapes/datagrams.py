@@ -6,7 +6,7 @@ import numpy as np
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Udp
+from lidarspec.spec import Fields, Frame, OnWrap, PacketCounter, Polar, Scaled, Udp
 
 BLOCKS, CHANNELS = 4, 3
 
@@ -53,7 +53,7 @@ SENSOR = Sensor(
     points=points,
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(7001, 7002)},
-    sequence=Sequence("number", first=1, last=200),
+    sequence=PacketCounter("number", first=1, last=200),
     state={"info": {"elevation": np.array([0.0, 1.0, 2.0])}},
     range_limits=(0.2, 100.0),
     status="manual",

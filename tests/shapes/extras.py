@@ -27,9 +27,9 @@ from lidarspec.spec import (
     Extra,
     Fields,
     Frame,
+    PacketCounter,
     Polar,
     Scaled,
-    Sequence,
     Simulation,
     Udp,
     Xor,
@@ -100,7 +100,7 @@ SENSOR = Sensor(
     scan=Every(0.1),
     links={"data": Udp(56_310)},
     clock=Clock("time", wraps_at=4294.967296, pace=lambda f: PACE_S),
-    sequence=Sequence("number"),
+    sequence=PacketCounter("number"),
     simulation=Simulation(
         lambda i: {
             "number": i % 65_536,

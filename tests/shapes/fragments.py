@@ -15,9 +15,9 @@ from lidarspec.spec import (
     Fields,
     Frame,
     OnWrap,
+    PacketCounter,
     Polar,
     Scaled,
-    Sequence,
     Simulation,
     SizeOf,
     Udp,
@@ -69,7 +69,7 @@ SENSOR = Sensor(
             7780, assembled=Assembled(FRAGMENT, key="message", index="index", count="count")
         )
     },
-    sequence=Sequence("counter"),
+    sequence=PacketCounter("counter"),
     simulation=Simulation(sweep),
     range_limits=(0.05, 30.0),
     status="manual",

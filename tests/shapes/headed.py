@@ -15,7 +15,7 @@ import numpy as np
 from construct import Array, Const, If, Int8ul, Int16ul, Struct, this
 
 from lidarspec import Sensor
-from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
+from lidarspec.spec import Fields, Frame, OnWrap, PacketCounter, Polar, Scaled, Simulation, Udp
 
 CHANNELS = 3
 EXAMPLE = Path(__file__).with_name("calibration.json")
@@ -83,7 +83,7 @@ SENSOR = Sensor(
     points=points_with([-1.0, 0.0, 1.0], nominal=True),
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(7004)},
-    sequence=Sequence("counter"),
+    sequence=PacketCounter("counter"),
     simulation=Simulation(sweep),
     configure=configure,
     range_limits=(0.1, 60.0),

@@ -11,7 +11,7 @@ import numpy as np
 from construct import Array, Const, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Sequence, Simulation, Udp
+from lidarspec.spec import Fields, Frame, OnWrap, PacketCounter, Polar, Scaled, Simulation, Udp
 
 PLAIN = Struct(
     "magic" / Const(b"LN"),
@@ -41,7 +41,7 @@ SENSOR = Sensor(
     points=points,
     scan=OnWrap("azimuth"),
     links={"data": Udp(7003)},
-    sequence=Sequence("counter"),
+    sequence=PacketCounter("counter"),
     simulation=Simulation(sweep),
     range_limits=(0.1, 60.0),
     status="manual",

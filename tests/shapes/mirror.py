@@ -11,7 +11,7 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Struct
 
 from lidarspec import Sensor
-from lidarspec.spec import Fields, Frame, OnJump, Polar, Scaled, Sequence, Simulation, Udp
+from lidarspec.spec import Fields, Frame, OnJump, PacketCounter, Polar, Scaled, Simulation, Udp
 
 ROWS, PER_FACE, STEP = 3, 20, 1.5  # rows of a packet and of a face, degrees between two of them
 FACES = (150.0, 345.0)  # where they begin; a sector has 28.5 degrees, and the second goes on past 0
@@ -58,7 +58,7 @@ SENSOR = Sensor(
     points=points,
     scan=OnJump("rows.angle", 10.0),
     links={"data": Udp(7043)},
-    sequence=Sequence("counter"),
+    sequence=PacketCounter("counter"),
     simulation=Simulation(sweep),
     range_limits=(0.01, 60.0),
     status="manual",

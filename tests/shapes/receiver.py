@@ -13,8 +13,8 @@ from lidarspec.spec import (
     Command,
     Fields,
     Frame,
+    PacketCounter,
     Scaled,
-    Sequence,
     Serial,
     Simulation,
     Sum,
@@ -89,7 +89,7 @@ SENSOR = Sensor(
         )
     },
     clock=Clock("time", wraps_at=3600.0),
-    sequence=Sequence("number"),
+    sequence=PacketCounter("number"),
     info={"temperature": "warmth.temperature"},
     status="manual",
     source="invented for the tests: a device without points",

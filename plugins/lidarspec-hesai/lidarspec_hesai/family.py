@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from lidarspec.spec import Clock, Frame, OnWrap, Points, Sensor, Sequence, Simulation, Udp
+from lidarspec.spec import Clock, Frame, OnWrap, PacketCounter, Points, Sensor, Simulation, Udp
 from lidarspec_hesai import ptc
 from lidarspec_hesai.calibration import Calibration, configure
 from lidarspec_hesai.parts import SPEED_LIMITS_HZ, clock
@@ -46,7 +46,7 @@ def make_spinning_sensor(
         links={"data": Udp(2368), "control": ptc.CONTROL},
         commands=ptc.make_commands((300, 1200)),
         on_open=("get_calibration",),
-        sequence=Sequence("sequence"),
+        sequence=PacketCounter("sequence"),
         simulation=Simulation(
             sweep, answers={"get_calibration": (("answer", {"payload": table.to_file()}),)}
         ),

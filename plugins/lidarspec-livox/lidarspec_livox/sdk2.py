@@ -46,11 +46,11 @@ from lidarspec.spec import (
     Every,
     Fields,
     Frame,
+    PacketCounter,
     Parts,
     Relative,
     Scaled,
     Sensor,
-    Sequence,
     Simulation,
     SizeOf,
     Udp,
@@ -587,7 +587,7 @@ def make_lidar(name: str) -> Sensor:
         },
         # the counter restarts with each frame, and frames have no fixed number of packets
         clock=Clock("timestamp", pace=lambda f: f.time_interval),
-        sequence=Sequence("udp_cnt"),
+        sequence=PacketCounter("udp_cnt"),
         simulation=make_simulation(
             rate,
             view,

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
 
-from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled, Sensor, Sequence, Simulation
+from lidarspec.spec import Fields, Frame, PacketCounter, Polar, Relative, Scaled, Sensor, Simulation
 from lidarspec_robosense.rotor import (
     COMMON,
     DIFOP_HEAD,
@@ -216,7 +216,7 @@ HELIOS_16P = Sensor(
         "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
     },
     points=points_16p,
-    sequence=Sequence("bottom_packet_count"),
+    sequence=PacketCounter("bottom_packet_count"),
     state=HELIOS_16P_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=2, lidar_type=TYPE_1615)),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model

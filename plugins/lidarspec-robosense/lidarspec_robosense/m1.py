@@ -44,10 +44,10 @@ from lidarspec.spec import (
     Fields,
     Frame,
     OnRewind,
+    PacketCounter,
     Polar,
     Scaled,
     Sensor,
-    Sequence,
     Simulation,
     Udp,
 )
@@ -250,7 +250,7 @@ M1 = Sensor(
     scan=OnRewind("pkt_psn"),
     links={"data": Udp(6699, 7788)},
     clock=Clock(("seconds", "microseconds"), pace=pace),
-    sequence=Sequence("pkt_psn", first=1, last=packets_per_frame),
+    sequence=PacketCounter("pkt_psn", first=1, last=packets_per_frame),
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),

@@ -37,9 +37,9 @@ from lidarspec.spec import (
     Fields,
     Frame,
     Imu,
+    PacketCounter,
     Polar,
     Scaled,
-    Sequence,
     Simulation,
     stack,
 )
@@ -187,7 +187,7 @@ def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
         dual: the return modes with twice as many packets in a frame.
     """
     return {
-        "sequence": Sequence(
+        "sequence": PacketCounter(
             "pkt_psn", first=model.first, last=partial(last_packet_number, model=model, dual=dual)
         ),
         "clock": Clock(("seconds", "microseconds"), pace=partial(pace, model=model, dual=dual)),

@@ -10,7 +10,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct
 
 import lidarspec as ls
-from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sequence, Udp
+from lidarspec.spec import Clock, Fields, Frame, OnRewind, PacketCounter, Polar, Scaled, Udp
 from tests.evidence import assert_points, decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -316,7 +316,7 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
         frames={"data": Frame(struct, data=True, max_length=103)},
         points=points,
         clock=Clock("micros"),
-        sequence=Sequence("turn"),
+        sequence=PacketCounter("turn"),
         scan=OnRewind("turn"),
         info={},
     )

@@ -38,11 +38,11 @@ from lidarspec.spec import (
     Frame,
     Imu,
     OnChange,
+    PacketCounter,
     Parts,
     Polar,
     Scaled,
     Sensor,
-    Sequence,
     Simulation,
     Udp,
 )
@@ -252,7 +252,7 @@ def make_scanner(name: str) -> Sensor:
         points=None,
         scan=OnChange("modules.turn"),
         clock=Clock("modules.start_time[0]"),
-        sequence=Sequence("counter"),
+        sequence=PacketCounter("counter"),
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
         relatives={

@@ -26,9 +26,9 @@ from lidarspec.spec import (
     Frame,
     OnChange,
     OnFlag,
+    PacketCounter,
     Relative,
     Sensor,
-    Sequence,
     Simulation,
     Tcp,
 )
@@ -187,7 +187,7 @@ def make_scanner(name: str) -> Sensor:
         if len(kind.layers) == 1
         else OnFlag("layer", kind.layers[0]),
         clock=Clock("time", wraps_at=CLOCK_WRAP_S),
-        sequence=Sequence("telegram_counter"),
+        sequence=PacketCounter("telegram_counter"),
         links={"data": Tcp(2112)},
         commands=make_commands("scan"),
         on_open=("start",),
