@@ -18,7 +18,7 @@ from pathlib import Path
 #: own layer, all others have their package's. Imports within functions and for types also count.
 LAYERS = (
     "_version notebook_display errors optional_libraries"
-    " trusted_files remote_files entry_points known_sensors",
+    " trusted_files remote_files entry_points known_sensors leap_seconds",
     "transports.protocol",  # what a source is, as values that plugins give too
     "spec",
     "frames",

@@ -1,0 +1,155 @@
+"""Leap seconds: the offsets of TAI and GPS time from UTC.
+
+TAI and GPS time count every second; UTC falls behind them by one second at each leap second. GPS
+time is always 19 s behind TAI. The dates are in a table of the operating system or of the package
+tzdata, in one of two formats: `leapseconds` (the time zone compiler's) and `leap-seconds.list`
+(NTP's). The table with the latest expiry date is used. Without a table, the offsets since 2017
+apply to all times.
+
+Source: IERS Bulletin C; tz database, `leapseconds`; NIST, `leap-seconds.list`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import zoneinfo
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+#: TAI minus UTC since 2017, and before the first leap second in 1972, s.
+CURRENT_TAI_OFFSET_S = 37
+FIRST_TAI_OFFSET_S = 10
+#: TAI minus GPS time, s.
+TAI_MINUS_GPS_S = 19
+#: Seconds from 1900, where NTP counts from, to 1970; and to 1980-01-06, where GPS time begins.
+NTP_EPOCH_S = 2_208_988_800
+GPS_EPOCH_S = 315_964_800
+FILES = ("leapseconds", "leap-seconds.list")
+
+
+@dataclass(frozen=True)
+class LeapSeconds:
+    """The offset of TAI from UTC at any time since 1972.
+
+    Attributes:
+        starts_s: the times from which on the offsets apply, seconds since 1970, ascending.
+        offsets_s: TAI minus UTC from each of these times on, s.
+        expires_s: the time from which on the table may lack a leap second, seconds since 1970; None
+            if it does not expire.
+        path: the file with the table; "" for the built-in offset.
+    """
+
+    starts_s: tuple[int, ...]
+    offsets_s: tuple[int, ...]
+    expires_s: int | None = None
+    path: str = ""
+
+    def tai_minus_utc(self, utc_s: float) -> int:
+        """Return TAI minus UTC in seconds at a time, seconds since 1970 in UTC."""
+        index = bisect_right(self.starts_s, utc_s) - 1
+        return self.offsets_s[max(index, 0)]
+
+    def gps_minus_utc(self, utc_s: float) -> int:
+        """Return GPS time minus UTC in seconds at a time, seconds since 1970 in UTC."""
+        return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
+
+    def utc_from_tai(self, tai_s: float) -> float:
+        """Return the UTC of a time in TAI; both are seconds since 1970.
+
+        A leap second repeats the second before it, as in the clock of an operating system.
+        """
+        index = 0
+        for number, start in enumerate(self.starts_s):
+            if tai_s >= start + self.offsets_s[max(number - 1, 0)]:
+                index = number
+        return tai_s - self.offsets_s[index]
+
+    def has_expired(self, utc_s: float) -> bool:
+        """Return whether the table may lack leap seconds before a time, seconds since 1970."""
+        return self.expires_s is not None and utc_s >= self.expires_s
+
+
+BUILT_IN = LeapSeconds((0,), (CURRENT_TAI_OFFSET_S,))
+
+
+@functools.lru_cache(maxsize=1)
+def read_leap_seconds() -> LeapSeconds:
+    """Return the table of this computer that expires last, or the built-in offset."""
+    tables = list[LeapSeconds]()
+    for path in _iter_files():
+        try:
+            tables.append(parse_leap_seconds(path.read_text("utf-8"), str(path)))
+        except (OSError, ValueError):
+            continue  # another file may be readable
+    return max(tables, key=lambda table: table.expires_s or 0, default=BUILT_IN)
+
+
+def parse_leap_seconds(text: str, path: str = "") -> LeapSeconds:
+    """Return the table in the text of a file of either format.
+
+    Raises:
+        ValueError: if the text has no leap seconds.
+    """
+    if "\nLeap" in text or text.startswith("Leap"):
+        return _parse_zone_table(text, path)
+    return _parse_ntp_table(text, path)
+
+
+def _iter_files() -> Iterator[Path]:
+    """Yield the paths of possible tables of this computer."""
+    folders = [Path(folder) for folder in zoneinfo.TZPATH]
+    package = importlib.util.find_spec("tzdata")
+    if package is not None and package.origin is not None:
+        folders.append(Path(package.origin).parent / "zoneinfo")
+    for folder in folders:
+        for name in FILES:
+            yield folder / name
+
+
+def _parse_zone_table(text: str, path: str) -> LeapSeconds:
+    """Return the table of lines such as "Leap 2016 Dec 31 23:59:60 + S"."""
+    starts = list[int]()
+    offsets = list[int]()
+    offset = FIRST_TAI_OFFSET_S
+    expires: int | None = None
+    for line in text.splitlines():
+        words = line.split()
+        if words[:1] == ["#expires"]:
+            expires = int(words[1])
+        if words[:1] != ["Leap"]:
+            continue
+        _, year, month, day, _, sign = words[:6]
+        date = datetime.strptime(f"{year} {month} {day}", "%Y %b %d").replace(tzinfo=UTC)
+        if not starts:
+            starts.append(0)
+            offsets.append(offset)
+        if sign == "+":
+            offset += 1
+        else:
+            offset -= 1
+        starts.append(int(date.timestamp()) + 86_400)
+        offsets.append(offset)
+    if not starts:
+        raise ValueError(path)
+    return LeapSeconds(tuple(starts), tuple(offsets), expires, path)
+
+
+def _parse_ntp_table(text: str, path: str) -> LeapSeconds:
+    """Return the table of lines such as "3692217600 37 # 1 Jan 2017"."""
+    starts = list[int]()
+    offsets = list[int]()
+    expires: int | None = None
+    for line in text.splitlines():
+        words = line.split()
+        if words[:1] == ["#@"]:
+            expires = int(words[1]) - NTP_EPOCH_S
+        if words and not words[0].startswith("#"):
+            starts.append(int(words[0]) - NTP_EPOCH_S)
+            offsets.append(int(words[1]))
+    if not starts:
+        raise ValueError(path)
+    return LeapSeconds(tuple(starts), tuple(offsets), expires, path)
