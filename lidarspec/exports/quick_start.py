@@ -11,6 +11,7 @@ import importlib.util
 from pathlib import Path
 
 from lidarspec.entry_points import SENSORS, entry_points
+from lidarspec.frames.wire_table import wire_table
 from lidarspec.spec import Sensor
 from lidarspec.spec.links import Serial, Tcp, Udp
 
@@ -23,21 +24,47 @@ def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
     """
     source = source or typical_source(sensor)
     sensor_option = f"-s {sensor.id}"
+    detect = (f"lidarspec detect {source}", "identify the sensor")
+    record = (f"lidarspec record {source} {sensor_option} -t 10s -o a.lsr", "record ten seconds")
+    if not sensor.has_points:
+        frame = sensor.main_frames[0]
+        return [
+            detect,
+            (f"lidarspec read {source} {sensor_option} -f {frame}", f"print {frame} frames"),
+            record,
+            (f"lidarspec convert a.lsr a.csv -f {frame}", "write their fields as a table"),
+            ("lidarspec stats a.lsr", "count frames and losses"),
+        ]
     return [
-        (f"lidarspec detect {source}", "identify the sensor"),
-        (f"lidarspec view {source} {sensor_option}", "draw its scans; --web: in the browser"),
-        (f"lidarspec record {source} {sensor_option} -t 10s -o a.lsr", "record ten seconds"),
+        detect,
+        (f"lidarspec view {source} {sensor_option}", "draw its scans (--web: a page)"),
+        record,
         ("lidarspec convert a.lsr a.foxglove.mcap", "open the result in Foxglove"),
         (f"lidarspec ros2 {source} {sensor_option}", "publish it in ROS 2"),
     ]
 
 
 def write_python(sensor: Sensor, source: str = "") -> str:
-    """Return a Python program that prints the points of one scan."""
+    """Return a Python program that prints the points of one scan.
+
+    For a sensor without points, the program prints a field of its first frame type, if possible
+    one with a unit.
+    """
+    source = source or typical_source(sensor)
+    if not sensor.has_points:
+        frame = sensor.main_frames[0]
+        rows = list(wire_table(sensor.frames[frame]))
+        field = next((row.field for row in rows if row.unit), rows[0].field)
+        return f"""\
+import lidarspec as ls
+
+with ls.open("{source}", "{sensor.id}") as device:
+    packets = next(device.packets("{frame}"))
+print(packets["{field}"])    # float64, one value for each packet"""
     return f"""\
 import lidarspec as ls
 
-with ls.open("{source or typical_source(sensor)}", "{sensor.id}") as device:
+with ls.open("{source}", "{sensor.id}") as device:
     scan = next(device.scans())
 print(scan.points.xyz)    # float32, shape (N, 3), in metres"""
 

@@ -26,18 +26,31 @@ def run(arguments: list[str], folder: Path) -> str:
 
 
 @needs("mcap", "google")
-def test_the_commands_work_as_they_are_printed(tmp_path: Path) -> None:
-    sensor = ls.sensor("ldrobot-stl27l")
+@pytest.mark.parametrize(
+    ("sensor_id", "made"), [("ldrobot-stl27l", "a.foxglove.mcap"), ("ublox-gnss", "a.csv")]
+)
+def test_the_commands_work_as_they_are_printed(sensor_id: str, made: str, tmp_path: Path) -> None:
+    sensor = ls.sensor(sensor_id)
     source = f"sim:{sensor.id}?rate=max"
-    commands = [shlex.split(command) for command, _ in list_commands(sensor, source)]
-    outputs = {
-        command[1]: run(["-m", *(part.replace("10s", "1s") for part in command)], tmp_path)
-        for command in commands
-        if command[1] in ("detect", "record", "convert")
-    }
+    outputs = dict[str, str]()
+    for command, _ in list_commands(sensor, source):
+        words = shlex.split(command.replace("10s", "1s"))
+        verb = words[1]
+        if verb == "read":
+            words += ["-n", "1"]
+        if verb not in ("view", "ros2"):
+            outputs[verb] = run(["-m", *words], tmp_path)
     assert sensor.id in outputs["detect"]
-    assert (tmp_path / "a.foxglove.mcap").stat().st_size > 0
+    assert (tmp_path / made).stat().st_size > 0
     assert "[" in run(["-c", write_python(sensor, source)], tmp_path)
+
+
+def test_a_sensor_without_points_has_commands_for_frames() -> None:
+    commands = [command for command, _ in list_commands(ls.sensor("ublox-gnss"))]
+    verbs = [command.split()[1] for command in commands]
+    assert verbs == ["detect", "read", "record", "convert", "stats"]
+    assert commands[1] == "lidarspec read /dev/ttyUSB0 -s ublox-gnss -f nav_pvt"
+    assert 'packets["time_of_week"]' in write_python(ls.sensor("ublox-gnss"))
 
 
 @pytest.mark.parametrize(
