@@ -17,7 +17,7 @@ from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
-from lidarspec.spec.timing import Split
+from lidarspec.spec.timing import ClockStatus, Split
 
 #: Version of the format; it increases if a key changes its meaning or is removed.
 VERSION = 1
@@ -115,7 +115,21 @@ def _clock(sensor: Sensor) -> dict[str, Any] | None:
         fields = [source]
     else:
         fields = list(source)
-    return {"fields": fields, "wraps_at": sensor.clock.wraps_at}
+    status = sensor.clock.status
+    return {
+        "fields": fields,
+        "wraps_at": sensor.clock.wraps_at,
+        "epoch": sensor.clock.epoch,
+        "status": None if status is None else _clock_status(status),
+    }
+
+
+def _clock_status(status: ClockStatus) -> dict[str, Any]:
+    return {
+        "frame": status.frame,
+        "field": None if callable(status.source) else status.source,
+        "states": [{"value": value, **vars(state)} for value, state in status.states.items()],
+    }
 
 
 def _frame(message: ExportedFrame) -> dict[str, Any]:

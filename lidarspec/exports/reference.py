@@ -23,7 +23,7 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
-from lidarspec.spec.timing import Clock, Every, OnFlag, Split
+from lidarspec.spec.timing import EPOCHS, Clock, Every, OnFlag, Split
 
 STATUSES = {
     "manual": "written from the manual",
@@ -68,7 +68,10 @@ def _iter_facts(sensor: Sensor) -> Iterator[str]:
         rows.append(("range", "{:g} m to {:g} m".format(*sensor.range_limits)))
     if sensor.scan is not None:
         rows.append(("scan", f"ends {_describe_scan_rule(sensor.scan)}"))
-    rows += [("clock", _describe_clock(sensor.clock))] if sensor.clock else []
+    if sensor.clock is not None:
+        rows += [("clock", _describe_clock(sensor.clock))]
+        if sensor.clock.status is not None:
+            rows.append(("clock status", _describe_clock_status(sensor.clock)))
     rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
     rows += [
@@ -123,9 +126,29 @@ def _describe_clock(clock: Clock) -> str:
         again = f", wraps at {clock.wraps_at:g} s"
     else:
         again = ""
-    return (
-        fields + again + (f", completed by {clock.reference[0]} frames" if clock.reference else "")
-    )
+    parts = [fields + again]
+    if clock.reference:
+        parts.append(f"completed by {clock.reference[0]} frames")
+    if clock.epoch:
+        parts.append(f"counts {EPOCHS[clock.epoch]}")
+    return ", ".join(parts)
+
+
+def _describe_clock_status(clock: Clock) -> str:
+    """Return the field with the state of the clock, and the meaning of its values."""
+    status = clock.status
+    assert status is not None
+    if callable(status.source):
+        place = f"calculated from `{status.frame}` frames" if status.frame else "calculated"
+    else:
+        place = f"`{'.'.join(filter(None, (status.frame, status.source)))}`"
+    meanings = []
+    for value, state in status.states.items():
+        meaning = f"{value} {state.meaning}"
+        if state.epoch is not None:
+            meaning += f" ({EPOCHS[state.epoch]})"
+        meanings.append(meaning)
+    return f"{place}: {', '.join(meanings)}"
 
 
 def _iter_commands(sensor: Sensor) -> Iterator[str]:

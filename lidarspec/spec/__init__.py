@@ -73,6 +73,8 @@ if TYPE_CHECKING:
     )
     from lidarspec.spec.timing import (
         Clock as Clock,
+        ClockState as ClockState,
+        ClockStatus as ClockStatus,
         Every as Every,
         OnChange as OnChange,
         OnFlag as OnFlag,
@@ -128,6 +130,8 @@ _NAMES = {
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": (
         "Clock",
+        "ClockState",
+        "ClockStatus",
         "PacketCounter",
         "OnWrap",
         "OnFlag",

@@ -42,7 +42,7 @@ from lidarspec.spec.description import (
 from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
-from lidarspec.spec.timing import Clock, OnChange, OnWrap, PacketCounter, Split
+from lidarspec.spec.timing import EPOCHS, HOUR_S, Clock, OnChange, OnWrap, PacketCounter, Split
 from lidarspec.trusted_files import resolve_beside
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ ROLES = ("serial", "firmware", "model", "temperature")
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
 #: options that every sensor has.
-OPTIONS = ("frame", "answer", "cut")
+OPTIONS = ("frame", "answer", "cut", "epoch")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 _Sensor = TypeVar("_Sensor", bound="SensorDescription")
 #: a text that an untrusted file may give as an option, because it cannot be a path.
@@ -278,6 +278,8 @@ def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     clock = sensor.clock
     if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
         clock = replace(clock, reference=None)
+    if clock is not None and clock.status is not None and clock.status.frame not in ("", *frames):
+        clock = replace(clock, status=None)
     return replace(
         sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=()
     )
@@ -401,9 +403,13 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
 
 
 def _check_clock(sensor: SensorDescription) -> None:
-    """Raise SpecError if `reference` of the clock cannot complete it."""
+    """Raise SpecError if the frames of the clock are missing, or cannot complete the clock."""
     clock = sensor.clock
-    if clock is None or clock.reference is None:
+    if clock is None:
+        return
+    if clock.status is not None and clock.status.frame:
+        _check_names(sensor, "clock.status.frame", [clock.status.frame], sensor.incoming)
+    if clock.reference is None:
         return
     _check_names(sensor, "clock.reference", clock.reference[:1], sensor.frames)
     if clock.wraps_at is None or callable(clock.source):
@@ -455,7 +461,11 @@ class Configure:
             configured = self._call_function(own_options)
         else:
             configured = sensor
-        return replace(configured, options={**sensor.options, **options}, configure=self.function)
+        options = {**sensor.options, **options}
+        clock = configured.clock
+        if clock is not None and "epoch" in options:
+            clock = replace(clock, epoch=options["epoch"])
+        return replace(configured, options=options, clock=clock, configure=self.function)
 
     @property
     def types(self) -> dict[str, OptionType]:
@@ -553,6 +563,19 @@ def _check_cut(sensor: SensorDescription, degrees: object) -> None:
         raise UsageError(f"{sensor.id}: cut must be an angle in degrees, not {shown(degrees)}")
 
 
+def _check_epoch(sensor: SensorDescription, epoch: object) -> None:
+    """Raise `UsageError` if the sensor has no clock, or the clock cannot count this."""
+    if sensor.clock is None and sensor.frames:
+        raise UsageError(f"{sensor.id}: epoch cannot be set, because the sensor has no clock")
+    if epoch not in EPOCHS:
+        raise UsageError(
+            f"{sensor.id}: epoch must be one of {', '.join(filter(None, EPOCHS))}, not"
+            f" {shown(epoch)}"
+        )
+    if epoch == "hour" and sensor.clock is not None and sensor.clock.wraps_at != HOUR_S:
+        raise UsageError(f"{sensor.id}: epoch cannot be hour, because the clock counts further")
+
+
 def _check_shared(sensor: SensorDescription, options: Mapping[str, Any]) -> None:
     frame = options.get("frame", FRAMES_OF_REFERENCE[0])
     if frame not in FRAMES_OF_REFERENCE:
@@ -563,6 +586,8 @@ def _check_shared(sensor: SensorDescription, options: Mapping[str, Any]) -> None
         raise UsageError(f"{sensor.id} declares no vendor axes")
     if "cut" in options:
         _check_cut(sensor, options["cut"])
+    if "epoch" in options:
+        _check_epoch(sensor, options["epoch"])
     if "answer" in options and options["answer"] not in sensor.data_frames:
         raise UsageError(
             f"{sensor.id}: answer must be one of {', '.join(sensor.data_frames)}, not"

@@ -1,18 +1,23 @@
 """Ends of scans, clocks and packet counters: rules that a sensor declares and the engine applies.
 
+A `Clock` says how to read the time of a packet, and what that time counts (`EPOCHS`). Many sensors
+also send how good their clock is: a `ClockStatus` names the field and the meaning of its values.
+
 `unix_time` is for the functions of a clock: it converts the fields of a date.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from lidarspec.errors import SpecError
 
+HOUR_S = 3600
 _DAY_S = 86_400
 #: days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
 _EPOCH_DAYS = 719_469
@@ -21,6 +26,19 @@ MAX_CLOCK_S = 2**63 / 1e9
 #: a field path, several that add up, or a function of the frame's `Fields` (returning a column or
 #: several).
 Source = str | tuple[str, ...] | Callable[[Any], Any]
+#: What a clock can count, by the name in `Clock.epoch`. "utc", "tai" and "gps" count from 1970, so
+#: that they differ by leap seconds only: in 2017 to 2026, TAI is 37 s and GPS time 18 s ahead of
+#: UTC.
+EPOCHS = MappingProxyType(
+    {
+        "": "not declared",
+        "boot": "time since power-up",
+        "utc": "UTC since 1970",
+        "tai": "TAI since 1970, as PTP grandmasters distribute it",
+        "gps": "GPS time, counted from 1970",
+        "hour": "UTC since the last full hour",
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -99,6 +117,63 @@ Split = OnWrap | OnFlag | OnChange | OnJump | OnRewind | Every
 
 
 @dataclass(frozen=True)
+class ClockState:
+    """The meaning of one value of a clock's status.
+
+    Args:
+        meaning: a few words for users, for example "locked to PTP".
+        locked: whether the clock follows its source of time; None if the manual does not say.
+        epoch: what the clock counts in this state (a key of `EPOCHS`); None for the epoch of the
+            clock.
+
+    Raises:
+        SpecError: for an unknown epoch.
+    """
+
+    meaning: str
+    locked: bool | None = None
+    epoch: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.epoch is not None:
+            _check_epoch(self.epoch, "clock.status.states")
+
+
+@dataclass(frozen=True)
+class ClockStatus:
+    """The field in which a sensor sends the state of its clock.
+
+    Args:
+        source: the path of the field, or a function of `Fields` that returns an integer for each
+            frame, nan if unknown.
+        states: the meaning of each value.
+        frame: the incoming frame type that has the field; "" for the frames with the clock.
+
+    Raises:
+        SpecError: if `states` is empty.
+    """
+
+    source: str | Callable[[Any], Any]
+    states: Mapping[int, ClockState]
+    frame: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.states:
+            raise SpecError(
+                "expected the meaning of at least one value, for example"
+                " {1: ClockState('locked to PTP', True)}",
+                path="clock.status.states",
+            )
+        object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
+
+    def state_of(self, value: float) -> ClockState:
+        """Return the meaning of a value; a value without one is neither locked nor unlocked."""
+        if value in self.states:
+            return self.states[int(value)]
+        return ClockState("unknown" if value != value else f"unknown value {value:g}")
+
+
+@dataclass(frozen=True)
 class Clock:
     """The sensor's own clock.
 
@@ -116,17 +191,30 @@ class Clock:
             field too. With it a function of its `Fields` that returns seconds since 1970, nan if
             the frame has no date. The first frame with a date decides: from the start of a file,
             and for live packets from that frame on.
+        epoch: what the clock counts, a key of `EPOCHS`: "boot", "utc", "tai", "gps" or "hour"; ""
+            if the manual does not say. With `status` it is the epoch of a locked clock. The option
+            `epoch` of every sensor replaces it.
+        status: the field that says whether the clock is locked; None if the sensor does not send
+            it.
 
     Raises:
-        SpecError: if `wraps_at` is not positive, or too long to ever be reached.
+        SpecError: if `wraps_at` is not positive, or too long to ever be reached, or if the epoch is
+            unknown.
     """
 
     source: Source
     wraps_at: float | None = None
     pace: Callable[[Any], Any] | None = None
     reference: tuple[str, Callable[[Any], Any]] | None = None
+    epoch: str = ""
+    status: ClockStatus | None = None
 
     def __post_init__(self) -> None:
+        _check_epoch(self.epoch, "clock.epoch")
+        if self.epoch == "hour" and self.wraps_at != HOUR_S:
+            raise SpecError(
+                f"a clock that counts from the full hour wraps at {HOUR_S} s", path="clock.wraps_at"
+            )
         if self.wraps_at is None:
             return
         if not self.wraps_at > 0:
@@ -139,6 +227,19 @@ class Clock:
                 " never wraps",
                 path="clock.wraps_at",
             )
+
+    def epoch_in(self, state: ClockState) -> str:
+        """Return what the clock counts in a state."""
+        if state.epoch is not None:
+            return state.epoch
+        return self.epoch
+
+
+def _check_epoch(epoch: str, path: str) -> None:
+    if epoch not in EPOCHS:
+        raise SpecError(
+            f"unknown epoch {epoch!r}: expected one of {', '.join(filter(None, EPOCHS))}", path=path
+        )
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,16 @@ def _check_required_fields(sensor: Sensor) -> Findings:
             for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock)
         ),
     ]
+    status = sensor.clock.status if sensor.clock is not None else None
+    if status is not None and status.frame:
+        known_status = set(get_codec(sensor.frames[status.frame]).schema.scan_names)
+    else:
+        known_status = known
+    if status is not None and isinstance(status.source, str):
+        path = without_indices(status.source)[0]
+        if path not in known_status:
+            what = f"no field {status.source!r}{did_you_mean(path, known_status)}"
+            yield "LS216", what, "clock.status"
     for place, path in given:
         there = cut_by if place == "scan" else known
         if path and without_indices(path)[0] not in there:

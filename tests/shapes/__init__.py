@@ -44,6 +44,7 @@ from tests.shapes import (
     segments,
     sized,
     state,
+    synced,
     tags,
     text,
     tokens,
@@ -95,6 +96,7 @@ _MODULES = (
     joined,
     escaped,
     paced,
+    synced,
 )
 
 SHAPES: dict[str, Sensor] = {
