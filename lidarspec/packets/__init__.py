@@ -15,4 +15,5 @@ other types. Modules in reading order:
 * `imu`: the samples of an IMU.
 * `packet_type`: the clock and the loss detection of one frame type.
 * `stream`: from frames to packets, batch by batch.
+* `clock_status`: the state of the sensor's clock at each packet.
 """
