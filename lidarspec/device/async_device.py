@@ -1,8 +1,8 @@
 """A `Device` for asyncio.
 
 `AsyncDevice` calls the methods of a `Device` in its own threads, so that the event loop is never
-blocked. An item that a thread has found stays in a `_ThreadedIterator` until a call fetches it, so
-that a cancelled call loses nothing.
+blocked. A thread stores each item in a `_ThreadedIterator`, and an awaited call takes it from
+there. If the call is cancelled, the item is kept for the next call.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class AsyncDevice:
     Its methods and properties have the arguments, results and errors of `Device`.
 
     Args:
-        opening: opens the device.
+        opening: the function that opens the device.
     """
 
     def __init__(self, opening: Callable[[], Device]) -> None:
@@ -54,7 +54,7 @@ class AsyncDevice:
         """The device.
 
         Raises:
-            UsageError: before it is opened.
+            UsageError: if the device is not open yet.
         """
         if self._device is None:
             raise UsageError(
@@ -74,7 +74,7 @@ class AsyncDevice:
 
     @property
     def warnings(self) -> list[str]:
-        """The present warnings; see `Device.warnings`."""
+        """The current warnings; see `Device.warnings`."""
         return self.device.warnings
 
     @property
@@ -172,7 +172,7 @@ class AsyncDevice:
             await _run(self._reading, iterator.find_next)
 
     def _find_newest(self, deadline: float | None) -> None:
-        """Wait up to `_MAX_WAIT_S` for the newest scan; called in the thread."""
+        """Wait up to `_MAX_WAIT_S` for the newest scan; called in a worker thread."""
         if self._newest is not None:
             return  # found by the thread of a call that was cancelled
         wait = _MAX_WAIT_S
@@ -185,13 +185,13 @@ class AsyncDevice:
 
 
 class _ThreadedIterator(Generic[T]):
-    """The items of an iterator, found in a thread and fetched in the event loop.
+    """The items of an iterator, which a thread reads for the event loop.
 
     Args:
-        source: the iterator. If nothing has arrived, it yields None or an empty batch.
+        source: the iterator. It yields None or an empty batch if nothing has arrived.
 
     Attributes:
-        items: the items that were found and not fetched yet.
+        items: the items that the event loop has not taken yet.
         ended: whether the iterator has ended.
     """
 
@@ -201,7 +201,7 @@ class _ThreadedIterator(Generic[T]):
         self.ended = False
 
     def find_next(self) -> None:
-        """Wait up to `_MAX_WAIT_S` for the next item; called in the thread."""
+        """Wait up to `_MAX_WAIT_S` for the next item; called in a worker thread."""
         if self.items or self.ended:
             return  # found by the thread of a call that was cancelled
         try:
@@ -219,9 +219,10 @@ async def _run(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
 
 
 async def _finish(future: asyncio.Future[T]) -> T:
-    """Return the result of a future; if cancelled, wait for its end first.
+    """Return the result of a future.
 
-    A device that is half open or half closed would keep its port.
+    If the caller is cancelled, wait until the future is done before raising. A device that is only
+    half opened or half closed would keep its port.
     """
     try:
         return await asyncio.shield(future)
@@ -235,6 +236,6 @@ def open_async(
 ) -> AsyncDevice:
     """Open a sensor on any SOURCE, for ``async with``.
 
-    The arguments and errors are the same as for `open`.
+    The arguments and errors are the same as those of `open`.
     """
     return AsyncDevice(partial(open_device, source, sensor, **options))

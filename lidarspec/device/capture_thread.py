@@ -1,9 +1,8 @@
 """Read a live source in a thread, and queue the data for decoding.
 
 The thread only reads, records and queues, so that no byte is lost if the consumer is slow. The
-recording contains everything that arrives. The queue is bounded. If it is full, the policy
-"drop_oldest" drops the oldest chunks, and "block" makes the thread wait. Every produced chunk is
-consumed, dropped or still in the queue.
+recording contains everything that arrives. The queue has a maximum size. If it is full, the policy
+"drop_oldest" drops the oldest chunks, and "block" makes the thread wait.
 
 If the device disappears, the thread reports this, tries to open the device again with growing
 pauses, and marks the first chunk after the gap. Silence is the sum of the durations of reads that
@@ -24,10 +23,10 @@ from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL_S, Chunk, Disconnected, LiveTransport
 
-#: limits of a queue: several seconds of data of the fastest sensors.
+#: The limits of a queue have room for several seconds of data of the fastest sensors.
 MAX_QUEUED_CHUNKS = 1 << 16
 MAX_QUEUED_BYTES = 1 << 25
-#: first and longest pause between attempts to open a device again.
+#: The pause between attempts to open a device again grows from the first value to the second.
 MIN_RETRY_PAUSE_S = 0.02
 MAX_RETRY_PAUSE_S = 0.25
 POLICIES = ("drop_oldest", "block")
@@ -46,18 +45,21 @@ Event = tuple[str, Item]
 
 
 class BoundedQueue:
-    """The events on the links of a device that have not been taken yet.
+    """A queue of chunks and other events from the links of a device.
 
-    Its length is the number of chunks.
+    `len` returns the number of chunks in the queue.
 
     Args:
-        policy: the policy of a full queue, "drop_oldest" or "block".
-        chunks: maximum number of chunks.
-        size: maximum number of bytes in all chunks.
+        policy: what `put` does if the queue is full: "drop_oldest" drops the oldest chunks, "block"
+            waits.
+        chunks: maximum number of chunks in the queue.
+        size: maximum total size of the chunks in the queue, in bytes.
 
     Attributes:
-        produced, consumed, dropped: numbers of chunks; ``produced == consumed + dropped +
-            len(queue)`` always holds.
+        produced: number of chunks that were put into the queue so far.
+        consumed: number of chunks that were taken.
+        dropped: number of chunks that were dropped. ``produced == consumed + dropped + len(queue)``
+            always holds.
     """
 
     def __init__(
@@ -88,7 +90,10 @@ class BoundedQueue:
         return self._waiting
 
     def put(self, link: str, items: Iterable[Item]) -> None:
-        """Add events of a link, in order; drop or wait if the queue is full."""
+        """Add events of a link in order.
+
+        If the queue is full, this drops the oldest chunks or waits, depending on the policy.
+        """
         with self._changed:
             for item in items:
                 if isinstance(item, Chunk):
@@ -106,14 +111,14 @@ class BoundedQueue:
     def take(
         self, timeout: float, *, until: float = 0.0, chunks: int = MAX_QUEUED_CHUNKS
     ) -> list[Event]:
-        """Remove the events that have arrived, and return them in order.
+        """Wait for events, remove them from the queue, and return them in order.
 
-        The list is empty if nothing arrives in time, or if the queue is closed and empty.
+        The list is empty if no event arrives in time, or if the queue is closed and empty.
 
         Args:
             timeout: seconds to wait.
-            until: a time of `time.monotonic`; events are collected until this time, but not longer
-                than `timeout`.
+            until: the time (of `time.monotonic`) until which events are collected, limited by
+                `timeout`.
             chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
@@ -177,7 +182,7 @@ class CaptureThread:
     """The thread that reads a live transport.
 
     Args:
-        transport: the open transport; closed with the thread.
+        transport: the open transport; `close` closes it.
         queue: receives the events.
         link: the name of the link.
         log: the recording; None to record nothing.
@@ -187,8 +192,8 @@ class CaptureThread:
         transport: the transport.
         connected: whether the device is connected.
         disconnects: how often the device has disappeared.
-        last_arrival: the time of the last arrival by `time.monotonic`; before it, the time of
-            opening.
+        last_arrival: the time of `time.monotonic` when data last arrived; if none has arrived, the
+            time when the transport was opened.
         warnings: warnings about the host's clock.
     """
 
@@ -265,7 +270,12 @@ class CaptureThread:
             self._queue.put(self._link, [error])
 
     def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
-        """Record and queue chunks, and mark the first chunk after a gap or silence."""
+        """Record and queue chunks.
+
+        Args:
+            gap: whether data is missing before the first chunk, which is then marked.
+            quiet: whether silence preceded the first chunk, which is then marked.
+        """
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         self._follow_wall_clock(chunks[0])
@@ -276,9 +286,9 @@ class CaptureThread:
             self._queue.put(self._link, chunks)
 
     def _follow_wall_clock(self, chunk: Chunk) -> None:
-        """Warn of a step if the wall clock was set, and record the step.
+        """Warn if the computer's wall clock was set, and record the change.
 
-        Arrival times do not follow the step.
+        Arrival times continue without a step.
         """
         ahead = self._clock.find_step()
         if ahead is None:
@@ -294,7 +304,7 @@ class CaptureThread:
         """Report that the device has disappeared, and wait until it is back.
 
         Returns:
-            False if the capture was stopped before.
+            True if the device is back, False if the capture was stopped first.
         """
         self.connected = False
         self.disconnects += 1

@@ -1,9 +1,9 @@
 """Demonstrate a session with a simulated sensor, end to end.
 
-The simulated sensor sends over an operating system interface: a pseudo-terminal for a serial sensor
-(a TCP port if the system has no pseudo-terminals), UDP on loopback for others. The line adds
-errors. The sensor is started, read and recorded. The recording is then decoded and has to give the
-same points.
+A simulated serial sensor sends through a pseudo-terminal, or through a TCP port on systems without
+pseudo-terminals. Other simulated sensors send over UDP to this computer. Some of the sent data is
+damaged or dropped on purpose. The sensor is started, read and recorded. The recording is then
+decoded and has to give the same points.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
-#: time limit for the scans, in addition to one second for each scan.
+#: The time limit for all scans is this time and one second for each scan.
 EXTRA_TIMEOUT_S = 15.0
-#: time without a scan after which all sent data has arrived.
+#: After this time without a scan, all sent data has arrived.
 DRAINED_AFTER_S = 0.2
 
 
@@ -43,12 +43,12 @@ class Demonstration:
 
     Attributes:
         sensor: the sensor.
-        address: its SOURCE.
+        address: the SOURCE of the simulated sensor.
         replies: the replies to the commands that started the sensor.
         scans: the received scans; the last scan is complete.
         stats: the decoder's counters.
         sent: number of packets that were sent.
-        intact: number of packets that the line did not damage.
+        intact: number of packets that arrived without a simulated error.
         digest: SHA-256 of the points of the complete scans.
         recorded_digest: SHA-256 of the points of the complete scans in the recording.
         recorded_bytes: size of the recording.
@@ -73,12 +73,12 @@ def demonstrate(
 
     Args:
         turns: the number of complete scans.
-        errors: for a stream, the share of damaged bytes, limited to one byte in the length of the
-            longest data frame; for datagrams, the share of lost datagrams.
+        errors: for a stream, the share of damaged bytes, at most one in the size of the longest
+            data frame; for datagrams, the share of lost datagrams.
         seed: the seed of the errors and the scene.
 
     Raises:
-        SourceError: if no line is available, or the scans do not arrive.
+        SourceError: if the interface cannot be opened, or the scans do not arrive in time.
         PluginError: if a function of the plugin raises.
     """
     longest = sensor.frames[sensor.data_frame].max_length

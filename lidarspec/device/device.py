@@ -1,4 +1,4 @@
-"""A sensor on a source: packets and scans as they arrive, commands, counters.
+"""A sensor on a source: it yields packets and scans, and sends commands.
 
 A `Device` gets frames from its input, which is a `FileInput` or a `LiveInput` with the same
 interface. A `PacketReader` makes packets and scans from the frames.
@@ -44,12 +44,12 @@ from lidarspec.transports.protocol import ClosingContext, LiveTransport, Transpo
 
 #: number of frames at the start that are compared with related models.
 _MAX_CHECKED_FRAMES = 64
-#: wait for data if the caller sets no limit.
+#: An iterator without a limit waits for data in steps of this length.
 _LONG_WAIT_S = 3600.0
 
 
 class Device(ClosingContext):
-    """A sensor on a source; a context manager.
+    """A sensor that was opened on a source; a context manager.
 
     Attributes:
         source: the source that is read.
@@ -219,14 +219,14 @@ class Device(ClosingContext):
     ) -> Iterator[dict[str, Packets]]:
         """Yield packets of several frame types in batches, until the input ends.
 
-        A file is read once, by all iterators together.
+        A file is read only once: all iterators share one position in it.
 
         Args:
             frames: the names of the frame types.
-            wait: yield an empty batch if none arrives for this number of seconds.
+            wait: if no packet arrives for this number of seconds, yield an empty dict.
 
-        Returns:
-            The packets of each type that has arrived, by name.
+        Yields:
+            Dicts of packets by frame type, with the types that have arrived.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
@@ -279,8 +279,9 @@ class Device(ClosingContext):
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
         """Yield the samples of the sensor's IMU in batches, until the input ends.
 
-        They are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the samples
-        that belong to a scan. A file is read only once: all iterators share one position in it.
+        The samples are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the
+        samples that belong to a scan. A file is read only once: all iterators share one position in
+        it.
 
         Args:
             wait: if no sample arrives for this number of seconds, yield an empty batch.
@@ -305,7 +306,7 @@ class Device(ClosingContext):
                 yield_timer.restart()
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """Wait for a whole scan that the last call did not return; return the newest.
+        """Return the newest whole scan; wait for one that was not returned before.
 
         Older scans are dropped. For a file, each call returns the next whole scan.
 
@@ -382,8 +383,8 @@ class Device(ClosingContext):
     def delay_decoding(self, until: float) -> None:
         """Collect arriving data until a time, and decode it together.
 
-        This needs less processor time. An iterator with `wait` does not delay longer. Files ignore
-        this.
+        This needs less processor time. An iterator with `wait` delays its data by at most `wait`
+        seconds. For a file, this has no effect.
 
         Args:
             until: a time of `time.monotonic`.
@@ -393,9 +394,9 @@ class Device(ClosingContext):
     def read_ahead(self, size: int) -> None:
         """Read a file in portions of about `size` bytes from now on.
 
-        A program that shows a file at its recorded pace needs this: otherwise the counters and the
-        input of a `DecoderObserver` are far ahead of the picture. The default 0 is the fastest
-        size. Live sources ignore this.
+        Small portions keep the counters and a `DecoderObserver` close to the packets that were
+        returned last, for example to show a file at its recorded pace. The default of 0 selects the
+        fastest size. For a live source, this has no effect.
         """
         self._input.read_ahead(size)
 
@@ -534,9 +535,10 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_ahead(self) -> FrameBatch | None:
-        """Take the batch in which `latest` found its last scan of a file.
+        """Return the batch in which `latest` found the last returned scan of a file.
 
-        A new iterator begins with this batch, so `latest` must not return its other scans as well.
+        A new iterator begins with this batch, so the other scans of the batch are no longer kept
+        for `latest`.
 
         Raises:
             SourceError: if the file has been read to its end.
@@ -547,7 +549,9 @@ class Device(ClosingContext):
             self._latest_stream = None
             self._unseen_scans.clear()
         elif self._input.state == "ended":
-            raise SourceError(f"{self.source} was read to its end: open it again to read it again")
+            raise SourceError(
+                f"{self.source} has been read to its end: open it again to start over"
+            )
         return ahead
 
     def _iter_batches(
@@ -590,7 +594,7 @@ class Device(ClosingContext):
 
 
 class _YieldTimer:
-    """Decides when an iterator has to yield although it has no data.
+    """Decides when an iterator without new data has to yield.
 
     Args:
         wait: longest time between two yields, in seconds; None for no limit.
@@ -654,7 +658,7 @@ def open(
 
 def _describe_nominal(sensor: Sensor) -> str:
     """Return a warning about a nominal calibration, with the option that replaces it."""
-    text = f"{sensor.id}: points use the nominal calibration of the model, not the one of this unit"
+    text = f"{sensor.id}: points use the nominal calibration of the model, not of this unit"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
         return (

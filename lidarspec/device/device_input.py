@@ -35,13 +35,14 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """Frames of a piece of input, in stream order.
+    """The frames of a piece of input, in stream order.
 
     Attributes:
         frames: the frames of all incoming types.
-        interrupted: whether input is missing after these frames, so that no frame, packet or scan
+        interrupted: whether input is missing after these frames. If so, no frame, packet or scan
             continues in the next batch.
-        replaced: whether the sensor has changed: all earlier frames have to be discarded.
+        replaced: whether another sensor is read from now on. If so, all earlier frames have to be
+            discarded.
     """
 
     frames: list[Frames] = field(default_factory=list)
@@ -52,7 +53,7 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    Methods with a body have the behaviour of a source that is not live.
+    The methods with a body are implemented for sources that are not live.
 
     Attributes:
         is_live: whether data arrives from a live source, not from a file.
@@ -71,9 +72,9 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Keep the latest frame of each type that reports values of the sensor.
+        """Keep the latest frame of each type that has a field of `Sensor.info`.
 
-        A frame of several parts is ignored if it lacks values that an earlier frame reported.
+        A frame that contains other frames is ignored if it lacks values of an earlier frame.
         """
         for frames in batches:
             for name in self.sensor.info_frames:
@@ -85,7 +86,7 @@ class DeviceInput(Protocol):
                         self.info_frames = {**self.info_frames, name: item}
 
     def _lacks_values(self, item: Found) -> bool:
-        """Return whether a frame of several parts lacks values of an earlier frame."""
+        """Return whether a frame with frames in it lacks values of an earlier frame."""
         earlier = self.info_frames.get(item.frame)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False
@@ -131,13 +132,16 @@ class DeviceInput(Protocol):
     def read_ahead(self, size: int) -> None:
         """Read a file in portions of about `size` bytes from now on.
 
-        0 is the fastest size. Live sources ignore this.
+        A size of 0 selects the fastest size. For a live source, this has no effect.
         """
 
     def delay_decoding(self, until: float) -> None:
-        """Collect arriving data until a time of `time.monotonic`, then decode it at once.
+        """Collect arriving data until a time, and decode it together.
 
-        `next` does not delay longer than its `wait`. Files ignore this.
+        `next` delays data by at most `wait` seconds. For a file, this has no effect.
+
+        Args:
+            until: a time of `time.monotonic`.
         """
 
     def begin(self) -> None:
@@ -162,13 +166,13 @@ class DeviceInput(Protocol):
         """
 
     def mark(self) -> int:
-        """Return the amount of data that has arrived so far, for `caught_up`."""
+        """Return a count of the data that has arrived, as an argument for `caught_up`."""
         return 0
 
     def caught_up(self, mark: int) -> bool:
         """Return whether all data that arrived before a mark has been decoded.
 
-        Always True for a file, which has no newest scan to catch up with.
+        Always True for a file.
         """
         return True
 
@@ -191,7 +195,10 @@ class DeviceInput(Protocol):
         """
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that apply from the first packet on; none for a live sensor."""
+        """Return the frames that are used from the first packet on.
+
+        A live sensor has no such frames.
+        """
         return FirstFrames()
 
     def close(self) -> None:
@@ -229,7 +236,7 @@ def _decode_stream(
     Each frame has the arrival time of the datagram that holds its last byte.
 
     Args:
-        size: number of bytes decoded together.
+        size: number of bytes that are decoded together.
     """
     data = datagrams.joined
     ends = decoder.stats.bytes_in + np.cumsum(datagrams.sizes)
@@ -255,7 +262,7 @@ def _set_arrival(
 
 
 def select_frames(batches: Sequence[Frames], names: frozenset[str]) -> list[Found]:
-    """Return a list of the frames of some types, in stream order."""
+    """Return the frames whose type is in `names`, in stream order."""
     selected = []
     for frames in batches:
         kinds = [index for index, name in enumerate(frames.names) if name in names]
@@ -263,7 +270,7 @@ def select_frames(batches: Sequence[Frames], names: frozenset[str]) -> list[Foun
     return selected
 
 
-#: numbers of bytes and of chunks that are decoded together; the first limit that is reached counts.
+#: Chunks are decoded together until they reach one of these limits.
 BATCH_BYTES = 1 << 18
 BATCH_CHUNKS = 1024
 
@@ -355,10 +362,10 @@ class FileInput(DeviceInput):
         self._frame_batches = iter(())  # the old generator holds this object and the read data
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that apply from the start of the file.
+        """Return the frames that are used from the first packet of the file on.
 
-        The source is opened and read a second time. Returns no frames if the sensor needs none, or
-        if the source is not a file that can be read twice.
+        This opens and reads the file a second time. It returns no frames if the sensor needs none,
+        or if the source cannot be read twice, such as standard input.
         """
         path = Path(str(self._source).partition("?")[0])
         if not needs_first_frames(self.sensor) or not (

@@ -1,10 +1,10 @@
 """Read the scans of a file, from its start or from a bookmark, also in another process.
 
-Decoding from the middle of a file needs state from the bytes before it: an incomplete frame, frames
-with state, the number of clock wraps, the packet counter, waiting packets, the direction of
-rotation. A bookmark is the pickled state, so that the scans after it are the same, bit for bit, as
-without a bookmark. The functions, structs and rules of a sensor cannot be pickled, and no input
-changes them. A bookmark refers to them by name, and the resumed sensor supplies them.
+Decoding from the middle of a file needs state from the bytes before that position, for example an
+incomplete frame, the number of clock wraps and the direction of rotation. A bookmark is this state,
+pickled. The scans that are read from a bookmark on are identical to the scans of an uninterrupted
+reading. The functions and structs of a sensor cannot be pickled, but no input changes them. A
+bookmark therefore refers to them by name, and the sensor that is given on resuming supplies them.
 
 A bookmark divides a file into pieces. A scan belongs to the piece in which it begins: the piece
 before a bookmark reads its last scan to the end, and the piece after it omits that scan.
@@ -38,12 +38,14 @@ from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport
 
-#: types whose values are pickled, not referred to by name.
+#: Values of these types are pickled; values of other types are referred to by name.
 _PLAIN_TYPES = (bool, int, float, str, bytes, type(None), type)
 
 
 class FileScans(ClosingContext):
-    """The scans of a file, as an iterable; `survey` can skip a piece quickly.
+    """The scans of a file, as an iterable.
+
+    `survey` only counts the scans of the next piece, which is faster.
 
     Args:
         source: the file.
@@ -53,7 +55,7 @@ class FileScans(ClosingContext):
 
     Raises:
         UsageError: for a source that is not a file, or a sensor without points.
-        SourceError: if it cannot be read.
+        SourceError: if the file cannot be read.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
@@ -96,11 +98,12 @@ class FileScans(ClosingContext):
         """Read the next piece of the file and count its scans.
 
         Args:
-            size: minimum number of bytes of the piece.
+            size: minimum size of the piece, in bytes.
 
         Returns:
-            The number of scans that begin in the piece, and a bookmark of its end. The bookmark is
-            None at the end of the file, which is reached if no bookmark can be made.
+            The number of scans that begin in the piece, and a bookmark of its end. If no bookmark
+            can be made, the piece extends to the end of the file. The bookmark is None at the end
+            of the file.
         """
         scan_count = 0
         end = self._offset + size
@@ -115,7 +118,7 @@ class FileScans(ClosingContext):
         self._input.close()
 
     def _next(self) -> Iterator[Scan] | None:
-        """Return the scans that the next bytes complete, None at the end."""
+        """Return the scans that the next batch of frames completes; None at the end."""
         batch = self._input.next(0)
         if batch is None:
             return None
@@ -141,7 +144,10 @@ class FileScans(ClosingContext):
         return reader.offset
 
     def _make_bookmark(self) -> bytes | None:
-        """Return the pickled state; None if it cannot be pickled or the file cannot seek."""
+        """Return the pickled state.
+
+        None if the state cannot be pickled, or if the file cannot be read from this position.
+        """
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_resume:
             return None
@@ -171,9 +177,9 @@ class FileScans(ClosingContext):
 
 
 def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
-    """Return the objects that no input changes, by name.
+    """Return the objects that do not depend on the input, by name.
 
-    They are the parts of a sensor, and objects that are made from the sensor only.
+    They are the parts of the sensor, and objects that are made from the sensor alone.
     """
     constants = dict[tuple[Any, ...], Any]()
     _name_parts(sensor, (), constants, set())
@@ -222,13 +228,16 @@ class _StatePickler(pickle.Pickler):
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Return how to pickle tables and packets; tables as the bytes of their frames.
+        """Return how a table, packets or a `struct.Struct` are pickled.
 
-        Of the frames of other types, only those that packets use are pickled.
+        A table is pickled as the bytes of its frames. With packets, only the frames of other types
+        that they use are pickled.
         """
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
-                raise pickle.PicklingError("parts of frames require the layout of their frame")
+                raise pickle.PicklingError(
+                    "the parts of a frame cannot be pickled without the frame"
+                )
             return _make_table, (
                 self._constants[()],
                 self._frames[id(obj.schema)],
@@ -237,7 +246,7 @@ class _StatePickler(pickle.Pickler):
         if isinstance(obj, Packets):
             if AROUND in obj.state:
                 raise pickle.PicklingError(
-                    "parts of a frame cannot be pickled alone; pickle the packets of the frame"
+                    "the parts of a frame cannot be pickled alone; pickle the packets of the frame"
                 )
             state = {name: _take_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}

@@ -1,6 +1,6 @@
-"""The frames of a file that apply from its start.
+"""Find the frames of a file that are used from its first packet on.
 
-They are the first frame of each state type, and the first reference of the clock.
+They are the first frame of each state type, and the first frame that dates the clock.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
 
-#: if no frame of the type that could date the clock is in this many bytes, the search ends.
+#: The search for a frame that dates the clock ends after this number of bytes without one.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
 @dataclass
 class FirstFrames:
-    """The frames that apply from the first packet on.
+    """The frames that are used from the first packet on.
 
     Attributes:
         state: the first frame of each type that `points` depends on, by name.
@@ -34,16 +34,16 @@ class FirstFrames:
 
 
 def needs_first_frames(sensor: Sensor) -> bool:
-    """Return whether frames of a sensor can apply from the first packet on."""
+    """Return whether later frames of a file can be used from the first packet on."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
 def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
-    """Return the frames that apply from the start of a file.
+    """Return the frames that are used from the first packet of a file on.
 
     Args:
-        sensor: the sensor that sent them.
-        batches: the frames of the file; they are read only as far as needed.
+        sensor: the sensor that sent the frames.
+        batches: the frames of the file; iterated only as far as needed.
     """
     first = FirstFrames()
     missing = set(sensor.state)
@@ -78,7 +78,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
 def _find_reference(
     sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
-    """Return the first reference of the clock in some frames; None if none is valid."""
+    """Return the first valid reference of the clock in some frames, else None."""
     assert sensor.clock is not None
     table = get_codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:

@@ -1,6 +1,6 @@
 """Watch the data link of a live sensor.
 
-`LinkState` reports silence, bytes without frames, and a lost device, each with the next command.
+`LinkState` warns of silence, bytes without frames and a lost device, and suggests a command to run.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
 
-#: if bytes arrive without a frame for this time, a warning reports it.
+#: A warning is given if bytes arrive without a frame for this time.
 FRAMELESS_WARNING_S = 0.9
-#: a source is silent after this time; a busy computer does not stall this long.
+#: A source without data for this time is silent. Even a busy computer reads more often.
 SILENT_AFTER_S = 3.0
 
 
@@ -98,7 +98,7 @@ class LinkState:
 
     @property
     def warnings(self) -> list[str]:
-        """The current problem of the link, with the next command; empty without a problem."""
+        """A warning about the current problem of the link; empty without a problem."""
         name = self.name
         if name == "disconnected":
             text = "the device is disconnected; waiting for it to return"
@@ -113,7 +113,7 @@ class LinkState:
         return [f"{self._source}: {text}; next: {self.suggest_command()}"]
 
     def suggest_command(self) -> str:
-        """Return the command that diagnoses the current problem."""
+        """Return the shell command, or the step, that helps with the current problem."""
         other = self._other_sender
         if other is not None and self.name == "silent":
             chosen = with_option(self._source, "src", endpoint(other))
@@ -127,7 +127,7 @@ class LinkState:
         return self._senders.other_sender or self._transport.other_sender
 
     def _describe_others(self) -> str:
-        """Return a clause about datagrams of other senders, "" if there are none."""
+        """Return a clause about datagrams of other senders; "" if none have arrived."""
         other = self._other_sender
         if other is None:
             return ""
@@ -139,13 +139,13 @@ class LinkState:
 
     @property
     def _frameless_bytes(self) -> int:
-        """Bytes since the last frame."""
+        """The number of bytes since the last frame."""
         return self._decoder.stats.bytes_in - self._framed_bytes
 
     def _is_frameless(self) -> bool:
-        """Return whether bytes without a frame have arrived for long.
+        """Return whether bytes have arrived for a long time without a frame.
 
-        Fewer bytes than the longest frame has do not count.
+        False until more bytes than the longest frame have arrived.
         """
         if self._frameless_since is None:
             return False

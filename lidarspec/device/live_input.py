@@ -2,10 +2,10 @@
 
 The capture threads queue chunks, which are decoded together every few milliseconds.
 
-`next` decodes the chunks that have arrived and returns the frames. While it waits, it drives the
-`Session`: it sends requests, passes the session the frames that may be replies, and the current
-time. Only one thread may run the decoders at a time; `send` in another thread waits for its reply
-while they run. `LinkState` watches the data link.
+`next` decodes the chunks that have arrived and returns the frames. While it waits, it also runs the
+`Session`: it sends requests, and passes frames that may be replies to the session. Only one thread
+may run the decoders at a time. If `send` is called in another thread meanwhile, it waits for its
+reply. `LinkState` watches the data link.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 
 #: time between two decodings of the data that has arrived.
 PERIOD_S = 0.02
-#: the longest wait for data, after which another thread may run the decoders.
+#: A thread waits for data at most this long before other threads may run the decoders.
 MAX_PUMP_S = 0.05
 #: how long `write` waits for a datagram if the address is known only from its first datagram.
 SENDER_TIMEOUT_S = 0.9
@@ -62,12 +62,12 @@ class LiveInput(DeviceInput):
 
     Args:
         source: the source.
-        sensor: its sensor.
+        sensor: the sensor on the source.
         opened: the open transport of the data link.
         backend: calculates points: "auto", "numpy" or "jit".
-        policy: the policy of a full queue, "drop_oldest" or "block".
-        record: makes the recorder for the configured sensor, or returns None. The recorder gets
-            everything that is sent or arrives, before it is queued.
+        policy: what happens if the queue is full, "drop_oldest" or "block"; see `BoundedQueue`.
+        record: a function that makes the recorder for the configured sensor, or returns None. The
+            recorder gets all data that is sent or arrives.
         will_begin: whether `begin` will be called. If the sensor then reports options, all earlier
             data is discarded.
         period: seconds between two decodings.
@@ -192,7 +192,9 @@ class LiveInput(DeviceInput):
                         " reported"
                     )
                 elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
-                    self._reported_warnings.append(f"{error}; the sensor sends data anyway")
+                    self._reported_warnings.append(
+                        f"{error}; the sensor sends data, so reading continues"
+                    )
                 else:
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
@@ -282,7 +284,7 @@ class LiveInput(DeviceInput):
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _find_own_address(self, name: str) -> None:
-        """Set the session's host if a command contains this computer's address."""
+        """Find this computer's address and pass it to the session, if a command needs it."""
         command = self.sensor.commands.get(name)
         if command is not None and any(
             isinstance(value, Address) for value in command.filled.values()
@@ -528,7 +530,7 @@ class LiveInput(DeviceInput):
                 ]
                 self._reported_warnings += [
                     f"{self._source}: the sensor that reconnected reports another {name}: open"
-                    " it again"
+                    " the device again"
                     for name in changed
                 ]
 

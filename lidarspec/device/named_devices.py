@@ -107,8 +107,8 @@ class NamedDevice:
             reason = f"sensor {self.sensor!r} is a Python file, which would be executed"
         elif is_remote(self.source):
             reason = (
-                f"source {self.source!r} is a URL, which would be contacted or could lead"
-                f" outside {folder}"
+                f"source {self.source!r} is a URL, which could lead to any host, or to a"
+                f" file outside {folder}"
             )
         elif os.path.isfile(file):
             try:
@@ -158,7 +158,8 @@ def find_device(source: str | Path) -> NamedDevice | None:
         raise refusal
     if device.shadowed_file:
         warnings.warn(
-            f"{word}: using the device of {device.file}, not the one of {device.shadowed_file}",
+            f"{word}: using the device of {device.file}; the device of {device.shadowed_file}"
+            " is ignored",
             stacklevel=2,
         )
     return device

@@ -20,9 +20,9 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream, iter_released
 from lidarspec.sensor_operations import Sensor
 
-#: Number of batches that are kept until the type of the data frames is known.
+#: Maximum number of batches that are kept until the type of the data frames is known.
 _MAX_UNDECIDED_BATCHES = 256
-#: Number of IMU samples that are kept for a scan that does not end.
+#: Maximum number of IMU samples that are kept until a scan ends.
 _MAX_WAITING_IMU_SAMPLES = 1 << 16
 
 
@@ -34,7 +34,7 @@ class PacketReader:
         frame: the frame type; None for the data frame. If the sensor has several data frame types,
             None selects the type that arrives first.
         decoder: the decoder that finds the frames.
-        first: the frames that count as seen before the first packet.
+        first: the frames that are used as if they had arrived before the first packet.
 
     Attributes:
         last: the packets of the last batch.

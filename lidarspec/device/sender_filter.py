@@ -22,7 +22,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
-#: maximum number of senders that are examined to find the sensor, and of remembered ports.
+#: Maximum number of senders that are examined to find the sensor, and of stored ports.
 MAX_SENDERS = 16
 
 
@@ -127,7 +127,7 @@ class SenderFilter(SenderCheck):
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Select a sender that has replied on another link, unless one is selected."""
+        """Select a sender that replied on another link, unless one sends data frames already."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
@@ -138,7 +138,7 @@ class SenderFilter(SenderCheck):
             return []
         text = (
             f"{self._source}: reading {endpoint(self._owner)}; ignoring"
-            f" {endpoint(self.other_sender)}, which sends as well"
+            f" {endpoint(self.other_sender)}, which also sends data"
         )
         other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
         return [f"{text}; next: repeat with {other} to read the other sender"]
@@ -169,8 +169,8 @@ class SenderFilter(SenderCheck):
         Other ports at the same address belong to other sensors.
 
         Args:
-            sent: the type and the sender of each frame; if one sender sent all frames, each type
-                once.
+            sent: the type and the sender of each frame. If one sender sent all frames, each type is
+                listed once.
             frames: frames from the address of the sensor.
         """
         count_before = len(self._other_senders)
@@ -188,7 +188,7 @@ class SenderFilter(SenderCheck):
         return frames.select(np.array(mine, np.bool_))
 
     def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Decide from a chunk whether its sender is the sensor, and store it if so.
+        """Store the sender of a chunk as the sensor if the frames in the chunk show this.
 
         Returns:
             Whether the sender replaces another sender.

@@ -1,9 +1,9 @@
 """Commands and their replies, without I/O.
 
 Requests go in, and bytes to send come out; frames go in, and replies come out. The caller passes
-all times, in ns of one monotonic clock. Each link has one current request. Further requests wait in
-a queue, also while the device settles. All frames that arrive on the link, data or not, are
-compared with the expected reply.
+all times, in ns of one monotonic clock. Each link has at most one current request. Further requests
+wait in a queue until the current request is done and the device has settled. All frames that arrive
+on the link, including data frames, are compared with the expected reply.
 
 A late reply must not be used as the reply to the next request. If no reply to a command arrives in
 time, the session still expects the reply until twice the timeout has passed. If this late reply
@@ -156,7 +156,10 @@ class ExpectedReply:
     refusal: str | None = None
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
-        """Return the differences between a frame and the reply in words; empty if equal."""
+        """Return a list of the differences between a frame and the expected reply.
+
+        Each item is a text; the list is empty if the frame can be the reply.
+        """
         if frame not in self.tables:
             return [f"a {frame} frame"]
         expected = {
@@ -171,7 +174,7 @@ class ExpectedReply:
         return [f"{path} {value} instead of {expected[path]}" for path, value in wrong]
 
     def overlaps(self, other: ExpectedReply) -> bool:
-        """Return whether one frame could be both replies."""
+        """Return whether a frame could be the reply to both requests."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -217,7 +220,7 @@ class _PendingCommand:
     Attributes:
         timeout: time from the first sending until the command fails, ns.
         sent: the times of all sendings, ns.
-        wrong: the last frame of the reply's type that was not the reply, with the differences.
+        wrong: a description of the last frame that had the type of the reply, but other values.
     """
 
     name: str
@@ -235,7 +238,7 @@ class _PendingCommand:
 
     @property
     def next_sending(self) -> int | None:
-        """The time at which the command is sent again; None if it is not."""
+        """The time at which the command is sent again, ns; None if it is not sent again."""
         next_time = self.sent[-1] + _to_ns(self.command.timeout)
         if len(self.sent) <= self.command.retries and next_time < self.fails_at:
             return next_time
@@ -243,7 +246,7 @@ class _PendingCommand:
 
     @property
     def max_reply_delay(self) -> int:
-        """The time after a sending in which a late reply is possible, ns."""
+        """The time after each sending during which a late reply can arrive, ns."""
         return 2 * max(self.timeout, _to_ns(self.command.timeout))
 
 
@@ -272,7 +275,7 @@ class _LinkQueue:
     quiet_until: int = 0
 
     def next_sending(self) -> int | None:
-        """Return the time at which the next request may be sent; None if none waits."""
+        """Return the time at which the next request may be sent; None if no request waits."""
         if self.current is not None or not self.queue:
             return None
         expected = self.queue[0].expected
@@ -306,12 +309,13 @@ class _Heartbeat:
 class Session:
     """The commands of one sensor on its links.
 
-    Pass every arriving frame to it, including the frames that `Decoder.idle` finds in silence: if a
-    device stops in the middle of a frame, its reply looks like the rest of that frame.
+    Pass every arriving frame to `receive`, including the frames that `Decoder.idle` returns when
+    the link falls silent. If a device stops in the middle of a frame, the decoder at first takes
+    its reply for the rest of that frame.
 
     Attributes:
         sensor: the sensor.
-        started: whether the last command that starts or stops the sensor was one that starts it.
+        started: whether the sensor was started, and was not stopped afterwards.
         late: number of replies that arrived after their timeout.
         unanswered: command -> error, of heartbeats without a reply.
         host: the address of this computer as seen by the sensor; None if unknown.
@@ -333,7 +337,7 @@ class Session:
     ) -> PendingReply:
         """Queue a command, and return its future reply.
 
-        It is sent as soon as its link is free.
+        The command is sent as soon as its link is free.
 
         Args:
             name: the name of the command.
@@ -382,7 +386,10 @@ class Session:
         return out
 
     def awaited_frames(self, link: str = "data") -> frozenset[str]:
-        """Return the frame types that `receive` needs from a link; it ignores all others."""
+        """Return the frame types of a link that can be replies.
+
+        `receive` ignores all other types.
+        """
         line = self._lines.get(link)
         if line is None:
             return frozenset()
@@ -428,7 +435,7 @@ class Session:
 
     @property
     def deadline(self) -> int | None:
-        """The time at which `tick` has to be called next, ns; None if it has not."""
+        """The time at which `tick` has to be called next, ns; None if nothing will be due."""
         times = [beat.due for beat in self._heartbeats.values()]
         for line in self._lines.values():
             current = line.current
@@ -444,13 +451,13 @@ class Session:
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Fail all requests and stop all heartbeats, because no reply is to be expected.
+        """Fail all requests and stop all heartbeats, because no reply can arrive.
 
         Late replies to commands that were sent are still recognised.
 
         Args:
             reason: the text of the error.
-            link: limits this to one link; None for all links.
+            link: the link on which requests fail; None for all links.
         """
         for name in [
             name for name in self._heartbeats if link in (None, self.sensor.commands[name].link)
@@ -475,9 +482,9 @@ class Session:
         return {}
 
     def _fill_value(self, value: Filled) -> Any:
-        """Return a value that is known only when a command is sent.
+        """Return the address of this computer, or the next running number.
 
-        It is the address of this computer, or the next number of the session.
+        These values are known only when a command is sent.
         """
         if isinstance(value, Address):
             return self.host
@@ -538,9 +545,9 @@ class Session:
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
     def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
-        """Fail the oldest request without a reply if a frame refuses it.
+        """Fail the oldest unanswered request if a frame is a refusal.
 
-        The frame does not name the request that it refuses.
+        A refusal does not name the refused request, so the oldest one is assumed.
 
         Returns:
             Whether the frame is a refusal.

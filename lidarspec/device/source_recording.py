@@ -35,7 +35,7 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: time between two checks of the limits and of the disk.
 CHECK_PERIOD_S = 0.1
-#: the numbers in a warning, which are ignored to detect repeated warnings.
+#: Numbers in a warning. Warnings that differ only in numbers are reported once.
 _NUMBERS = re.compile(r"[\d.]+")
 
 
@@ -82,7 +82,7 @@ class TimedLog:
     Attributes:
         first: arrival time of the first recorded chunk, ns; None if nothing has arrived.
         last: arrival time of the last recorded chunk, ns; None if nothing has arrived.
-        is_over: whether all further arrivals are ignored.
+        is_over: whether the limit has passed, so that further arrivals are ignored.
     """
 
     def __init__(self, recorder: BackgroundWriter, seconds: float | None) -> None:
@@ -309,7 +309,7 @@ class SourceRecording:
         return events
 
     def _copy(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
-        """Copy a file; give data of standard input its time of arrival."""
+        """Copy a file. Data from standard input is recorded with its time of arrival."""
         clock = HostClock()
         assert self.recorder is not None
         for chunk in source.chunks():
@@ -324,7 +324,7 @@ class SourceRecording:
             self.packets += source.datagrams
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
-        """Create the recording of an open source and its configured sensor."""
+        """Create the file that an open source with a configured sensor is recorded to."""
         counts = source.datagrams or (
             self._sensor is not None and isinstance(source, LiveTransport)
         )
@@ -362,7 +362,10 @@ class SourceRecording:
 
 
 def _next_arrival_times(device: Device) -> NDArray[np.int64]:
-    """Return the arrival times of the next packets, ns; of all frames if none has points."""
+    """Return the arrival times of the next packets, (n,) ns since 1970.
+
+    If the sensor has no points, they are the arrival times of its main frames.
+    """
     if device.sensor.has_points:
         packets = next(device.packets(wait=CHECK_PERIOD_S), None)
         batches = [] if packets is None else [packets]

@@ -1,19 +1,19 @@
-"""Packets: frames of one type in order and in time.
+"""Packets: the frames of one type as columns, with their times and losses.
 
-In: `Frames` out of a decoder. Out: `Packets`, the frames of one type as columns, with the times,
-indices and breaks that follow from the sensor's clock and counter, and with the last frames of
-other types. Modules in reading order:
+These modules turn the `Frames` of a decoder into `Packets`. Each packet gets a time from the
+sensor's clock and an index from its counter, so that lost packets are known. Frames of other types
+that the packets need are kept with them. Modules in reading order:
 
 * `packets`: the columns of n frames, raw and physical.
-* `clocks`: the sensor's own time as integer nanoseconds that run on.
-* `pace`: the time that a packet takes by the clock, as declared.
-* `counter_order`: lost, duplicate and late packets by their counter.
-* `clock_order`: the same by the clock, for datagrams without a counter.
-* `arrival_order`: lost packets of streams without a counter, which arrive in order.
-* `masked_sector`: sectors in which a rotating sensor sends nothing, which are no loss.
-* `reorder`: packets put back in order, duplicates left out.
+* `clocks`: reads and unwraps the sensor's clock, in integer nanoseconds.
+* `pace`: the declared time from one packet to the next.
+* `counter_order`: finds lost, duplicate and late packets by their counter.
+* `clock_order`: finds them by the clock, for datagrams without a counter.
+* `arrival_order`: counts lost packets that have no counter and always arrive in order.
+* `masked_sector`: finds sectors in which a rotating sensor sends nothing on purpose.
+* `reorder`: sorts packets and drops duplicates.
 * `imu`: the samples of an IMU.
 * `packet_type`: the clock and the loss detection of one frame type.
-* `stream`: from frames to packets, batch by batch.
+* `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
 """

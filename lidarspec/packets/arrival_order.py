@@ -1,11 +1,12 @@
 """Count losses among packets that always arrive in order.
 
-These are packets of byte streams, and datagrams without a counter and without a clock.
+They are packets of byte streams, and datagrams with neither a counter nor a clock.
 
-`ArrivalOrder` numbers the packets as they arrive and leaves out as many numbers as packets are
-missing. Skipped bytes count as packets of the largest size so far. A step of the clock that is
-longer than the declared pace counts as lost packets. If the resolution of the clock is coarser
-than half a packet, it shows only long gaps, and the larger of both counts applies.
+`ArrivalOrder` numbers the packets as they arrive, and leaves out a number for each missing packet.
+It estimates the missing packets in two ways. Skipped bytes are divided by the size of the largest
+packet so far. If the sensor has a clock with a declared pace, the time that has passed is divided
+by the pace. The clock decides if its resolution is at least half a packet. Otherwise the larger of
+the two estimates is used.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from lidarspec.spec.timing import Clock
 
 
 class ArrivalOrder:
-    """The index and losses of the packets of one stream, in the order of arrival.
+    """Numbers the packets of one stream as they arrive, and counts lost packets.
 
     Args:
         stats: counts the lost packets.
         clock: the clock of the packets; None to find losses by skipped bytes alone.
-        grain_ns: the step of the clock; 0 if it is fine or computed by a function.
+        grain_ns: the resolution of the clock in ns; 0 if it is fine or unknown.
     """
 
     def __init__(self, stats: Counters, clock: Clock | None, grain_ns: float) -> None:
@@ -47,7 +48,8 @@ class ArrivalOrder:
         """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
         Args:
-            batch: the packets; `breaks` marks skipped bytes, and further breaks are added to it.
+            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them;
+                this adds marks for lost packets.
             times: times by the sensor's clock, (n,) ns; None without a clock.
             skipped: number of bytes outside frames before each packet, (n,).
         """
@@ -71,15 +73,15 @@ class ArrivalOrder:
         return partial(_make_index_with_gaps, first, count, rows, missing), batch.breaks
 
     def forget(self) -> None:
-        """Ignore the clock at the next packet: time has passed that no packet shows."""
+        """Do not compare the clock of the next packet with the last one, after lost input."""
         self._time = None
 
     def _count_skipped(
         self, batch: Batch, skipped: NDArray[np.int64]
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows that have skipped bytes before them, and the packets lost there.
+        """Return the rows after skipped bytes, and the number of packets lost before each.
 
-        The number of lost packets is the skipped bytes divided by the size of a packet.
+        This number is the number of skipped bytes divided by the size of a packet.
         """
         sizes = batch.table.sizes
         size = broadcast_value(sizes)
@@ -103,9 +105,9 @@ class ArrivalOrder:
         skipped_rows: NDArray[np.intp],
         skipped_packets: NDArray[np.int64],
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows that may have a gap before them, and the packets missing there.
+        """Return the rows that may follow a gap, and the number of packets missing there.
 
-        Only losses that the clock confirms are counted in `lost`: skipped bytes are no packets.
+        The missing packets are also added to `Counters.lost`, unless the clock was set.
         """
         steps = np.diff(times, prepend=times.item(0) - 1 if self._time is None else self._time)
         self._time = times.item(-1)
@@ -137,7 +139,7 @@ def _make_index_with_gaps(
     """Return consecutive indices from `first` on, (count,), with gaps for losses.
 
     Args:
-        rows: the packets that have a gap before them.
+        rows: the rows of the packets after each gap.
         missing: the number of packets missing in each gap.
     """
     index = np.ones(count, np.int64)

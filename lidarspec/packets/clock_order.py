@@ -1,20 +1,20 @@
 """Order of datagrams that have a clock but no counter.
 
-`ClockOrder` judges datagrams as they arrive. A datagram follows the newest one, or is late, or is a
-duplicate, or comes after a gap or after the clock was set. The newest packets are remembered in the
-order of their times. A packet with the time and the bytes of a remembered packet is a duplicate;
-bytes are compared by their CRC-32. A late packet is inserted between its neighbours, and the
-packets missing there are counted again. So the counters end up as if the packets had arrived in
-order.
+`ClockOrder` compares each datagram with the newest packets, which it stores in the order of their
+times. The datagram directly follows the newest packet, or follows it after a gap, or is late, or is
+a duplicate, or shows that the clock was set. A packet with the time and the bytes of a stored
+packet is a duplicate; bytes are compared by their CRC-32. A late packet is inserted between its
+neighbours, and the number of packets missing there is corrected. The counters are finally the same
+as if the packets had arrived in order.
 
-Each packet gets an index and an order. The index also counts missing packets. The order is the time
-of the packet since the first packet, in nanoseconds. Packets of equal time that are not duplicates
-get different orders. If the clock was set or the sensor restarted, the order leaps by
-`2 * MAX_STEP_NS`. Packets sorted by order and judged by another `ClockOrder` get the index and the
-breaks that they would have got had they arrived in order.
+Each packet gets an index, a sequence number that leaves out a number for each missing packet, and
+an order, which is its sort key. The order is the time of the packet since the first packet, in
+nanoseconds. Packets of equal time that are not duplicates get different orders. If the clock was
+set or the sensor restarted, the order increases by `2 * MAX_STEP_NS`. To get the final index and
+breaks, sort the packets by their order and pass them to another `ClockOrder`.
 
-If the pace of the clock is not declared, order and duplicates are known, but not losses: the index
-then has no gaps. A gap at a masked sector (`masked_sector`) is not a loss.
+If the pace of the clock is not declared, lost packets are not found, and the index has no gaps. A
+gap at a masked sector (`masked_sector`) is not a loss.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.spec.timing import Clock
 
-#: the number of places that a packet may be late. If the clock goes back further, it was set or the
-#: sensor restarted.
+#: The number of places by which a packet can be late. If the clock goes back further, it was set or
+#: the sensor restarted.
 MAX_PLACES_LATE = 64
-#: the time that a packet may be late if the pace is unknown.
+#: The time by which a packet can be late if the pace is unknown.
 MAX_LATE_NS = 10**9
-#: the number of packets with a remembered checksum. An older packet with the same time counts as a
-#: duplicate without comparing bytes.
+#: The number of newest packets with a stored checksum. A packet with the time of an older packet
+#: counts as a duplicate; their bytes are not compared.
 REMEMBERED_CHECKSUMS = 16
 
 _time_of = attrgetter("time")
@@ -53,11 +53,12 @@ class RecentPacket:
 
     Attributes:
         time: the time by the sensor's clock, ns.
-        order, index: see the module.
-        missing: the number of packets missing between it and the packet before it in time.
-        checksum: the CRC-32 of its bytes; None if it is no longer remembered.
+        order: the sort key, ns.
+        index: the sequence number, which also counts missing packets.
+        missing: the number of packets missing directly before this packet.
+        checksum: the CRC-32 of its bytes; None if it is no longer stored.
         angle: the angle at which it begins, in turns; nan if unknown.
-        masked: the number of packets that a masked sector leaves out before it.
+        masked: the number of packets directly before this packet that a masked sector leaves out.
     """
 
     time: int
@@ -70,12 +71,12 @@ class RecentPacket:
 
 
 class ClockOrder:
-    """Order, losses and duplicates of the datagrams of one stream, by their clock.
+    """Finds lost, late and duplicate datagrams of one stream by their clock.
 
     Args:
         stats: counts lost, late and duplicate packets.
         clock: the clock of the packets.
-        gaps: finds gaps at masked sectors; None to count all gaps as losses.
+        gaps: recognizes gaps at masked sectors; None to count all gaps as losses.
     """
 
     def __init__(self, stats: Counters, clock: Clock, gaps: MaskedGaps | None = None) -> None:
@@ -130,7 +131,7 @@ class ClockOrder:
     def forget(self) -> None:
         """Treat the next packet as the first one after the clock was set.
 
-        This is called after lost input, when the time that has passed is unknown.
+        Call this after input was lost, since the number of lost packets is then unknown.
         """
         self._arrived = None
         self._neighbours.clear()
@@ -138,7 +139,7 @@ class ClockOrder:
             self._gaps.forget()
 
     def _find_odd(self, times: Times, paces: Paces) -> list[int]:
-        """Return the rows of packets that do not follow the packet that arrived before."""
+        """Return the rows of packets that do not directly follow the previous packet."""
         passed = np.empty(len(times), np.int64)
         passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
         np.subtract(times[1:], times[:-1], out=passed[1:])
@@ -148,17 +149,18 @@ class ClockOrder:
         return np.flatnonzero(is_odd).tolist()
 
     def _follows(self, time: int, pace: float) -> bool:
-        """Return whether a packet is the next one after the newest."""
+        """Return whether a packet directly follows the newest packet."""
         if not self._neighbours:
             return False
         passed = time - self._neighbours[-1].time
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Append consecutive packets to the newest ones, and return the first index.
+        """Append consecutive packets to the newest ones, and return their first index.
 
         Args:
-            start, stop: the rows of the packets.
+            start: the row of the first packet.
+            stop: the row after the last packet.
         """
         assert self._newest is not None
         first = self._newest.index + 1
@@ -175,7 +177,10 @@ class ClockOrder:
         return first
 
     def _place(self, batch: Batch, row: int, time: int, pace: float) -> RecentPacket:
-        """Place a packet that does not follow the newest one, and count losses."""
+        """Return the order and index of a packet that does not directly follow the newest.
+
+        This also updates the counters of lost, late and duplicate packets.
+        """
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
             return self._begin(batch, row, time, checksum)
@@ -222,17 +227,17 @@ class ClockOrder:
 
     @property
     def _places_late(self) -> int:
-        """The number of places that a packet may be late."""
+        """The maximum number of places by which a packet can be late."""
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock leaps back to its value before the last leap."""
+        """Return whether the clock returns to its value before the last leap."""
         assert self._leap is not None
         reach = self._places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock goes back further than a late packet explains."""
+        """Return whether the clock goes back further than for a late packet."""
         if pace > 0:
             return passed < -self._places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
@@ -241,7 +246,7 @@ class ClockOrder:
     def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
         """Begin with a first packet, or again after the clock was set.
 
-        After the clock was set the index leaves out one number.
+        After the clock was set, the index leaves out one number.
         """
         before = self._newest
         if before is None:
@@ -264,10 +269,10 @@ class ClockOrder:
     def _insert(
         self, position: int, row: int, time: int, pace: float, checksum: int
     ) -> RecentPacket:
-        """Insert a late packet before a neighbour, and recount the losses on both sides.
+        """Insert a late packet, and correct the number of lost packets on both sides.
 
         Args:
-            position: the index of the neighbour after it in time.
+            position: the position in `_neighbours` of the next packet by time.
         """
         self._stats.late += 1
         after = self._neighbours[position]
@@ -292,7 +297,7 @@ class ClockOrder:
         return placed
 
     def _trim(self) -> None:
-        """Forget packets that are too old to have late neighbours."""
+        """Remove stored packets that are too old to have late neighbours."""
         if len(self._neighbours) > MAX_PLACES_LATE:
             del self._neighbours[:-MAX_PLACES_LATE]
         for neighbour in reversed(self._neighbours[:-REMEMBERED_CHECKSUMS]):
@@ -302,7 +307,12 @@ class ClockOrder:
 
 
 def _count_missing(passed: int, pace: float) -> int:
-    """Return the number of packets missing in a step of the clock."""
+    """Return the number of packets missing between two packets.
+
+    Args:
+        passed: the time between the packets, ns.
+        pace: the time that each packet takes, ns; nan or 0 if unknown.
+    """
     if not pace > 0:
         return 0
     return max(math.ceil(passed / pace - 0.5), 1) - 1

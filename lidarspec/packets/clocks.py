@@ -22,19 +22,19 @@ from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 
-#: larger readings (over 285 years) are clipped, so that damaged readings do not overflow.
+#: Larger readings (over 285 years) are reduced to this, so that corrupt readings do not overflow.
 _MAX_READING_NS = 9 * 10**18
 
 
 class Unwrapper:
-    """A clock that starts again after `wraps_at` seconds, unwrapped.
+    """Unwraps the readings of a clock that starts again after `wraps_at` seconds.
 
     The result is exact over any number of wraps.
 
-    A step of more than half a wrap period counts as a step backward, so late packets go back in
-    time. Arrival times decide in two cases: after a pause of more than three quarters of a period
-    they give the number of wraps, and after more than half a period they can show that the step was
-    forward.
+    A reading that is ahead by more than half a wrap period counts as a step backward, because the
+    packet is late. Arrival times decide in two cases: after a pause of more than three quarters of
+    a period they give the number of wraps, and after more than half a period they can show that the
+    step was forward.
     """
 
     def __init__(self, wraps_at: float | None) -> None:
@@ -82,12 +82,10 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """A clock reading and the date that a frame reported for it (`Clock.reference`).
-
-    It is found before the packets that it applies to.
+    """The date that a frame reported for a clock reading (see `Clock.reference`).
 
     Attributes:
-        reading_ns: the reading of the clock in that frame.
+        reading_ns: the reading of the clock in the frame, ns.
         reported_s: the seconds since 1970 that the frame reported.
         host_ns: the arrival time of the frame, ns since 1970; 0 if unknown.
     """
@@ -104,9 +102,9 @@ class ClockEpoch:
 
     Args:
         sensor: the sensor that declares the clock.
-        clock: that clock.
-        reference: applies from the first packet on; None if the offset is unknown until a frame
-            reports the date.
+        clock: the clock.
+        reference: the reference that dates the clock from the first packet on; None if the offset
+            is unknown until a frame reports the date.
 
     Attributes:
         frame: the type of the frames that report the date.
@@ -130,15 +128,15 @@ class ClockEpoch:
     ) -> Times:
         """Return the offset to add to the times of packets, (n,) ns.
 
-        It is 0 for packets before the first frame that reports the date, unless that date applies
-        to all packets.
+        The offset is 0 for packets before the first frame that reports the date, unless `whole` is
+        set.
 
         Args:
             batch: the packets.
             readings: the readings of the clock, (n,) ns.
             times: the same readings, unwrapped, (n,) ns.
             host: arrival times, (n,) ns; 0 if unknown.
-            whole: whether the packets are a whole input: the first date then applies to all
+            whole: whether the packets are the whole input. If so, the first date applies to all
                 packets.
         """
         if self.ns is None and self._reference is not None:
@@ -165,10 +163,12 @@ class ClockEpoch:
         return np.where(np.arange(len(times)) < first, 0, self.ns)
 
     def _find_offset(self, reference: ClockReference, reading: int, time: int, host: int) -> int:
-        """Return the offset that follows from the reference and one packet.
+        """Return the offset to add to times, from the reference and one packet.
 
         Args:
-            reading, time, host: the reading, the unwrapped time and the arrival time of the packet.
+            reading: the clock reading of the packet, ns.
+            time: the unwrapped time of the packet, ns.
+            host: the arrival time of the packet, ns; 0 if unknown.
         """
         passed = self._fold_step(reference.reading_ns - reading)
         if host and reference.host_ns:
@@ -176,16 +176,21 @@ class ClockEpoch:
         return self._find_nearest_time(reference.reading_ns, reference.reported_s) - time - passed
 
     def _find_nearest_time(self, reading: int, seconds: float) -> int:
-        """Return the time that has a reading and is nearest to some seconds since 1970."""
+        """Return the time nearest to a date at which the clock shows a reading, ns.
+
+        Args:
+            reading: the reading, ns.
+            seconds: the date, seconds since 1970.
+        """
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
     def _fold_step(self, step: int) -> int:
-        """Return a step of the clock, folded to at most half a wrap period."""
+        """Return a step of the clock, reduced to at most half a wrap period, ns."""
         return (step + self._period_ns // 2) % self._period_ns - self._period_ns // 2
 
 
 def reported_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
-    """Return the seconds since 1970 that frames report, (n,); nan if not reported."""
+    """Return the date that each frame reports, (n,) s since 1970; nan if not reported."""
     assert clock.reference is not None
     frames = Batch(table, np.zeros(len(table), np.bool_))
     seconds = np.asarray(clock.reference[1](Fields(frames)), np.float64)
@@ -200,8 +205,8 @@ def reference_readings(sensor: SensorDescription, table: Table) -> Times:
 def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     """Return the clock reading of each packet, (n,) int64 ns, not unwrapped.
 
-    If the clock is in the parts of a frame, the reading of the first part counts. A frame without
-    parts has the reading of the frame before.
+    If the parts of a frame have the clock, this is the reading of the first part. A frame without
+    parts gets the reading of the previous frame.
     """
     which, readings = read_clock(sensor, batch)
     if which is None:
@@ -210,9 +215,10 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
 
 
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
-    """Return the packets that have a clock reading (None: all), and the readings.
+    """Return the rows of packets that have a clock reading, and the readings in ns.
 
-    If the clock is in parts, the first part counts.
+    The rows are None if all packets have a reading. If the parts of a frame have the clock, this is
+    the reading of the first part.
     """
     assert sensor.clock is not None
     fields = clock_fields(sensor.clock)
@@ -229,12 +235,12 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
 
 
 def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
-    """Return the times of some packets, each held until the next of them, (n,).
+    """Return the times of packets, (n,); a packet without a time gets the previous one.
 
     Args:
-        which: the packets that have a time, ascending, (k,).
-        times: their times, (k,).
-        before: the times of packets before the first of them, (n,).
+        which: the rows of the packets that have a time, ascending, (k,).
+        times: the times of these packets, (k,).
+        before: the times that packets before the first of these rows get, (n,).
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
@@ -269,7 +275,7 @@ def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
 def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
     """Return the axis and the kind of the parts that have the fields of a clock.
 
-    Returns None if the frame itself has them.
+    Returns None if the frame itself has these fields.
     """
     places = set[tuple[str, str]]()
     for path in fields:
@@ -291,7 +297,7 @@ def part_times(
     which: NDArray[np.intp],
     times: Times,
 ) -> Times:
-    """Return the times of parts, (k,); each has its own time if parts have the clock.
+    """Return the times of parts, (k,) ns: their own, or the times of their frames.
 
     Args:
         place: the axis and the kind of the parts.
@@ -329,12 +335,12 @@ def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table)
 
 @lru_cache(maxsize=256)
 def _to_exact_ns(seconds: float) -> int:
-    """Return seconds as nanoseconds, exact for the decimal number as written."""
+    """Return seconds as nanoseconds, exact for the shortest decimal form of the number."""
     return int(to_exact(seconds) * 10**9)
 
 
 def clock_fields(clock: Clock) -> tuple[str, ...]:
-    """Return the fields that add up to a clock; none if a function computes it."""
+    """Return the paths of the fields that add up to a clock; () if a function computes it."""
     if isinstance(clock.source, str):
         return (clock.source,)
     if callable(clock.source):
@@ -348,8 +354,9 @@ def clock_terms(
 ) -> list[tuple[str, Any, Any, int]]:
     """Return the fields that add up to a clock.
 
-    Each is a tuple: the path, the nanoseconds of one step, the nanoseconds at 0, and the largest
-    raw value that cannot overflow (0 if the nanoseconds are fractions).
+    Each item is a tuple: the path of the field, the nanoseconds of a raw step of 1, the nanoseconds
+    of the raw value 0, and the largest raw value that cannot overflow (0 if the nanoseconds are
+    fractions).
 
     Raises:
         SpecError: if a field has no unit of time, or does not have one value in each packet.
@@ -364,7 +371,7 @@ def clock_terms(
         if info is None or scaling is None or info.axes:
             reason = "a clock must be a field with a unit of time, outside of arrays"
             raise SpecError(
-                reason if info else "no data frame has this field for the clock",
+                reason if info else "the clock uses this field, but no data frame has it",
                 path=path,
                 sensor=sensor,
             )
@@ -377,7 +384,7 @@ def clock_terms(
 
 
 def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Return the nanoseconds of one step of a field, and at its zero.
+    """Return the nanoseconds of a raw step of 1, and of the raw value 0, of a field.
 
     They are integers if both are whole, else fractions. Returns None if the unit is not a unit of
     time.
@@ -418,5 +425,5 @@ def _to_ns(seconds: Any, count: int) -> Times:
     else:
         flat = None
     if flat is None:
-        raise SpecError("a clock must have one time per packet")
+        raise SpecError("a clock function must return one time per packet")
     return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)

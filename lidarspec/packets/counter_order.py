@@ -1,13 +1,12 @@
-"""Losses, duplicates and order of packets that have a counter (`PacketCounter`).
+"""Find lost, late and duplicate packets by their counter (`PacketCounter`).
 
-`CounterOrder` gives each packet an index: the counter, unwrapped. The index leaves out as many
-numbers as packets are missing, and a late packet gets the number that was left out for it. Lost,
+`CounterOrder` gives each packet an index, which is the unwrapped counter. The index leaves out a
+number for each missing packet, and a late packet gets the number that was left out for it. Lost,
 late and duplicate packets and the completeness of scans follow from the index.
 
-A clock with a declared pace answers two questions that the counter alone cannot: how often the
-counter wrapped in a gap, and whether a jump of the counter is damage. Without a pace, a gap of
-a whole period of the counter is not seen, and a single damaged number makes two breaks, but no
-loss.
+A clock with a declared pace also shows how often the counter wrapped in a gap, and whether a jump
+of the counter comes from a corrupt value. Without a pace, the loss of a whole period of the counter
+is not found, and a single corrupt value causes two breaks, but no loss.
 
 A gap at a masked sector (`masked_sector`) is not a loss.
 """
@@ -32,16 +31,17 @@ from lidarspec.packets.packets import Index
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, PacketCounter
 
-#: the number of places that a packet may be late; if it is further back, the sensor restarted.
+#: The number of places by which a packet can be late. If it is further back, the sensor restarted.
 MAX_PLACES_LATE = 64
-#: the same for a packet that would come before the first one: there a wrap of the counter during
-#: a loss is more likely.
+#: The limit for a packet that would come before the first one. It is smaller, because a wrap of the
+#: counter during a loss is more likely then.
 MAX_PLACES_EARLY = 10
-#: a counter with at least this many values is reset to 0 only if the sensor restarts.
+#: A counter with at least this many values does not wrap in normal use: if it returns to 0, the
+#: sensor has restarted.
 LONG_PERIOD = 1 << 16
-#: a counter with more values fills 64 bits: differences then wrap without a modulo.
+#: A counter with more values than this fills 64 bits, and its differences wrap by themselves.
 MAX_SIGNED_PERIOD = 1 << 63
-#: limit of the first index and of its steps, so that it fits 64 bits for any counter.
+#: The limit of the first index and of its steps, so that the index fits 64 bits for any counter.
 MAX_INDEX_STEP = 1 << 32
 
 
@@ -51,10 +51,10 @@ class CounterReadings:
 
     Attributes:
         numbers: the values of the counter, (n,).
-        periods: the number of values before the counter wraps, an integer for all packets or (n,).
-        has_counter: whether each packet has the counter, (n,); None if all have it.
-        times: (n,) ns; None without a clock that has a declared pace.
-        steps: the time since the packet that arrived before, (n,) ns; None if `times` is None.
+        periods: the number of values before the counter wraps: an int for all packets, or (n,).
+        has_counter: whether each packet has the counter, (n,); None if all packets have it.
+        times: the times by the sensor's clock, (n,) ns; None without a clock with a declared pace.
+        steps: the time since the previous packet, (n,) ns; None if `times` is None.
         paces: the time that each packet takes, (n,) ns; nan if unknown.
     """
 
@@ -88,7 +88,7 @@ class CounterReadings:
 
 @dataclass
 class CountedLoss:
-    """A gap of the counter, as the number of lost and of masked packets.
+    """The numbers of lost and of masked packets in a gap of the counter.
 
     See `masked_sector.GapLoss`.
     """
@@ -99,7 +99,7 @@ class CountedLoss:
 
 @dataclass(frozen=True)
 class CounterJump:
-    """A jump of the counter that one damaged number may have caused.
+    """A jump of the counter that a single corrupt value may have caused.
 
     Attributes:
         number: the counter of the packet before the jump.
@@ -111,12 +111,12 @@ class CounterJump:
 
 
 class CounterOrder:
-    """Order, losses and duplicates of the packets of one stream, by their counter.
+    """Finds lost, late and duplicate packets of one stream by their counter.
 
     Args:
         sensor: the sensor that declares the counter.
         stats: counts lost, late and duplicate packets.
-        clock: the clock of the packets; it is used if its pace is declared.
+        clock: the clock of the packets; used only if its pace is declared.
     """
 
     def __init__(self, sensor: SensorDescription, stats: Counters, clock: Clock | None) -> None:
@@ -141,7 +141,8 @@ class CounterOrder:
         """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
         Args:
-            batch: the packets; `breaks` marks skipped bytes, and further breaks are added to it.
+            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them;
+                this adds marks for lost packets.
             times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
@@ -174,7 +175,7 @@ class CounterOrder:
         return index, batch.breaks
 
     def forget(self) -> None:
-        """Ignore the clock at the next packet, after lost input of unknown duration."""
+        """Do not compare the clock of the next packet with the last one, after lost input."""
         self._time = None
         self._arrived = None
         self._gaps.forget()
@@ -183,7 +184,10 @@ class CounterOrder:
         """Return the counter and the clock of a batch."""
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
-            raise SpecError("a sequence must be a field outside of arrays", path=self._rule.field)
+            raise SpecError(
+                "the counter of a PacketCounter must be a field outside of arrays",
+                path=self._rule.field,
+            )
         numbers = batch.table.raw(self._rule.field)
         periods = self._find_last_number(batch, (1 << info.bits) - 1) - self._rule.first + 1
         if not isinstance(periods, int) or periods <= MAX_SIGNED_PERIOD:
@@ -204,7 +208,7 @@ class CounterOrder:
         return CounterReadings(numbers, periods, has_counter, times, steps, paces)
 
     def _find_last_number(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
-        """Return the value after which the counter wraps, one or one per packet."""
+        """Return the value after which the counter wraps: an int, or one per packet, (n,)."""
         last = self._rule.last
         if callable(last):
             (values,) = header_function(last, batch.table.schema, _integers)(batch)
@@ -216,7 +220,7 @@ class CounterOrder:
         return int(last)
 
     def _find_odd(self, readings: CounterReadings) -> list[int]:
-        """Return the rows of packets that do not follow the previous one.
+        """Return the rows of packets that do not directly follow the previous packet.
 
         Row 0 is not included.
         """
@@ -245,9 +249,10 @@ class CounterOrder:
     def _count_places_ahead(
         self, readings: CounterReadings, row: int
     ) -> tuple[int | None, int | None]:
-        """Return the places of a packet ahead of the newest, and its corrected number.
+        """Return how many places a packet is ahead of the newest, and its counter value.
 
-        The number of places is None if the sensor has restarted.
+        The counter value is corrected by the clock. The number of places is None if the sensor has
+        restarted.
         """
         number = readings.number(row)
         if number is None:
@@ -279,10 +284,12 @@ class CounterOrder:
         return self._correct(number, time, pace, by_clock)
 
     def _count_by_number(self, ahead: int, period: int) -> int | None:
-        """Return the places ahead by the counter alone; None if the sensor has restarted.
+        """Return how many places a packet is ahead of the newest, by the counter alone.
+
+        Returns None if the sensor has restarted.
 
         Args:
-            ahead: the difference to the newest packet's counter, from 0 to `period` - 1.
+            ahead: the counter minus the newest packet's counter, modulo `period`.
         """
         if ahead == 0:
             return 0
@@ -298,13 +305,13 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Correct the number of a packet by the clock, because counter and clock disagree.
+        """Correct the counter value of a packet that disagrees with the clock.
 
-        If two consecutive numbers disagree with the clock but agree with each other, the counter
-        was reset there.
+        If two consecutive values disagree with the clock but agree with each other, the counter was
+        reset.
 
         Returns:
-            The places ahead and the number.
+            How many places the packet is ahead of the newest, and the corrected counter value.
         """
         ahead = max(round(by_clock), 1)
         suspect = self._suspect
@@ -320,7 +327,7 @@ class CounterOrder:
     def _place(
         self, readings: CounterReadings, row: int, ahead: int | None, number: int | None
     ) -> tuple[int, bool]:
-        """Place a packet that does not follow the newest one.
+        """Return the index of a packet that does not directly follow the newest.
 
         Returns:
             The index, and whether there is a break before the packet.
@@ -348,14 +355,14 @@ class CounterOrder:
         return self._index, is_break
 
     def _note_jump(self, loss: CountedLoss | None) -> None:
-        """Remember a jump of the counter, unless a clock can show that it is damage."""
+        """Store a jump of the counter, unless a clock can show that the value is corrupt."""
         if self._clock is None and self._number is not None:
             self._jump = CounterJump(self._number, loss)
 
     def _is_continued(self, jump: CounterJump, number: int | None) -> bool:
-        """Return whether a number continues from before a jump.
+        """Return whether a counter value continues the sequence before a jump.
 
-        If so, the number at the jump was damaged.
+        If so, the value at the jump was corrupt.
         """
         if number is None:
             return False
@@ -385,7 +392,7 @@ class CounterOrder:
     def _begin(self, number: int | None) -> None:
         """Begin with a first packet, or again after the sensor restarted.
 
-        No loss is counted there; after a restart the index leaves out one number.
+        This counts no loss. After a restart, the index leaves out one number.
         """
         if self._index < 0 and number is not None:
             self._index = (number - self._rule.first) % self._period % MAX_INDEX_STEP
@@ -399,7 +406,7 @@ class CounterOrder:
         """Return the index of a packet that is late or a duplicate, and count it.
 
         Args:
-            behind: the number of places behind the newest packet.
+            behind: how many places the packet is behind the newest packet.
         """
         index = self._index - behind
         if index in self._missing:

@@ -1,4 +1,4 @@
-"""IMU samples of packets, in stream order, and the buffer that assigns them to scans.
+"""The IMU samples of packets, and the buffer that assigns them to scans.
 
 Samples are in SI units and in the axes of the points.
 """
@@ -19,7 +19,8 @@ from lidarspec.points.reference_evaluator import flatten_valid
 from lidarspec.spec.results import Imu
 from lidarspec.spec.sensor import SensorDescription
 
-#: the columns of a sample after its time, in the order in which files list them, and their units.
+#: The units of the columns of a sample, in the order of the columns in files. `time_ns` precedes
+#: them.
 UNITS = {
     **{f"angular_velocity_{axis}": "rad/s" for axis in "xyz"},
     **{f"linear_acceleration_{axis}": "m/s2" for axis in "xyz"},
@@ -73,7 +74,7 @@ class ImuSamples:
 
 
 def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Return samples of several batches as one value, empty if there are no batches."""
+    """Return the samples of several batches as one value; empty if there are no batches."""
     if len(parts) != 1:
         parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
     names = ("time_ns", "angular_velocity", "linear_acceleration")
@@ -88,7 +89,8 @@ def read_samples(
     """Return the IMU samples of packets, in the axes of the points.
 
     Args:
-        frame: the frame type of the packets, or the name of the parts.
+        frame: the frame type of the packets; if the packets are parts of frames, the name of the
+            parts.
         batch: the packets.
         time_ns: the time of each packet, (n,).
 
@@ -101,7 +103,7 @@ def read_samples(
     with plugin_errors(f"imu of {frame}", sensor.id, function), np.errstate(all="ignore"):
         result = function(Fields(batch))
         if not isinstance(result, Imu):
-            raise TypeError(f"must return Imu, not {type(result).__name__}")
+            raise TypeError(f"must return Imu, got {type(result).__name__}")
         values = dict(
             zip(
                 [*UNITS, "time"],
@@ -130,7 +132,7 @@ def read_samples(
 
 
 class WaitingSamples:
-    """Samples that wait for the scan that they belong to.
+    """A buffer of IMU samples until the scan that they belong to has ended.
 
     A scan has the samples from its first point to the first point of the next scan. The first scan
     also has all earlier samples.
@@ -145,9 +147,9 @@ class WaitingSamples:
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Drop all but the newest samples, if there are more than twice as many.
+        """Keep only the newest samples, so that memory is limited if no scan ends.
 
-        This bounds the memory if no scan ends.
+        Nothing is dropped until twice as many samples are stored.
 
         Args:
             most: the number of samples to keep.

@@ -1,12 +1,12 @@
 """Detect masked sectors, in which a rotating sensor sends no packets.
 
-The user of a sensor can configure a part of each revolution to be masked.
+A user can configure many rotating sensors to mask a part of each revolution. At a masked sector the
+clock advances and the angle leaps, as if packets were lost. A gap belongs to a masked sector if it
+recurs at the same angles and no packet has ever come from these angles. After a real loss, packets
+from the missing angles arrive in other revolutions.
 
-At a masked sector the clock advances and the angle leaps, as if packets were lost. A gap belongs to
-a masked sector if it recurs at the same angles and no packet has ever come from the angles between.
-After a real loss, packets from the missing angles arrive in earlier or later revolutions.
-
-All angles here are in turns, from 0 to 1. Widths are measured in the direction of rotation.
+All angles in this module are in turns, from 0 to 1. Widths are measured in the direction of
+rotation.
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ from lidarspec.spec.timing import OnChange, OnWrap
 
 Angles = NDArray[np.float64]
 
-#: a whole turn in each unit of angles.
+#: A whole turn in each unit of angles.
 FULL_TURNS = {"deg": 360.0, "rad": 2 * np.pi}
-#: the number of equal parts of a turn in which angles are remembered.
+#: The number of equal parts of a turn. A part is marked if a packet has begun in it.
 BINS = 360
-#: the narrowest sector that is searched for, in turns.
+#: The minimum width of a masked sector, in turns.
 MIN_WIDTH = 1 / 36
-#: the narrowest sector in steps from packet to packet.
+#: The minimum width of a masked sector, in steps from packet to packet.
 MIN_WIDTH_STEPS = 4
-#: how far the edges of a gap vary, in steps from packet to packet.
+#: The variation of the edges of a gap, in steps from packet to packet.
 EDGE_STEPS = 1.25
-#: a step back by less, in turns, is jitter of the angle and not a leap over the rest of the turn.
+#: A step back by less than this, in turns, is jitter of the angle.
 JITTER = 1 / 200
-#: two gaps belong to one sector if they share more than this share of the wider gap.
+#: Two gaps belong to one sector if they overlap by more than this share of the wider gap.
 COMMON_SHARE = 0.5
-#: the number of earlier gaps that a new gap is compared with.
+#: The number of earlier gaps that a new gap is compared with.
 REMEMBERED_GAPS = 16
-#: how many packets the gap of a masked sector may vary by: packets do not begin at its edges.
+#: The number of packets in the gap of a masked sector may vary by this number, because packets do
+#: not begin exactly at its edges.
 VARYING_PACKETS = 2
 
 
@@ -50,8 +51,8 @@ class Sector:
     """A sector of a revolution.
 
     Attributes:
-        start: the angle at which it begins, in the direction of rotation, turns.
-        width: its width, turns.
+        start: the angle at which the sector begins, in turns.
+        width: the width of the sector, in turns.
         direction: 1 if angles grow as the sensor rotates, else -1.
     """
 
@@ -66,12 +67,12 @@ class Sector:
 
     @property
     def stop(self) -> float:
-        """The angle at which it ends, in turns."""
+        """The angle at which the sector ends, in turns."""
         return (self.start + self.direction * self.width) % 1
 
     @property
     def middle(self) -> float:
-        """The angle in its middle, in turns."""
+        """The angle in the middle of the sector, in turns."""
         return (self.start + self.direction * self.width / 2) % 1
 
     def contains(self, angle: float) -> bool:
@@ -79,7 +80,7 @@ class Sector:
         return forward_step(angle - self.start, self.direction) < self.width
 
     def common(self, other: Sector) -> Sector | None:
-        """Return the intersection of two sectors; None if they do not overlap."""
+        """Return the overlap of two sectors; None if they do not overlap."""
         offset = forward_step(other.start - self.start, self.direction)
         if offset < self.width:
             return Sector(other.start, min(self.width - offset, other.width), self.direction)
@@ -89,7 +90,7 @@ class Sector:
 
 
 def forward_step(step: float, direction: int) -> float:
-    """Return a step in the direction of rotation, in turns from 0 to 1.
+    """Return a step, measured in the direction of rotation, in turns from 0 to 1.
 
     A step back by less than `JITTER` counts as 0.
     """
@@ -100,13 +101,15 @@ def forward_step(step: float, direction: int) -> float:
 
 
 class AngleReader:
-    """A reader of the angle at which each packet begins, by the rule that cuts scans.
+    """Reads the angle at which each packet begins.
+
+    The field of the angle is known from the sensor's rule that divides packets into scans.
 
     Args:
         sensor: the sensor that sends the packets.
 
     Attributes:
-        is_available: whether the rule uses an angle field of datagrams.
+        is_available: whether the sensor sends datagrams and its rule uses an angle field.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -125,7 +128,7 @@ class AngleReader:
     def angles(self, table: Table) -> Angles | None:
         """Return the angle at which each packet begins, (n,), in turns.
 
-        Returns None if the packets do not have the field, or have no part with it.
+        Returns None if the packets do not contain the field.
         """
         if self.is_available:
             info = table.schema.fields.get(self._path)
@@ -162,7 +165,7 @@ class AngleReader:
 
 
 class SectorFinder:
-    """The search for the masked sector of one stream.
+    """Searches for the masked sector of one stream.
 
     Args:
         direction: 1 if angles grow as the sensor rotates, else -1.
@@ -186,13 +189,14 @@ class SectorFinder:
         """Compare a gap with earlier ones, and set `sector` if it recurs.
 
         Args:
-            start, stop: the angles of the packets before and after the gap, turns.
-            step: the angle from one packet to the next, turns. The edges of a gap may vary by about
-                this much, because packets do not begin at the edges of the sector.
+            start: the angle of the packet before the gap, in turns.
+            stop: the angle of the packet after the gap, in turns.
+            step: the angle from one packet to the next, in turns. The edges of a gap may vary by
+                about one step, because packets do not begin exactly at the edges of the sector.
 
         Returns:
-            The earlier gaps that contain the sector, each as its distance in gaps (1 is the last
-            one). The list is empty if no sector is found.
+            The earlier gaps at the same sector, as numbers counted back from the last gap (1 is the
+            last gap). The list is empty if no sector is found.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
@@ -212,13 +216,13 @@ class SectorFinder:
         return []
 
     def has_unseen_gaps(self, step: float) -> bool:
-        """Return whether any gap may still prove to be a masked sector."""
+        """Return whether any gap may still turn out to be at a masked sector."""
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet began in a sector, apart from its edges.
+        """Return whether no packet has begun in a sector, apart from its edges.
 
-        If the sector were not masked, at least one packet of each revolution would begin there.
+        False if the sector is so narrow that packets need not begin in it.
         """
         edge = EDGE_STEPS * step + 1 / BINS
         inner = sector.width - 2 * edge
@@ -230,11 +234,11 @@ class SectorFinder:
 
 
 class GapLoss(Protocol):
-    """A gap that counts as a loss so far.
+    """A gap that counts as a loss until a masked sector explains it.
 
     Attributes:
         missing: the number of packets that count as lost.
-        masked: the number of packets that a masked sector leaves out, which do not count as lost.
+        masked: the number of packets that a masked sector leaves out; they do not count as lost.
     """
 
     missing: int
@@ -242,7 +246,7 @@ class GapLoss(Protocol):
 
 
 class MaskedGaps:
-    """Gaps at a masked sector of one stream, as distinct from losses.
+    """Distinguishes gaps at the masked sector of one stream from losses.
 
     The packets may be in any order. A gap counts as a loss until it recurs one revolution later.
 
@@ -275,13 +279,13 @@ class MaskedGaps:
             self._finder = SectorFinder(direction) if direction else None
 
     def _note_until(self, row: int) -> None:
-        """Record that the current packets before a row came from unmasked angles."""
+        """Record the angles of the current packets before a row as not masked."""
         if self._finder is not None and self._angles is not None:
             self._finder.add_angles(self._angles[self._first_unnoted : row])
         self._first_unnoted = row
 
     def forget(self) -> None:
-        """Start again, since the next packets may come from a sensor set differently."""
+        """Forget the masked sector, because the sensor may have been configured again."""
         self._finder = None
         self._losses.clear()
         self.masked = 0
@@ -293,9 +297,12 @@ class MaskedGaps:
         return self._angles.item(row)
 
     def count_masked(self, start: float, stop: float, missing: int) -> int:
-        """Return how many of the packets missing between two angles are masked.
+        """Return how many missing packets a masked sector leaves out; 0 if none is known.
 
-        Returns 0 if no masked sector is known.
+        Args:
+            start: the angle of the packet before the gap, in turns.
+            stop: the angle of the packet after the gap, in turns.
+            missing: the number of packets missing between them.
         """
         if self._finder is None:
             sector = None
@@ -310,15 +317,16 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def find_unlost(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """Compare a loss with earlier ones; if it recurs, mark these losses as masked.
+        """Compare a loss with earlier ones, and mark all of them as masked if it recurs.
 
         Args:
-            row: the packet after the loss.
-            start, stop: the angles of the packets before and after the loss, turns.
-            loss: its counts, which are changed if it recurs.
+            row: the row of the packet after the loss.
+            start: the angle of the packet before the loss, in turns.
+            stop: the angle of the packet after the loss, in turns.
+            loss: the counts of the loss, which are changed if it recurs.
 
         Returns:
-            The number of packets that were counted as lost but are masked.
+            The number of packets that were counted as lost, but are masked.
         """
         finder = self._finder
         if finder is None or finder.sector is not None or math.isnan(start) or math.isnan(stop):

@@ -1,7 +1,7 @@
-"""Read the time that each packet takes by the sensor's clock (`Clock.pace`).
+"""Read the declared time from each packet to the next (`Clock.pace`).
 
-If the spec declares no pace, the clock shows no lost packets. A rate is never estimated from the
-stream, because a stream with regular losses has a regular rate, too.
+Without a declared pace, the clock cannot show lost packets. The pace is not estimated from the
+stream, because a stream with regular losses has regular steps as well.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from lidarspec.spec.timing import Clock
 
 Paces = NDArray[np.float64]
 
-#: if the clock advances by more from one packet to the next, it was set.
+#: If the clock advances by more than this from one packet to the next, it was set.
 MAX_STEP_NS = 3600 * 10**9
 
 
 def read_paces(clock: Clock, batch: Batch) -> Paces:
-    """Return the nanoseconds that each packet takes, (n,); nan if not declared.
+    """Return the time from each packet to the next, (n,) ns; nan if not declared.
 
     If all packets have one pace, the result is a zero-stride array.
     """

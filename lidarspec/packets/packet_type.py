@@ -23,18 +23,19 @@ class PacketType:
     """The timing and loss rules of one frame type of a sensor.
 
     Attributes:
-        sensor, frame: the sensor, and the name of the frame type.
-        codec: the engine of the frame type.
-        others: the names of the other frame types that packets of this type read as their state.
-        clock: the clock of these packets; None without a clock.
-        timed_sensor: the sensor with this clock.
-        loss_clock: the clock that shows losses; None without a clock, or if the clock is in the
-            parts of a frame: a frame without parts does not show how much time has passed.
-        loss_clock_step_ns: the step of that clock; 0 if a function computes it.
-        counter_clock: the clock that is compared with the counter; None without one.
+        sensor: the sensor.
+        frame: the name of the frame type.
+        codec: parses frames of the type.
+        others: the names of the other frame types that packets of this type need as their state.
+        clock: the clock of the packets; None without a clock.
+        timed_sensor: the sensor, with its clock replaced by `clock`.
+        loss_clock: the clock that shows losses; None without a clock, or if the parts of a frame
+            have the clock, because a frame without parts then has no time.
+        loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
+        counter_clock: the clock that the counter is compared with; None if there is no such clock.
         is_counted: whether the packets have a counter.
-        is_ordered_by_clock: whether the packets are ordered by their clock. This applies to
-            datagrams without a counter.
+        is_ordered_by_clock: whether the packets are ordered by their clock: datagrams that have a
+            clock, but no counter.
     """
 
     sensor: SensorDescription
@@ -100,8 +101,8 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
     """Return the clock of the frames of a type; None without a clock.
 
-    A frame type that declares a clock uses it. Otherwise data frames use the clock of the sensor
-    if they have its fields. So do IMU frames, and all frames of a sensor without points.
+    A frame type that declares a clock uses this clock. Otherwise data frames, IMU frames, and all
+    frames of a sensor without points use the clock of the sensor if they have its fields.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
@@ -120,9 +121,9 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 
 
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
-    """Return whether packets of this type have a field.
+    """Return whether packets of a frame type have a field.
 
-    Also returns True if no data frame has the field: reading it then reports the error.
+    Also returns True if no data frame has the field, so that reading the field reports the error.
     """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [

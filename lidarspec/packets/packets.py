@@ -21,28 +21,31 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import evaluate
 from lidarspec.spec.sensor import SensorDescription
 
-#: the attributes of `Packets` that have one value for each packet.
+#: The attributes of `Packets` that have one value for each packet.
 _COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")
 
-#: indices of packets, or a function that computes them when they are first read.
+#: The indices of packets, or a function that computes them when they are first read.
 Index = Numbers | Callable[[], NDArray[np.int64]]
 StateOf = tuple[Table | None, NDArray[np.intp]]
 
 
 class Packets:
-    """n frames of one type, in stream order. Arrays are read-only: some share memory.
+    """n frames of one type, in stream order.
+
+    All arrays are read-only, because some of them share memory.
 
     Attributes:
-        sensor, frame: the sensor, and the name of the frame type.
+        sensor: the sensor.
+        frame: the name of the frame type.
         table: the raw columns of the frames.
         time_ns: (n,) int64 ns by the sensor's clock, unwrapped; arrival times without a clock.
         host_ns: (n,) int64 arrival times, ns; 0 if unknown.
         breaks: (n,) bool, True if something was lost before the packet.
         is_clocked: whether the packets are ordered by the sensor's clock, not by a counter.
-        state: for each other frame type, its frames and, for each packet, the row of the last
-            frame before it.
-        masked: (n,) the number of packets before each that a masked sector leaves out; None if no
-            masked sector was found.
+        state: for each other frame type, a table of its frames, and an array (n,) with the row of
+            the last frame before each packet.
+        masked: (n,) the number of packets directly before each packet that a masked sector leaves
+            out; None if no masked sector was found.
         stats: the counters of the decoder.
         backend: the back end that computes points: "auto", "numpy" or "jit".
     """
@@ -86,9 +89,9 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The index of each packet, (n,), in which missing packets are counted too.
+        """The index of each packet, (n,), in which missing packets are counted as well.
 
-        If the sensor has a counter, it is the unwrapped counter.
+        If the sensor has a counter, the index is the unwrapped counter.
         """
         if callable(self._index):
             return self._index()
@@ -98,7 +101,7 @@ class Packets:
     def order(self) -> NDArray[np.int64]:
         """The sort key of each packet, (n,), equal for duplicates.
 
-        It follows from the counter. For datagrams without a counter it follows from the clock.
+        The key is the index. For datagrams with a clock and no counter, it is a time in ns.
         """
         if self._order is None:
             return self.index
@@ -122,7 +125,7 @@ class Packets:
         Values are nan in frames that lack the field.
 
         Raises:
-            UnknownField: if there is no such field; it suggests the closest path.
+            UnknownField: if the frame has no such field. The error suggests the closest path.
         """
         info = self.table.schema.columns.get(path)
         if info is None:
@@ -136,7 +139,7 @@ class Packets:
 
     @property
     def raw(self) -> NDArray[Any]:
-        """The integers of the wire, a structured array (n,), nested as in the struct.
+        """The integers of the frames, a structured array (n,), nested as in the struct.
 
         Arrays of variable length are padded with 0.
         """
@@ -230,12 +233,13 @@ class Packets:
         return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
-        """Return the parts of all packets, in stream order, as packets.
+        """Return the parts of all packets (frames within frames), in stream order, as packets.
 
-        They have the times, indices and state of their frames.
+        Parts have the times, indices and state of their frames.
 
         Args:
-            path: the path of the parts; "tlvs.points" if there are several kinds.
+            path: the path of the parts, such as "blocks"; with several kinds of parts, path and
+                kind, such as "tlvs.points".
 
         Raises:
             UnknownField: if the frame does not have these parts, or if it has several kinds and the
@@ -273,7 +277,7 @@ class Packets:
 
     @property
     def with_points(self) -> Packets:
-        """The packets that have the points: these packets, or their parts."""
+        """The packets that contain the points: these packets, or their parts."""
         path = self.sensor.parts_with("points", self.frame)
         if path:
             return self.parts(path)
@@ -283,7 +287,7 @@ class Packets:
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
         """The frames that contain the packets, and the row of each packet's frame, (n,).
 
-        A packet that is not a part is a frame itself.
+        If the packets are not parts, these are the packets themselves.
         """
         table, which = self.state.get(AROUND, (None, slice(None)))
         if table is None:
@@ -291,16 +295,16 @@ class Packets:
         return (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """Return the batch that plugin functions read through `Fields`.
+        """Return the batch that the functions of a plugin read through `Fields`.
 
         Args:
-            carry: the state left by the previous batch.
+            carry: the values that these functions keep from the previous batch.
         """
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 
 def join_packets(parts: Sequence[Packets]) -> Packets:
-    """Return batches of one stream as one batch, in this order."""
+    """Return the packets of several batches of one stream as one batch, in this order."""
     if len(parts) == 1:
         return parts[0]
     head = parts[0]
@@ -339,7 +343,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
 
 
 def join_tables(tables: Sequence[Any]) -> Table:
-    """Return tables of one frame type as one table, in this order."""
+    """Return the rows of several tables of one frame type as one table, in this order."""
     return tables[0] if len(tables) == 1 else type(tables[0]).join(tables)  # type: ignore[no-any-return]
 
 
@@ -363,7 +367,8 @@ def _nested_dtype(
         here = prefix + name
         if len(_list_forms(schema, here)) > 1:
             raise SpecError(
-                "its branches are a value, a struct or an array: request its columns one by one",
+                "in some branches this is a value, in others a struct or an array: read its columns"
+                " separately",
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
@@ -381,7 +386,8 @@ def _nested_dtype(
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
     """Return the forms that a name has in the branches of the struct.
 
-    A form is a pair: whether the name is a value, and the number of its own array axes.
+    A form is a pair: whether the name is a value and not a struct, and the number of array axes
+    that the name itself adds.
     """
     parts = [
         (path, info)

@@ -1,14 +1,15 @@
 """Sort packets and drop duplicates.
 
-A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW`
-packets are held. Duplicates are dropped, and so are packets whose successors were released before
-they arrived. All other packets pass at once, so ordering adds no delay while no packet is late. At
-the start `WINDOW` packets are held, since the first packet to arrive may be late as well.
+If a packet is missing, the packets after it are held until it arrives, or until more than `WINDOW`
+packets are held. All other packets are released at once, so sorting adds no delay unless a packet
+is late. Duplicates are dropped, and so are packets that arrive after a later packet was released.
+At the start, `WINDOW` packets are held, because the first packet to arrive may not be the first
+that was sent.
 
-`Packets.order` is the sort key. With a counter it is the index. With a clock alone it is a time,
-and losses are judged again once the packets are in order: scans depend on the packets, not on the
-order in which they arrive. A clock without a declared pace does not show that a packet is missing,
-so `WINDOW` packets are always held.
+`Packets.order` is the sort key. With a counter, it is the index. With a clock alone, it is a time;
+losses are then found again in the sorted packets, so that scans do not depend on the order of
+arrival. A clock without a declared pace does not show that a packet is missing, so `WINDOW` packets
+are always held.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.packets import Packets, join_packets
 
-#: the number of packets that are held while an earlier packet may be missing.
+#: The maximum number of packets that are held while an earlier packet is missing.
 WINDOW = 10
 
 
@@ -38,7 +39,10 @@ class Reorder:
         self._clock_order: ClockOrder | None = None
 
     def push(self, packets: Packets) -> list[Packets]:
-        """Return the packets that are now in order; at most one batch."""
+        """Add packets, and return a list of the packets that are released.
+
+        The list has at most one batch.
+        """
         if not len(packets):
             return []
         held_count = 0
@@ -53,7 +57,7 @@ class Reorder:
         return self._push_disordered(packets, held_count)
 
     def finish(self) -> list[Packets]:
-        """Return the packets that are still held."""
+        """Return a list of the packets that are still held, sorted, at most one batch."""
         held = self._held
         self._held = None
         if held is None:
@@ -61,7 +65,11 @@ class Reorder:
         return [self._mark(held.take(np.argsort(held.order, kind="stable")), self._next)]
 
     def _push_ascending(self, packets: Packets) -> list[Packets]:
-        """Release packets without late ones, up to the first gap that may still be filled."""
+        """Release packets up to the first gap that may still be filled.
+
+        Args:
+            packets: the held packets and the packets that arrived after them, in ascending order.
+        """
         index = packets.index
         before = self._next
         gaps = [] if before == index.item(0) else [0]
@@ -89,7 +97,7 @@ class Reorder:
         return [self._mark(packets, before)]
 
     def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
-        """Insert packets between held ones, and release all that have no gap before them.
+        """Sort packets into the held ones, and release all that have no gap before them.
 
         Args:
             packets: the held packets, followed by the packets that arrived after them.
@@ -129,10 +137,10 @@ class Reorder:
         return []
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
-        """Return packets in order, with breaks where the index leaves out numbers.
+        """Return sorted packets, with a break at each gap of the index.
 
         Args:
-            before: the index after the last packet released before these; None before the first.
+            before: the index that follows the last released packet; None if no packet was released.
         """
         marked = copy.copy(packets)
         if packets.is_clocked:
@@ -143,7 +151,7 @@ class Reorder:
         return marked
 
     def _judge(self, packets: Packets) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the index and the breaks of packets in order, by their clock."""
+        """Return the index and the breaks of sorted packets, found by their clock."""
         if self._clock_order is None:
             assert packets.sensor.clock is not None
             self._clock_order = ClockOrder(Counters(), packets.sensor.clock)
@@ -154,6 +162,6 @@ class Reorder:
 
 
 def _shows_gaps(packets: Packets) -> bool:
-    """Return whether the index of packets has a gap where packets are missing."""
+    """Return whether missing packets show as gaps in the index."""
     clock = packets.sensor.clock
     return not packets.is_clocked or (clock is not None and clock.pace is not None)

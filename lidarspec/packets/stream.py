@@ -1,9 +1,10 @@
-"""Turn frames into packets: times, losses, order, and the frames that packets depend on.
+"""Make packets from frames, with their times, losses, order and state.
 
-A `PacketStream` remembers between batches what the next one needs: the last clock reading, the
-newest packet, the last frame of each other type, and whether bytes were skipped since the last
-packet. Losses are judged by the counter of the packets (`counter_order`). Without a counter,
-datagrams are judged by the clock (`clock_order`), and all others by arrival (`arrival_order`).
+A `PacketStream` keeps the state that the next batch needs: the last clock reading, the newest
+packet, the last frame of each other type, and the number of bytes that were skipped since the last
+packet. Losses are found by the counter of the packets (`counter_order`). Without a counter, they
+are found by the clock of datagrams (`clock_order`), or else by skipped bytes and the order of
+arrival (`arrival_order`).
 """
 
 from __future__ import annotations
@@ -39,20 +40,22 @@ from lidarspec.packets.packets import Index, Packets, StateOf, join_tables
 from lidarspec.spec.sensor import SensorDescription
 
 Integers = NDArray[np.int64]
-#: frames of another type, and the number of packets before each, (k,).
+#: The frames of another type, and the number of packets before each of them, (k,).
 OtherFrames = tuple[Frames, NDArray[np.intp]]
 
 
 class PacketStream:
-    """Packets of one type, made from the frames that a decoder finds.
+    """Makes packets of one type from the frames that a decoder finds.
 
     Args:
         sensor: the sensor that sends the packets.
         frame: the frame type of the packets.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
         backend: the back end that computes points: "auto", "numpy" or "jit".
-        state: frames of other types, by name, that count as seen before the first packet.
-        reference: dates the clock from the first packet on.
+        state: frames of other types, by name, that are used as if they had arrived before the first
+            packet.
+        reference: the date of a clock reading, which is used from the first packet on; None if
+            unknown.
 
     Raises:
         UnknownFrame: if the sensor has no such type.
@@ -95,12 +98,12 @@ class PacketStream:
         self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)
 
     def add(self, batches: Sequence[Frames], *, whole: bool = False) -> Packets:
-        """Return the packets among some frames, and update the state of the stream.
+        """Return the packets among the next frames, and update the state of the stream.
 
         Args:
             batches: frames of all types, in stream order.
-            whole: whether the frames are a whole input. Packets before the first frame of another
-                type then use that frame as their state.
+            whole: whether the frames are the whole input. If so, packets before the first frame of
+                a state type use this frame.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join([self._read(part) for part in parts])
@@ -148,9 +151,9 @@ class PacketStream:
     def _judge(
         self, batch: Batch, time: Integers | None, skipped: Integers
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
-        """Return the index of packets, the breaks before them, and their order.
+        """Return the index, the breaks and the order of packets, (n,) each.
 
-        Lost, late and duplicate packets are counted. The order is None if the packets are not
+        This also counts lost, late and duplicate packets. The order is None if the packets are not
         ordered by their clock. If the plugin raises, the packets keep the order of arrival.
         """
         fallback = (range(len(batch)), batch.breaks)
@@ -176,10 +179,11 @@ class PacketStream:
     ) -> Any:
         """Call a function that runs plugin code and return its result.
 
-        If it raises, the error is counted and `fallback` is returned.
+        If the function raises, the error is counted and `fallback` is returned.
 
         Args:
-            declaration: the name of the plugin's declaration, for the error.
+            declaration: the part of the spec that contains the plugin code, such as "clock", for
+                the error.
         """
         try:
             return function(batch, *args)
@@ -188,9 +192,9 @@ class PacketStream:
             return fallback
 
     def _read_times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
-        """Return the unwrapped clock times of packets, (n,) ns, and remember the last one.
+        """Return the unwrapped clock times of packets, (n,) ns, and store the last one.
 
-        A packet without a clock reading has the time of the last packet that has one.
+        A packet without a clock reading gets the time of the last packet with a reading.
 
         Args:
             host: arrival times, (n,) ns; 0 if unknown.
@@ -212,9 +216,9 @@ class PacketStream:
         return hold_values(which, times, before)
 
     def _date_times(self, times: Integers) -> Integers:
-        """Return times since 1970, ns, if a frame has reported the date.
+        """Return times in ns since 1970, if a frame has reported the date.
 
-        Otherwise return them unchanged and set `stats.undated`, which warns the user.
+        Otherwise return the times unchanged and set `stats.undated`, which is shown as a warning.
         """
         if self._epoch is None or not len(times):
             return times
@@ -230,7 +234,7 @@ class PacketStream:
     def _count_skipped_bytes(self, part: OwnFrames) -> Integers:
         """Return the number of bytes outside frames before each own frame, (n,).
 
-        The bytes after the last own frame are remembered for the next piece of input.
+        The bytes after the last own frame are added to the count of the next piece of input.
         """
         gaps = part.piece.gaps
         rows = part.rows
@@ -250,7 +254,7 @@ class PacketStream:
         return np.diff(own_sums, prepend=0)
 
     def _read(self, part: OwnFrames) -> _Columns:
-        """Return the columns of one piece of input, and count its skipped bytes."""
+        """Return the columns of the own frames in one piece of input."""
         frames = part.frames
         skipped = self._count_skipped_bytes(part)
         return _Columns(self._type.codec.gather(frames), frames.places, frames.at, skipped)
@@ -262,7 +266,10 @@ class PacketStream:
     def _find_states(
         self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return the frames of each other type, and the last of them before each packet."""
+        """Return, for each state type, its frames and the row of each packet's frame.
+
+        The frame of a packet is the last one before the packet.
+        """
         others = self._select_others(parts)
         return {
             name: self._find_state(
@@ -272,7 +279,7 @@ class PacketStream:
         }
 
     def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
-        """Return the frames of the types that packets depend on, by name."""
+        """Return the frames of the state types, by name."""
         selected: dict[str, list[OtherFrames]] = {}
         packet_count = 0
         for part in parts:
@@ -294,12 +301,12 @@ class PacketStream:
     def _find_state(
         self, name: str, others: Sequence[OtherFrames], *, packet_count: int, whole: bool
     ) -> StateOf:
-        """Return the frames of another type, and the last of them before each packet.
+        """Return the frames of a state type, and the row of each packet's frame, (n,).
 
-        The newest frame is remembered for the next packets.
+        The newest frame is stored for the next packets.
 
         Args:
-            name: the other type.
+            name: the state type.
             others: its frames in this input.
         """
         last_frame = self._last_frames.get(name)
@@ -321,15 +328,18 @@ class PacketStream:
 
 
 class ImuStream:
-    """IMU samples of one stream, from all frame types that have IMU data.
+    """Reads the IMU samples of one stream, from all frame types that have IMU data.
 
     Args:
         sensor: the sensor that sends the frames.
-        stats, backend, state: the same as for `PacketStream`.
+        stats: the decoder's counters.
+        backend: the back end that computes points, see `PacketStream`.
+        state: frames of other types, by name, see `PacketStream`.
 
-    Attributes:
-        waiting: the samples of scans that have not ended. None if there is no IMU, or if only some
-            of the IMU and data frames have a clock: their times are not comparable.
+        Attributes:
+            waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if
+                their times cannot be compared with the times of points, because only some of the
+                frame types have a clock.
     """
 
     def __init__(
@@ -350,14 +360,14 @@ class ImuStream:
     def add(
         self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
     ) -> ImuSamples:
-        """Return the IMU samples among some frames, and add them to `waiting`.
+        """Return the IMU samples among the next frames, and add them to `waiting`.
 
         Errors of a plugin are counted.
 
         Args:
             found: frames of all types, in stream order.
-            data: the data packets among the frames; None if the frames have no data packets.
-            whole: whether the frames are a whole input.
+            data: the data packets among the frames; None if there are none.
+            whole: whether the frames are the whole input.
         """
         batches = list[Packets]()
         if data is not None and data.sensor.frames[data.frame].imu is not None:
@@ -434,8 +444,8 @@ def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> s
     It is the configured type. Without a configured type it is the type of the first data frame
     that arrived.
 
-    Returns None for a sensor without points, and if the sensor has several types, none is
-    configured and no data frame has arrived yet.
+    Returns None for a sensor without points, and as long as none of several possible types has
+    arrived.
     """
     names = sensor.data_frames
     if not sensor.has_points:
@@ -457,7 +467,7 @@ class _Columns(NamedTuple):
         table: the raw columns.
         offset: offsets in the input; a range if the frames are consecutive and of one size.
         at: arrival times, ns; -1 if unknown.
-        skipped: number of bytes outside frames before each.
+        skipped: number of bytes outside frames before each frame.
     """
 
     table: Table
@@ -467,7 +477,7 @@ class _Columns(NamedTuple):
 
 
 def _join(parts: Sequence[_Columns]) -> _Columns | None:
-    """Return the columns of all parts, in this order; None if there are no packets."""
+    """Return the columns of all pieces of input as one; None if there are no packets."""
     parts = [part for part in parts if len(part.table)]
     if len(parts) < 2:
         return parts[0] if parts else None
@@ -480,7 +490,7 @@ def _join(parts: Sequence[_Columns]) -> _Columns | None:
 
 
 def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
-    """Return the offsets of all parts; a range if all steps are equal."""
+    """Return the offsets of all pieces of input; a range if all steps are equal."""
     first = parts[0]
     if not isinstance(first, range):
         return np.concatenate([to_array(part) for part in parts])
@@ -493,9 +503,9 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
-    """Return the values of all parts, in this order.
+    """Return the values of all pieces of input.
 
-    If all values are equal, the result shares one value (`repeat`).
+    If all values are equal, the result is a zero-stride array (`repeat`).
     """
     values = {broadcast_value(part) for part in parts}
     if len(values) == 1:
@@ -506,7 +516,7 @@ def _join_values(parts: Sequence[Integers]) -> Integers:
 
 
 def _host_times(at: Integers) -> Integers:
-    """Return arrival times with 0 in place of -1 for unknown times."""
+    """Return arrival times; unknown times of -1 become 0."""
     only = broadcast_value(at)
     if only is not None:
         return repeat(max(only, 0), len(at))

@@ -228,7 +228,7 @@ def test_a_sensor_that_returns_with_another_table_is_a_warning() -> None:
         assert angles(device) == ANGLES
         port.unplug()
         port.plug()
-        told = "the sensor that reconnected reports another table: open it again"
+        told = "the sensor that reconnected reports another table: open the device again"
         read_until(device, lambda: any(told in warning for warning in device.warnings))
 
 

@@ -303,10 +303,10 @@ def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
         )
         assert device.stats.lost == device.stats.duplicates == 0
         read_until(device, lambda: device.stats.foreign == 120)
-        (said,) = (warning for warning in device.warnings if "sends as well" in warning)
+        (said,) = (warning for warning in device.warnings if "also sends data" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
         assert (
-            f"udp://:{number}: reading {senders[0]}; ignoring {senders[1]}, which sends as well"
+            f"udp://:{number}: reading {senders[0]}; ignoring {senders[1]}, which also sends data"
             in said
         )
         assert f"'udp://:{number}?src={senders[1]}'" in said
@@ -635,7 +635,7 @@ def test_iterators_continue_after_latest(tmp_path: Path) -> None:
         assert device.stats.frames["data"] == len(frames)
         assert (device.stats.duplicates, device.stats.lost) == (0, 0)
         for read_again in (device.packets, device.scans):
-            with pytest.raises(SourceError, match="was read to its end: open it again"):
+            with pytest.raises(SourceError, match="has been read to its end: open it again"):
                 next(read_again())
     with ls.open(path, TURNING) as device:
         device.latest()

@@ -122,11 +122,11 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     assert found["desk"].file == str(user)
     project = folder / "lidarspec.toml"
     with pytest.warns(
-        UserWarning, match=f"front: using the device of {user}, not the one of {project}"
+        UserWarning, match=f"front: using the device of {user}; the device of {project} is ignored"
     ):
         assert named_devices.find_device("front") == found["front"]
     said = ran("stats", "front", "-s", SENSOR, "-n", "1").stderr
-    assert said.count(f"front: using the device of {user}, not the one of {project}") == 1
+    assert said.count(f"front: using the device of {user}; the device of {project} is ignored") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
     assert list(named_devices.read_devices()) == ["front", "desk"]
 

@@ -103,7 +103,7 @@ def test_other_senders_are_reported_once_while_recording(tmp_path: Path) -> None
             said.append(next(running))
             other.sendto(frame, ("127.0.0.1", number))
         said += running
-    assert "\n".join(said).count("which sends as well") == 1
+    assert "\n".join(said).count("which also sends data") == 1
 
 
 def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path) -> None:
