@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from lidarspec.spec import Clock, Frame, OnWrap, PacketCounter, Points, Sensor, Simulation, Udp
+from lidarspec.spec import Frame, OnWrap, PacketCounter, Points, Sensor, Simulation, Udp
 from lidarspec_hesai import ptc
 from lidarspec_hesai.calibration import Calibration, configure
-from lidarspec_hesai.parts import SPEED_LIMITS_HZ, clock
+from lidarspec_hesai.parts import CLOCK, SPEED_LIMITS_HZ
 
 
 def make_spinning_sensor(
@@ -34,7 +34,7 @@ def make_spinning_sensor(
     """
     defaults: dict[str, Any] = {
         "turn": SPEED_LIMITS_HZ,
-        "clock": Clock(clock),
+        "clock": CLOCK,
         "scan": OnWrap(azimuth),
         "vendor_axes": ("right", "forward", "up"),
     }

@@ -27,7 +27,6 @@ from construct import Array, Const, Int8ul, Int16sl, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import (
     Checksummed,
-    Clock,
     Fields,
     Frame,
     OnWrap,
@@ -41,7 +40,7 @@ from lidarspec.spec import (
 )
 from lidarspec_hesai.calibration import Calibration, configure, make_nominal_table
 from lidarspec_hesai.crc_packets import CRC
-from lidarspec_hesai.parts import UTC, clock, rotation_values
+from lidarspec_hesai.parts import CLOCK, UTC, rotation_values
 
 CHANNELS = 16
 BLOCKS_PER_TURN = 600
@@ -148,7 +147,7 @@ JT16 = Sensor(
     points=partial(points, channels=TABLE),
     scan=OnWrap("azimuth"),
     links={"data": Serial(3_125_000)},
-    clock=Clock(clock),
+    clock=CLOCK,
     sequence=PacketCounter("sequence"),
     simulation=Simulation(sweep),
     configure=partial(configure, points, TABLE),

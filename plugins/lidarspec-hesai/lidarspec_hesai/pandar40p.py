@@ -11,6 +11,7 @@ tier4/nebula.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, make_nominal_table
 from lidarspec_hesai.family import make_spinning_sensor
-from lidarspec_hesai.parts import TAIL_40P, clock, count_returns, make_points, rotation_values
+from lidarspec_hesai.parts import CLOCK, TAIL_40P, count_returns, make_points, rotation_values
 
 BLOCKS = 10
 CHANNELS = 40
@@ -98,7 +99,7 @@ def pace(f: Fields, blocks: int) -> Any:
 
 def make_clock(blocks: int) -> Clock:
     """Return the clock of packets with `blocks` blocks, which may lack the sequence."""
-    return Clock(clock, pace=partial(pace, blocks=blocks))
+    return replace(CLOCK, pace=partial(pace, blocks=blocks))
 
 
 def sweep(i: int) -> dict[str, Any]:

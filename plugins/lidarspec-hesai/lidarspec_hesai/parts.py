@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Fields, Polar, Scaled, unix_time
+from lidarspec.spec import Clock, Fields, Polar, Scaled, unix_time
 from lidarspec_hesai.calibration import Calibration
 
 RETURN_MODES = (
@@ -68,6 +68,11 @@ def clock(f: Fields) -> tuple[Any, Any]:
     date = unix_time(year, utc.month, utc.day, utc.hour, utc.minute, utc.second)
     unix = (((utc.month * 256 + utc.day) * 256 + utc.hour) * 256 + utc.minute) * 256 + utc.second
     return np.where(utc.year == 0, unix, date), f.timestamp
+
+
+#: The date is UTC with GPS. With PTP it is the time of the grandmaster. Data packets do not report
+#: the state of the clock: GPS packets (UDP port 10110) and the sensor's web page do.
+CLOCK = Clock(clock, epoch="utc")
 
 
 def make_points(

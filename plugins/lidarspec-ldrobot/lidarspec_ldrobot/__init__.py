@@ -244,6 +244,7 @@ def make_lidar(
             "timestamp",
             wraps_at=30.0,
             pace=partial(pace, rate=rate, older_rate=older_rate),
+            epoch="boot",
         ),
         simulation=Simulation(partial(sweep, rate=rate, turns=turns)),
         vendor_axes=("forward", "right", "up"),

@@ -26,6 +26,8 @@ from lidarspec.spec import (
     Address,
     Checksummed,
     Clock,
+    ClockState,
+    ClockStatus,
     Command,
     Count,
     Crc,
@@ -61,6 +63,13 @@ CRC16 = Crc(16, 0x1021, init=0x9232, refin=True, refout=True)
 CRC32 = Crc(32, 0x04C11DB7, init=0xAFE50D95, refin=True, refout=True, xorout=0xFFFFFFFF)
 MAX_POSITION_M = 1000.0  # of the extrinsics: twice the range of the Tele-15
 GPS = 3  # the timestamp type of dates
+#: Livox SDK communication protocol 1.3.0, timestamp type.
+TIMESTAMP_TYPES = {
+    0: ClockState("not synchronized", False, epoch="boot"),
+    1: ClockState("synchronized by PTP", True),
+    GPS: ClockState("synchronized by GPS", True, epoch="utc"),
+    4: ClockState("synchronized by PPS without a date", True, epoch="boot"),
+}
 IMU_RATE_HZ = 200
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starting, 1 normal, 2 power saving, 3 standby, 4 error"
@@ -513,7 +522,12 @@ def make_lidar(name: str) -> Sensor:
             "control": Udp(65_000, local=COMMAND_PORT),
         },
         commands=COMMANDS,
-        clock=Clock(clock, pace=partial(pace, rate=rate)),
+        clock=Clock(
+            clock,
+            pace=partial(pace, rate=rate),
+            epoch="tai",  # PTP's own scale, unless the grandmaster sends UTC
+            status=ClockStatus("timestamp_type", TIMESTAMP_TYPES),
+        ),
         simulation=make_simulation(
             first,
             rate,

@@ -40,6 +40,8 @@ from lidarspec.spec import (
     Address,
     Checksummed,
     Clock,
+    ClockState,
+    ClockStatus,
     Command,
     Count,
     Crc,
@@ -84,6 +86,14 @@ VARIABLE_COUNT = {"LS203": "a datagram contains any number of parameters"}
 SHOTS = np.arange(96)  # shot numbers of a simulated packet
 IMU_RATE_HZ = 200
 DEVICE_TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
+
+
+#: Mid-360 protocol document, point data, time_type.
+TIME_TYPES = {
+    0: ClockState("not synchronized", False, epoch="boot"),
+    1: ClockState("synchronized by PTP or gPTP", True),
+    2: ClockState("synchronized by GPS", True, epoch="utc"),
+}
 
 
 def make_packet(kind: int, *members: Any) -> Checksummed:
@@ -586,7 +596,12 @@ def make_lidar(name: str) -> Sensor:
             },
         },
         # the counter restarts with each frame, and frames have no fixed number of packets
-        clock=Clock("timestamp", pace=lambda f: f.time_interval),
+        clock=Clock(
+            "timestamp",
+            pace=lambda f: f.time_interval,
+            epoch="tai",  # PTP's own scale, unless the grandmaster sends UTC
+            status=ClockStatus("time_type", TIME_TYPES),
+        ),
         sequence=PacketCounter("udp_cnt"),
         simulation=make_simulation(
             rate,

@@ -42,7 +42,7 @@ from lidarspec.spec import (
     stack,
     take,
 )
-from lidarspec_ouster.metadata import IDENTITY, Table, Unit, read_unit
+from lidarspec_ouster.metadata import IDENTITY, TIME_EPOCHS, Table, Unit, read_unit
 from lidarspec_ouster.packets import (
     COLUMNS,
     ENCODER_COUNTS_PER_TURN,
@@ -160,6 +160,7 @@ def apply_unit(sensor: Sensor, unit: Unit) -> Sensor:
         clock=Clock(
             "columns[0].timestamp",
             pace=partial(pace, columns=unit.columns) if unit.columns > 1 else None,
+            epoch=TIME_EPOCHS.get(unit.timestamp_mode, ""),
         ),
         info={} if is_legacy else {"serial": "data.serial"},
         simulation=Simulation(

@@ -49,6 +49,15 @@ LIDAR_TO_SENSOR = (
 BEAM_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 BEAM_ORIGIN_GENERATION_1_MM = 12.163
 
+#: What the clock counts, by `timestamp_mode` (Software User Manual, setting sensor time source).
+#: PTP's scale is TAI, unless the grandmaster sends UTC. A pulse without NMEA sentences counts from
+#: power-up too. Packets do not report whether the clock is locked: `GET api/v1/time` does.
+TIME_EPOCHS = {
+    "TIME_FROM_INTERNAL_OSC": "boot",
+    "TIME_FROM_SYNC_PULSE_IN": "utc",
+    "TIME_FROM_PTP_1588": "tai",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Unit:
@@ -67,6 +76,7 @@ class Unit:
             sensor, and from IMU to sensor.
         samples: samples per IMU packet; 0 for those of LEGACY.
         product, serial: as in the metadata, "" if missing.
+        timestamp_mode: the source of the time, a key of `TIME_EPOCHS`; "" if unknown.
         nominal: whether values of the model replace missing values of the unit.
     """
 
@@ -85,6 +95,7 @@ class Unit:
     product: str = ""
     serial: str = ""
     nominal: bool = False
+    timestamp_mode: str = ""
 
     @property
     def rows(self) -> int:
@@ -250,6 +261,7 @@ class MetadataKeys:
             product=product,
             serial=str(self.data.get("prod_sn", "")),
             nominal=is_nominal,
+            timestamp_mode=str(self.data.get("timestamp_mode", "")),
         )
 
     def _read_profile(self) -> str:

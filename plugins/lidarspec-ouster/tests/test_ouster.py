@@ -396,3 +396,16 @@ def test_metadata_that_cannot_be_are_refused_by_name(
 def test_layouts_that_there_are_not_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ls.UsageError):
         OS1.configure(**options)
+
+
+def test_metadata_say_what_the_clock_counts(tmp_path: Path) -> None:
+    metadata = json.loads(make_nominal_unit("OS1", 32, 512, "LEGACY").to_metadata())
+    metadata["config_params"]["timestamp_mode"] = "TIME_FROM_PTP_1588"
+    path = tmp_path / "os1.json"
+    path.write_text(json.dumps(metadata))
+    sensor = ls.sensor("ouster-os1").configure(metadata=path)
+    assert sensor.clock is not None
+    assert sensor.clock.epoch == "tai"
+    told = sensor.configure(epoch="utc").configure(metadata=path)
+    assert told.clock is not None
+    assert told.clock.epoch == "utc"

@@ -37,6 +37,7 @@ from construct import (
 )
 
 from lidarspec.spec import (
+    Clock,
     Fields,
     Frame,
     Imu,
@@ -62,6 +63,7 @@ from lidarspec_robosense.rotor import (
     Rotor,
     laser_degrees,
     make_angles,
+    make_clock_status,
     make_points,
     rotation_values,
     split_angles,
@@ -301,6 +303,8 @@ AIRY = Sensor(
     ),
     **{
         **COMMON,
+        # the time of the grandmaster, in PTP's own scale
+        "clock": Clock(("seconds", "microseconds"), epoch="tai", status=make_clock_status()),
         "links": {"data": Udp(6699, 7788, 6688)},
         "turn": (FACTORY_SPEED_HZ, FACTORY_SPEED_HZ),
     },

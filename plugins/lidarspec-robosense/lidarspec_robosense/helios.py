@@ -47,6 +47,7 @@ from lidarspec_robosense.rotor import (
     laser_angles,
     make_angles,
     make_blocks,
+    make_clock_status,
     points_of_firings,
     points_of_groups,
     rotation_values,
@@ -239,6 +240,7 @@ HELIOS_16P = Sensor(
     ),
     **{
         **COMMON,
+        "clock": dataclasses.replace(COMMON["clock"], status=make_clock_status()),
         "turn": (FACTORY_SPEED_HZ, 20.0),
         "status": "capture",
     },  # 600 and 1200 rpm (manual B.1)

@@ -51,7 +51,7 @@ from lidarspec.spec import (
     Simulation,
     Udp,
 )
-from lidarspec_robosense.rotor import TIME
+from lidarspec_robosense.rotor import TIME, make_clock_status
 
 BLOCKS = 25
 CHANNELS = 5
@@ -249,7 +249,8 @@ M1 = Sensor(
     points=points,
     scan=OnRewind("pkt_psn"),
     links={"data": Udp(6699, 7788)},
-    clock=Clock(("seconds", "microseconds"), pace=pace),
+    # the time of the grandmaster as it is (issue rslidar_sdk 169), in PTP's own scale TAI
+    clock=Clock(("seconds", "microseconds"), pace=pace, epoch="tai", status=make_clock_status()),
     sequence=PacketCounter("pkt_psn", first=1, last=packets_per_frame),
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model

@@ -13,7 +13,7 @@ Not supported: if a field of view is set, blocks after the gap are later than th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,18 @@ from construct import (
 )
 from numpy.typing import NDArray
 
-from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, between_blocks, following
+from lidarspec.spec import (
+    Clock,
+    ClockState,
+    ClockStatus,
+    Fields,
+    OnWrap,
+    Polar,
+    Scaled,
+    Udp,
+    between_blocks,
+    following,
+)
 
 FACTORY_SPEED_HZ = 10  # revolutions per second
 SPEED_LIMITS_HZ = (5.0, 20.0)  # lowest and highest of the family
@@ -99,6 +110,31 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
 
 
+SYNC_MODES = "0 internal, 1 PPS, 2 PTP, 3 gPTP"
+SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
+
+
+def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
+    """Return the state of the clock in DIFOP, from the mode and the status of synchronization.
+
+    `sources` are the names of the modes, "" for a mode that does not exist.
+
+    Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP. PPS comes with a
+    GPRMC sentence, whose time is UTC.
+    """
+    states = {}
+    for mode, source in enumerate(sources):
+        if not source:
+            continue
+        locked_epoch = "utc" if source == "PPS" else None
+        states[4 * mode] = ClockState(f"{source}, not locked", False, epoch="boot")
+        states[4 * mode + 1] = ClockState(f"locked to {source}", True, epoch=locked_epoch)
+        states[4 * mode + 2] = ClockState(f"{source} lost", False, epoch=locked_epoch)
+    for status in range(3):
+        states[status] = ClockState(sources[0], False, epoch="boot")
+    return ClockStatus(lambda f: 4 * f.time_sync_mode + f.time_sync_status, states, frame="difop")
+
+
 #: The first 50 bytes of every DIFOP.
 DIFOP_HEAD: tuple[Construct, ...] = (
     "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
@@ -135,7 +171,11 @@ DIFOP_UNIT: tuple[Construct, ...] = (
     "return_mode" / Int8ub,
 )
 #: Bytes 301 to 312 of the second layout.
-DIFOP_TIME: tuple[Construct, ...] = ("time_sync_mode" / Int8ub, "time_sync_status" / Int8ub, *TIME)
+DIFOP_TIME: tuple[Construct, ...] = (
+    "time_sync_mode" / Int8ub * SYNC_MODES,
+    "time_sync_status" / Int8ub * "0 none, 1 locked, 2 timeout",
+    *TIME,
+)
 #: Bytes 313 to 467 of the first layout.
 DIFOP_STATUS: tuple[Construct, ...] = (
     "currents" / Array(2, Int24ub),
@@ -333,7 +373,9 @@ COMMON: dict[str, Any] = {
     "vendor": "RoboSense",
     "scan": OnWrap("blocks.azimuth"),
     "links": {"data": Udp(6699, 7788)},
-    "clock": Clock(("seconds", "microseconds")),
+    # Helios and Ruby subtract the leap seconds of TAI from the grandmaster's time: with a
+    # grandmaster that sends UTC they are 37 s late (issues rs_driver 75, rslidar_sdk 169).
+    "clock": Clock(("seconds", "microseconds"), epoch="utc"),
     "vendor_axes": ("forward", "left", "up"),
     "turn": SPEED_LIMITS_HZ,
     "status": "manual",

@@ -175,7 +175,9 @@ def clock(f: Fields) -> tuple[Any, Any, Any]:
 
 def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
     """Return the clock of packets with `shots` firings of all lasers."""
-    return Clock(source, pace=partial(pace, shots=shots, period=model.period, dual=DUAL))
+    pace_of_mode = partial(pace, shots=shots, period=model.period, dual=DUAL)
+    # set by PPS and GPRMC, whose time is UTC; whether it is set is not reported
+    return Clock(source, pace=pace_of_mode, epoch="utc")
 
 
 def points_16(f: Fields) -> Polar:

@@ -43,6 +43,7 @@ from lidarspec_robosense.rotor import (
     Rotor,
     make_angles,
     make_blocks,
+    make_clock_status,
     points_of_firings,
     rotation_values,
     sweep_difop,
@@ -232,6 +233,8 @@ def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = N
             "clock": Clock(
                 ("seconds", "microseconds"),
                 pace=partial(pace, shots=BLOCKS[lasers], period=rotor.period),
+                epoch="utc",  # as in `COMMON`
+                status=make_clock_status(),
             ),
         },
     )

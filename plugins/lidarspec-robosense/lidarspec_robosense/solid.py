@@ -44,7 +44,7 @@ from lidarspec.spec import (
     stack,
 )
 from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1
-from lidarspec_robosense.rotor import TIME
+from lidarspec_robosense.rotor import TIME, make_clock_status
 
 # return modes
 DUAL = 0
@@ -190,7 +190,10 @@ def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
         "sequence": PacketCounter(
             "pkt_psn", first=model.first, last=partial(last_packet_number, model=model, dual=dual)
         ),
-        "clock": Clock(("seconds", "microseconds"), pace=partial(pace, model=model, dual=dual)),
+        # the time of the grandmaster, in PTP's own scale
+        "clock": Clock(
+            ("seconds", "microseconds"), pace=partial(pace, model=model, dual=dual), epoch="tai"
+        ),
     }
 
 
@@ -335,6 +338,11 @@ MX = dataclasses.replace(
     source="rs_driver (decoder_RSMX.hpp); not tested with packets of this model",
 )
 
+E1_TIMING = make_counter(E1_SCANNER, (9, 10, 11))
+E1_TIMING["clock"] = dataclasses.replace(
+    E1_TIMING["clock"], status=make_clock_status(("internal clock", "", "PTP (E2E L2)", "gPTP"))
+)
+
 E1 = dataclasses.replace(
     M2,
     id="robosense-e1",
@@ -348,7 +356,7 @@ E1 = dataclasses.replace(
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },
     points=points,
-    **make_counter(E1_SCANNER, (9, 10, 11)),
+    **E1_TIMING,
     simulation=Simulation(partial(sweep, model=E1_SCANNER)),
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},

@@ -10,6 +10,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct
 
 import lidarspec as ls
+from lidarspec.packets.clock_status import frame_status
 from lidarspec.spec import Clock, Fields, Frame, OnRewind, PacketCounter, Polar, Scaled, Udp
 from tests.evidence import assert_points, decode, vector_bytes, vectors
 
@@ -336,3 +337,21 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     )
     np.testing.assert_allclose(cloud.time, np.repeat([0, 1e-5, 2e-5], 5), atol=1e-12)
     assert cloud.stamp_ns == 500_000_000
+
+
+def test_mode_and_status_of_synchronization_say_whether_the_clock_is_locked() -> None:
+    clock = SENSOR.clock
+    assert clock is not None
+    assert clock.status is not None
+    difop = SENSOR.parse(SENSOR.example("difop"), "difop")
+    states = {}
+    for mode in range(4):
+        for status in range(3):
+            difop.time_sync_mode = mode
+            difop.time_sync_status = status
+            frames = SENSOR.decode([SENSOR.build("difop", difop)], "difop")
+            value = frame_status(clock.status, frames.table).item()
+            states[mode, status] = clock.status.state_of(value)
+    locked = {place: clock.epoch_in(state) for place, state in states.items() if state.locked}
+    assert locked == {(1, 1): "utc", (2, 1): "tai", (3, 1): "tai"}
+    assert all(state.locked is not None for state in states.values())

@@ -244,7 +244,9 @@ FALCON = Sensor(
     points=points,
     scan=OnChange("frame"),
     links={"data": Udp(8010)},
-    clock=Clock(lambda f: (f.start, f.blocks[0].after)),
+    # "epoch time" in the vendor's header. The type of time is in the high bits of `source`, but
+    # the meaning of its values is not public.
+    clock=Clock(lambda f: (f.start, f.blocks[0].after), epoch="utc"),
     range_limits=(0.1, 500.0),
     turn=(5.0, 20.0),
     vendor_axes=("up", "right", "forward"),

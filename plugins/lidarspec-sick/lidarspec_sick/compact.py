@@ -251,7 +251,9 @@ def make_scanner(name: str) -> Sensor:
         },
         points=None,
         scan=OnChange("modules.turn"),
-        clock=Clock("modules.start_time[0]"),
+        # since 1970 if NTP or PTP has set it, otherwise since power-up: the telegrams do not report
+        # which (sick_scan_xd, README, timestamps)
+        clock=Clock("modules.start_time[0]", epoch="utc"),
         sequence=PacketCounter("counter"),
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,

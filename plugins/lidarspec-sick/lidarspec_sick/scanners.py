@@ -186,7 +186,7 @@ def make_scanner(name: str) -> Sensor:
         scan=OnChange("telegram_counter")
         if len(kind.layers) == 1
         else OnFlag("layer", kind.layers[0]),
-        clock=Clock("time", wraps_at=CLOCK_WRAP_S),
+        clock=Clock("time", wraps_at=CLOCK_WRAP_S, epoch="boot"),
         sequence=PacketCounter("telegram_counter"),
         links={"data": Tcp(2112)},
         commands=make_commands("scan"),

@@ -27,7 +27,7 @@ from construct import (
     Struct,
 )
 
-from lidarspec.spec import Fields, Frame, Scaled, Simulation
+from lidarspec.spec import ClockState, ClockStatus, Fields, Frame, Scaled, Simulation
 
 BLOCKS = 12
 SLOTS = 32
@@ -153,6 +153,18 @@ def is_plausible_position(f: Fields) -> Any:
 #: Time, validity and date of a sentence, with position and movement in between.
 _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 PPS_LOCKED = 2
+#: The state of the clock in position packets (VLP-16 user manual, PPS status). Without a pulse the
+#: clock counts from power-up, modulo an hour.
+CLOCK_STATUS = ClockStatus(
+    "pps",
+    {
+        0: ClockState("no PPS", False, epoch="boot"),
+        1: ClockState("synchronizing to PPS", False, epoch="boot"),
+        PPS_LOCKED: ClockState("locked to PPS", True),
+        3: ClockState("PPS error", False, epoch="boot"),
+    },
+    frame="position",
+)
 
 
 def nmea_seconds(f: Fields) -> Any:

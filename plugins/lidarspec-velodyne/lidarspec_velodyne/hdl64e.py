@@ -300,7 +300,10 @@ def make_sensor(series: str, unit: Unit, other: str) -> Sensor:
         points=partial(points, unit=unit),
         scan=OnWrap("blocks.azimuth"),
         links={"data": Udp(2368)},
-        clock=Clock("timestamp", wraps_at=CLOCK_WRAP_S, pace=partial(pace, unit=unit)),
+        # the packets do not report whether a GPS receiver sets the clock
+        clock=Clock(
+            "timestamp", wraps_at=CLOCK_WRAP_S, pace=partial(pace, unit=unit), epoch="hour"
+        ),
         simulation=Simulation(partial(sweep, unit=unit)),
         configure=partial(configure, unit),
         range_limits=(0.9, 120.0),  # data sheet

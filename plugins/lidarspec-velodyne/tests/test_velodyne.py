@@ -13,6 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.errors import UnknownOption
+from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.stream import PacketStream
 from tests.calibration_files import write_velodyne_xml
 from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
@@ -578,3 +579,12 @@ def test_an_invalid_hdl64e_file_is_refused(tmp_path: Path) -> None:
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "vlp32.xml", 32))
     with pytest.raises(ls.UsageError, match="rotCorrection_ of a laser must be finite"):
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "nan.xml", rotCorrection_="nan"))
+
+
+def test_position_packets_report_the_state_of_the_clock() -> None:
+    datagrams = [position(b"", pps=0), packet(steps(0), {}), position(b""), packet(steps(1), {})]
+    clock = VLP16.clock
+    assert clock is not None
+    assert clock.status is not None
+    values = read_clock_status(decode(VLP16, datagrams))
+    assert [clock.status.state_of(value).locked for value in values] == [False, True]
