@@ -54,6 +54,9 @@ class Sensor(SensorDescription):
         vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
             of forward, back, left, right, up and down.
         beams: points of a scan, if their number is constant.
+        returns: the names of the returns of a firing, by return index, if they are not in the
+            order of their distance: "first", "last", "strongest", "second strongest", or "varying"
+            if a setting of the sensor decides. `Selection` chooses by them.
         turn: the slowest and the fastest number of scans a second.
         relatives: ids of related models, installed or not, with the difference: a text if the pace
             of the clock or the model in `info` shows it, a `Relative` if single packets show it.

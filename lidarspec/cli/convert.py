@@ -82,7 +82,7 @@ class _Counts:
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans")
-@selecting("times", "scans", "every", "ranges", "columns", "time", "beams", "frame_id")
+@selecting("times", "scans", "every", "ranges", "returns", "columns", "time", "beams", "frame_id")
 @points_option
 @click.option(
     "--organized",

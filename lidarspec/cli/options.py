@@ -298,6 +298,12 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
         metavar="NEAR:FAR",
         help="Drop returns outside this range, such as 0.5m:30m.",
     ),
+    "returns": click.option(
+        "--returns",
+        type=click.Choice(["first", "last", "strongest", "all"]),
+        metavar="WHICH",
+        help="Keep one return of each firing: first, last or strongest.  [default: all]",
+    ),
     "columns": click.option(
         "--columns",
         metavar="NAME,...",

@@ -66,7 +66,7 @@ from lidarspec.view.svg import svg
     type=DURATION,
     help="Time to read a live source.  [default: 10s, except for a scan]",
 )
-@selecting("times", "scans", "every", "ranges", "time")
+@selecting("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
 @click.option(
     "--max-range",

@@ -81,7 +81,7 @@ TOLERANCE_S = 1e-6
 @click.option("-f", "--frame", metavar="NAME", help="Print the packets of this frame type.")
 @count_option("rows")
 @click.option("-t", "--duration", type=DURATION, help="Stop after this time, such as 10s.")
-@selecting("times", "scans", "every", "ranges", "columns", "time")
+@selecting("times", "scans", "every", "ranges", "returns", "columns", "time")
 @points_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
@@ -328,7 +328,7 @@ class StatsPrinter:
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
 @sensor_option
 @count_option("lines")
-@selecting("times", "scans", "every", "ranges", "time")
+@selecting("times", "scans", "every", "ranges", "returns", "time")
 @click.option(
     "-t",
     "--duration",

@@ -58,7 +58,7 @@ from lidarspec.view.terminal_window import Window
     is_flag=True,
     help="Print one picture and exit; the default if standard output is not a terminal.",
 )
-@selecting("times", "scans", "every", "ranges", "time")
+@selecting("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
 @click.option(
     "--web",

@@ -238,6 +238,9 @@ def _iter_geometry(sensor: Sensor) -> Iterator[str]:
     if sensor.vendor_axes:
         x, y, z = sensor.vendor_axes
         yield f"`configure(frame='vendor')` selects the vendor's axes: x {x}, y {y}, z {z}."
+    if sensor.returns:
+        numbered = [f"{number}: {name}" for number, name in enumerate(sensor.returns)]
+        yield f"Returns of a firing, by `return_index`: {', '.join(numbered)}."
     for name, frame in sensor.frames.items():
         cloud = _decode_example(sensor, name) if frame.data else None
         if cloud is None:

@@ -67,6 +67,8 @@ class Counters:
         bad_constant: datagrams without the constants of any frame. In a stream such bytes are
             skipped and are not candidates.
         lost, duplicates, late: packets, by the sensor's counter and clock.
+        incomplete_returns: groups of packets with the returns of the same firings of which some,
+            but not all, packets were lost (`PacketCounter.returns`).
         fragments_lost: datagrams that were missing when their message was abandoned.
         fragments_late: datagrams that arrived twice, or after their message was joined or
             abandoned.
@@ -92,6 +94,7 @@ class Counters:
     lost: int = 0
     duplicates: int = 0
     late: int = 0
+    incomplete_returns: int = 0
     fragments_lost: int = 0
     fragments_late: int = 0
     kernel_drops: int = 0

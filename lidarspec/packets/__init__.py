@@ -7,6 +7,7 @@ that the packets need are kept with them. Modules in reading order:
 * `packets`: the columns of n frames, raw and physical.
 * `clocks`: reads and unwraps the sensor's clock, in integer nanoseconds.
 * `pace`: the declared time from one packet to the next.
+* `returns`: finds the returns of the same firings in consecutive packets.
 * `counter_order`: finds lost, duplicate and late packets by their counter.
 * `clock_order`: finds them by the clock, for datagrams without a counter.
 * `arrival_order`: counts lost packets that have no counter and always arrive in order.

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.expressions.columns import Batch
 from lidarspec.expressions.graph import header_function
-from lidarspec.framing.results import Counters
+from lidarspec.framing.results import Counters, to_array
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
+from lidarspec.packets.returns import GroupCounter
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, PacketCounter
 
@@ -125,6 +126,9 @@ class CounterOrder:
         self._clock = clock if clock is not None and clock.pace is not None else None
         self._stats = stats
         self._gaps = MaskedGaps(sensor)
+        self._groups: GroupCounter | None = None
+        if self._rule.returns != 1:
+            self._groups = GroupCounter(self._rule, stats)
         self._arrived: int | None = None  # time of the packet that arrived last, ns
         self._number: int | None = None  # of the newest packet
         self._time: int | None = None  # of the newest packet, ns
@@ -148,6 +152,15 @@ class CounterOrder:
         Raises:
             SpecError: if the counter is not a field outside of arrays.
         """
+        index, breaks = self._place_all(batch, times)
+        if self._groups is not None:
+            self._groups.push(batch, to_array(index))
+        return index, breaks
+
+    def _place_all(
+        self, batch: Batch, times: Times | None
+    ) -> tuple[NDArray[np.int64] | range, NDArray[np.bool_]]:
+        """Return the index of each packet, and the breaks before packets."""
         count = len(batch)
         readings = self._read(batch, times)
         self._gaps.read(batch.table)

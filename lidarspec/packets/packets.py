@@ -185,6 +185,26 @@ class Packets:
         """
         return evaluate(self.with_points).cloud
 
+    def returns(self) -> NDArray[Any]:
+        """Return the points with the returns of each firing along the last axis.
+
+        The fields of the structured array are the columns of the points, "valid", and "missing" for
+        a return whose packet is lost. Its shape depends on the packets:
+
+        - If consecutive packets contain the returns (`PacketCounter.returns`): (groups of packets,
+          *shape of the points of a packet, returns).
+        - If each packet contains them in the same places: (packets, *shape of the firings of a
+          packet, returns).
+        - Otherwise: (firings, returns).
+
+        Raises:
+            SpecError: as `points`.
+        """
+        from lidarspec.packets.returns import arrange_returns
+
+        packets = self.with_points
+        return arrange_returns(packets, packets.index)
+
     def imu(self) -> ImuSamples:
         """Return the samples of the sensor's IMU in all packets, in stream order.
 

@@ -8,6 +8,7 @@ Modules in reading order:
 * `column_sources`: sources of the columns of consecutive points.
 * `table_types`: PCL's structured layout and the schema of Arrow.
 * `cloud`: point clouds.
+* `firings`: the returns of each firing, and the choice of one.
 * `mount`: the position of a sensor on its carrier.
 * `colours`: the scale of colours for values, on a dark and on a light ground.
 * `appearance`: the extent and the colours of a drawn cloud.

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lidarspec.packets.packets import Packets
 from lidarspec.points.reference_evaluator import EvaluatedPoints
 from lidarspec.scans.scan_ends import first_points
@@ -53,10 +56,20 @@ class Provenance:
 
     Args:
         runs: the points of the scan, in stream order.
+        indices: the selected points among them; None for all.
     """
 
-    def __init__(self, runs: Sequence[PointRun] = ()) -> None:
+    def __init__(
+        self, runs: Sequence[PointRun] = (), indices: NDArray[np.intp] | None = None
+    ) -> None:
         self._runs = runs
+        self._indices = indices
+
+    def select(self, indices: NDArray[np.intp]) -> Provenance:
+        """Return the origins of some points of the scan, given their indices."""
+        if self._indices is not None:
+            indices = self._indices[indices]
+        return Provenance(self._runs, indices)
 
     def __call__(self, point: int) -> PointOrigin:
         """Return the origin of a point, given its index in the scan.
@@ -65,8 +78,12 @@ class Provenance:
             IndexError: if the index is out of range.
         """
         size = sum(run.stop - run.start for run in self._runs)
+        if self._indices is not None:
+            size = len(self._indices)
         if not 0 <= point < size:
             raise IndexError(f"point {point} of {size}")
+        if self._indices is not None:
+            point = int(self._indices[point])
         first = 0
         runs = iter(self._runs)
         run = next(runs)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud
+from lidarspec.points.firings import RETURNS, Returns, choose_returns, take_returns
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -51,6 +52,8 @@ class Selection:
         every: the step between selected scans; 1 for all.
         ranges: the least and the greatest range, metres. Points outside become invalid; their range
             is -inf if they are nearer, and inf if they are farther (REP-117).
+        returns: one return of each firing: "first", "last" or "strongest"; "all" keeps all. The
+            choice is among the returns inside `ranges`.
         columns: the names of the columns of the points, in this order; () for all.
         time: the clock of the stamps and of `times`: "device", or "host" for the arrival time of
             the first packet of a scan.
@@ -65,6 +68,7 @@ class Selection:
     every: int = 1
     ranges: tuple[float, float] = (0.0, math.inf)
     columns: tuple[str, ...] = ()
+    returns: Returns = "all"
     time: Literal["device", "host"] = "device"
     beams: int | None = None
     frame_id: str = ""
@@ -82,6 +86,8 @@ class Selection:
                 _check_order(low, high)
         if self.every < 1:
             raise UsageError(f"every must be at least 1, not {self.every}")
+        if self.returns not in RETURNS:
+            raise UsageError(f"returns must be one of {', '.join(RETURNS)}, not {self.returns!r}")
 
     @property
     def is_timed(self) -> bool:
@@ -357,11 +363,17 @@ class ScanSelector:
             cloud = LazyCloud.of(_LimitedRanges(cloud, *selection.ranges), stamp_ns)
         elif stamp_ns != cloud.stamp_ns:
             cloud = LazyCloud.of(CloudColumns(cloud), stamp_ns)
+        provenance = scan.provenance
+        if selection.returns != "all" and cloud.return_index is not None:
+            indices = choose_returns(cloud, selection.returns, scan.sensor.returns)
+            cloud = take_returns(cloud, indices)
+            provenance = provenance.select(indices)
         if selection.columns:
             cloud = cloud.select_columns(*selection.columns)
         return replace(
             scan,
             points=cloud,
+            provenance=provenance,
             beams=selection.beams or scan.beams,
             frame_id=selection.frame_id or scan.frame_id,
         )

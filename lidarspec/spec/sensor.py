@@ -53,6 +53,8 @@ API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: the keys of `Sensor.info`.
 ROLES = ("serial", "firmware", "model", "temperature")
+#: names of the returns of a firing; "varying" if a setting of the sensor decides.
+RETURN_NAMES = ("first", "last", "strongest", "second strongest", "varying")
 #: directions of the vendor's axes; in REP-103 x points forward, y left and z up.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
@@ -95,6 +97,7 @@ class SensorDescription:
     range_limits: tuple[float, float] | None = field(default=None, kw_only=True)
     vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
     beams: int | None = field(default=None, kw_only=True)
+    returns: tuple[str, ...] = field(default=(), kw_only=True)
     turn: tuple[float, float] | None = field(default=None, kw_only=True)
     relatives: Mapping[str, str | Relative] = field(default_factory=dict, kw_only=True)
     info: Mapping[str, str] = field(default_factory=dict, kw_only=True)
@@ -109,7 +112,7 @@ class SensorDescription:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", MappingProxyType(FrameTypes(self.id, self.frames)))
         freeze(self, "links", "commands", "state", "relatives", "info", "acknowledged", "options")
-        for name in ("on_open", "on_close", "aliases"):
+        for name in ("on_open", "on_close", "aliases", "returns"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if isinstance(self.configure, Configure):
             function = self.configure.function
@@ -356,6 +359,13 @@ def _check_facts(sensor: SensorDescription) -> None:
     if unknown_directions:
         raise SpecError(
             f"unknown direction {unknown_directions[0]!r}", path="vendor_axes", sensor=sensor.id
+        )
+    unknown_returns = sorted(set(sensor.returns) - set(RETURN_NAMES))
+    if unknown_returns:
+        raise SpecError(
+            f"unknown name {unknown_returns[0]!r}: expected one of {', '.join(RETURN_NAMES)}",
+            path="returns",
+            sensor=sensor.id,
         )
     if sensor.beams is not None and sensor.beams < 1:
         raise SpecError(

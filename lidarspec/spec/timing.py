@@ -252,11 +252,15 @@ class PacketCounter:
         field: path of the counter.
         first, last: its lowest and highest value. `last` may be a function of `Fields`; by default
             it is the largest value of the field.
+        returns: the number of consecutive packets that contain the returns of the same firings, one
+            return each; a number or a function of `Fields`. The first packet of such a group has
+            the counter `first`, or a multiple of `returns` more.
     """
 
     field: str
     first: int = 0
     last: int | Callable[[Any], Any] | None = None
+    returns: int | Callable[[Any], Any] = 1
 
 
 def unix_time(

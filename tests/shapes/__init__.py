@@ -39,6 +39,7 @@ from tests.shapes import (
     options,
     outer,
     paced,
+    pairs,
     remarks,
     scales,
     segments,
@@ -97,6 +98,7 @@ _MODULES = (
     escaped,
     paced,
     synced,
+    pairs,
 )
 
 SHAPES: dict[str, Sensor] = {

@@ -37,6 +37,7 @@ def make_spinning_sensor(
         "clock": CLOCK,
         "scan": OnWrap(azimuth),
         "vendor_axes": ("right", "forward", "up"),
+        "returns": ("varying",) * 3,  # the return mode decides
     }
     return Sensor(
         id,

@@ -216,6 +216,7 @@ C16 = Sensor(
     simulation=Simulation(sweep),
     configure=configure,
     range_limits=(0.3, 200.0),  # the defaults of the driver
+    returns=("varying", "varying"),  # the order is not documented
     vendor_axes=("right", "forward", "up"),
     turn=SPEED_LIMITS_HZ,
     info={"model": "data.model"},

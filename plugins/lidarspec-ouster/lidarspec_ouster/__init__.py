@@ -303,6 +303,7 @@ def make_model(name: str, status: str) -> Sensor:
         recognise=recognise,
         on_open=("get_metadata",),
         range_limits=limits,
+        returns=("varying", "varying"),  # the return order is a setting of newer firmware
         vendor_axes=("forward", "left", "up"),
         turn=(5, 20),
         relatives={f"ouster-{other.lower()}": METADATA_ONLY for other in MODELS if other != name},

@@ -156,6 +156,15 @@ def packets_per_frame(f: Fields) -> Any:
     return np.where(f.wave_mode == 0, DUAL_RETURN_PACKETS, SINGLE_RETURN_PACKETS)
 
 
+def count_returns(f: Fields) -> Any:
+    """Return the number of consecutive packets with the returns of the same firings.
+
+    With dual return, an odd packet has the first returns and the next packet has the second returns
+    (M1 user guide, 2.1.2).
+    """
+    return np.where(f.wave_mode == 0, 2, 1)
+
+
 def pace(f: Fields) -> Any:
     """Return the seconds from a packet to the next."""
     return 1 / (FRAME_RATE_HZ * packets_per_frame(f))
@@ -164,9 +173,13 @@ def pace(f: Fields) -> Any:
 def points(f: Fields) -> Polar:
     """Return range and direction as on the wire, which has REP-103 axes.
 
+    The column is the number of the firing in its frame. Two returns of a firing have the same
+    column and ring.
+
     Source: M1P user guide, page 13.
     """
     channels = f.blocks.channels
+    measurement = np.where(f.wave_mode == 0, np.floor((f.pkt_psn - 1) / 2), f.pkt_psn - 1)
     return Polar(
         range=channels.radius,
         azimuth=np.deg2rad(channels.azimuth),
@@ -175,6 +188,7 @@ def points(f: Fields) -> Polar:
         time=f.blocks.time_offset,
         ring=np.arange(CHANNELS),
         return_index=np.maximum(f.blocks.return_seq - 1, 0),
+        column=measurement * BLOCKS + f.blocks.index,
     )
 
 
@@ -251,7 +265,8 @@ M1 = Sensor(
     links={"data": Udp(6699, 7788)},
     # the time of the grandmaster as it is (issue rslidar_sdk 169), in PTP's own scale TAI
     clock=Clock(("seconds", "microseconds"), pace=pace, epoch="tai", status=make_clock_status()),
-    sequence=PacketCounter("pkt_psn", first=1, last=packets_per_frame),
+    sequence=PacketCounter("pkt_psn", first=1, last=packets_per_frame, returns=count_returns),
+    returns=("first", "last"),  # the nearer and the farther return (M1 user guide, Table 5)
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),

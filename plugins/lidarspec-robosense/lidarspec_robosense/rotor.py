@@ -378,5 +378,6 @@ COMMON: dict[str, Any] = {
     "clock": Clock(("seconds", "microseconds"), epoch="utc"),
     "vendor_axes": ("forward", "left", "up"),
     "turn": SPEED_LIMITS_HZ,
+    "returns": ("varying", "varying"),  # a setting; the order is not documented
     "status": "manual",
 }

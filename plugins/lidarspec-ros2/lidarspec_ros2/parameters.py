@@ -126,6 +126,12 @@ PARAMETERS = (
         10,
         live=True,
     ),
+    Parameter(
+        "returns",
+        "all",
+        "Keep one return of each firing: first, last or strongest; all keeps all.",
+        live=True,
+    ),
     Parameter("range_min", 0.0, "Drop nearer returns, metres.", 0, _MAX_RANGE_M, live=True),
     Parameter(
         "range_max",
@@ -234,7 +240,10 @@ class Settings:
         """Return the selection of points in each scan."""
         far = self["range_max"] or math.inf
         return Selection(
-            ranges=(self["range_min"], far), beams=self["beams"] or None, frame_id=self["frame_id"]
+            ranges=(self["range_min"], far),
+            returns=self["returns"],
+            beams=self["beams"] or None,
+            frame_id=self["frame_id"],
         )
 
     def make_planar_scans(self) -> PlanarScans:

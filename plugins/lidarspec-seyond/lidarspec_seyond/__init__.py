@@ -249,6 +249,8 @@ FALCON = Sensor(
     clock=Clock(lambda f: (f.start, f.blocks[0].after), epoch="utc"),
     range_limits=(0.1, 500.0),
     turn=(5.0, 20.0),
+    # two strongest, or strongest and farthest, by the field flags.returns
+    returns=("strongest", "varying"),
     vendor_axes=("up", "right", "forward"),
     status="manual",
     source=(

@@ -250,6 +250,9 @@ VLP16 = Sensor(
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
+    # even blocks: the last return, odd blocks: the strongest or second strongest (user manuals,
+    # dual return mode)
+    returns=("last", "strongest"),
     vendor_axes=("right", "forward", "up"),
     turn=SPEED_LIMITS_HZ,
     # 12 shots, or 6 with dual return, with periods of 110.592 and 46.080 us

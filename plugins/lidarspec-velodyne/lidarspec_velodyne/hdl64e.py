@@ -307,6 +307,8 @@ def make_sensor(series: str, unit: Unit, other: str) -> Sensor:
         simulation=Simulation(partial(sweep, unit=unit)),
         configure=partial(configure, unit),
         range_limits=(0.9, 120.0),  # data sheet
+        # the first pair of blocks: the strongest, the second pair: the last (manual, dual return)
+        returns=("strongest", "last"),
         vendor_axes=("right", "forward", "up"),
         turn=SPEED_LIMITS_HZ,
         relatives={

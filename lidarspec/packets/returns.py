@@ -1,0 +1,218 @@
+"""Returns of one firing in consecutive packets (`PacketCounter.returns`), and in one packet.
+
+Some sensors send each return of their firings in a packet of its own. These packets form a group
+with consecutive counters. A group is incomplete if some of its packets are lost: the points of the
+others then lack the other return. `GroupCounter` counts incomplete groups, and `arrange_returns`
+puts the returns of each firing next to each other.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.expressions.columns import Batch
+from lidarspec.expressions.graph import header_function
+from lidarspec.framing.results import Counters
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.firings import MISSING, group_firings
+from lidarspec.points.reference_evaluator import PacketBatch
+from lidarspec.spec.timing import PacketCounter
+
+#: the number of packets after which a group no longer waits for a late packet.
+MAX_PLACES_LATE = 64
+
+
+def read_groups(
+    rule: PacketCounter, batch: Batch, index: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the group of each packet, its place in the group, and the size of the group, (n,).
+
+    Args:
+        index: the index of each packet, (n,).
+    """
+    sizes = np.ones(len(batch), np.int64)
+    if callable(rule.returns):
+        (values,) = header_function(rule.returns, batch.table.schema, _to_sizes)(batch)
+        sizes = np.broadcast_to(np.maximum(values, 1), (len(batch),))
+    else:
+        sizes *= rule.returns
+    numbers = batch.table.raw(rule.field).astype(np.int64)
+    places = (numbers - rule.first) % sizes
+    return index - places, places, sizes
+
+
+def _to_sizes(values: Any, count: int) -> NDArray[np.int64]:
+    sizes = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
+    if len(sizes) == 1:
+        return sizes
+    return np.broadcast_to(sizes, (count,))
+
+
+class GroupCounter:
+    """The number of incomplete groups of packets with the returns of the same firings.
+
+    Args:
+        rule: the counter of the packets.
+        stats: `incomplete_returns` counts the groups.
+    """
+
+    def __init__(self, rule: PacketCounter, stats: Counters) -> None:
+        self._rule = rule
+        self._stats = stats
+        self._first: int | None = None  # the lowest index of the stream
+        self._newest = 0
+        self._seen = dict[int, set[int]]()  # places seen of each incomplete group
+        self._ends = dict[int, int]()  # the last index of each of these groups
+        self._counted = set[int]()  # those of them that are counted
+
+    def push(self, batch: Batch, index: NDArray[np.int64]) -> None:
+        """Count the groups that the next packets show to be incomplete.
+
+        Args:
+            index: the index of each packet, (n,).
+        """
+        if not len(batch):
+            return
+        groups, places, sizes = read_groups(self._rule, batch, index)
+        if self._first is None:
+            self._first = int(index.min())
+        self._newest = max(self._newest, int(index.max()))
+        for row in _find_incomplete(groups, places, sizes).tolist():
+            self._add(int(groups[row]), int(places[row]), int(sizes[row]))
+        self._count_ended()
+
+    def _add(self, group: int, place: int, size: int) -> None:
+        """Add a packet to a group that has not been complete so far."""
+        assert self._first is not None
+        if group < self._first:
+            return  # the stream began within the group
+        places = self._seen.setdefault(group, set())
+        places.add(place)
+        self._ends[group] = group + size - 1
+        if len(places) == size:
+            if group in self._counted:
+                self._stats.incomplete_returns -= 1
+            self._forget(group)
+
+    def _count_ended(self) -> None:
+        """Count the incomplete groups that the newest packet follows."""
+        for group, end in list(self._ends.items()):
+            if end < self._newest and group not in self._counted:
+                self._stats.incomplete_returns += 1
+                self._counted.add(group)
+            if end < self._newest - MAX_PLACES_LATE:
+                self._forget(group)
+
+    def _forget(self, group: int) -> None:
+        del self._seen[group]
+        del self._ends[group]
+        self._counted.discard(group)
+
+
+def _find_incomplete(
+    groups: NDArray[np.int64], places: NDArray[np.int64], sizes: NDArray[np.int64]
+) -> NDArray[np.intp]:
+    """Return the rows of packets whose group is not complete in a batch, (k,)."""
+    _, first_rows = np.unique(groups * int(sizes.max()) + places, return_index=True)
+    _, numbers, counts = np.unique(groups[first_rows], return_inverse=True, return_counts=True)
+    is_incomplete = counts[numbers.reshape(-1)] < sizes[first_rows]
+    rows: NDArray[np.intp] = first_rows[is_incomplete]
+    return rows
+
+
+def arrange_returns(packets: PacketBatch, index: NDArray[np.int64]) -> NDArray[Any]:
+    """Return the points of packets, with the returns of a firing along the last axis.
+
+    See `Packets.returns`.
+
+    Args:
+        index: the index of each packet, (n,).
+    """
+    points = evaluate(packets)
+    cloud = points.cloud
+    shape = points.counts.shape[1:]
+    is_regular = bool(points.counts.all())
+    rule = packets.sensor.sequence
+    indices: NDArray[np.intp] | None = None
+    if is_regular and rule is not None and rule.returns != 1:
+        indices = _join_packets(read_groups(rule, packets.batch(), index), shape)
+    elif is_regular and cloud.return_index is not None:
+        indices = _split_axis(cloud.return_index.reshape(len(packets), *shape))
+    if indices is None:
+        indices = group_firings(cloud)
+    return _gather(cloud, indices)
+
+
+def _join_packets(
+    members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    shape: tuple[int, ...],
+) -> NDArray[np.intp]:
+    """Return the indices of points in groups of packets, (groups, *shape, returns).
+
+    Args:
+        members: the group of each packet, its place, and the size of the group, (n,).
+        shape: the shape of the points of each packet.
+    """
+    groups, places, sizes = members
+    size = int(sizes.max(initial=1))
+    _, numbers = np.unique(groups, return_inverse=True)
+    rows = np.full((int(numbers.max(initial=-1)) + 1, size), MISSING, np.intp)
+    rows[numbers.reshape(-1), places] = np.arange(len(groups))
+    width = int(np.prod(shape))
+    inside = np.arange(width).reshape(shape)
+    rows = rows.reshape(len(rows), *(1,) * len(shape), size)
+    return np.where(rows == MISSING, MISSING, rows * width + inside[..., None])
+
+
+def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
+    """Return the indices of points with the returns of a packet along a new last axis.
+
+    The axis along which the return index varies is divided among the returns.
+
+    Args:
+        numbers: the return index of each point, (n, ...).
+
+    Returns:
+        None unless all packets have equally many points of each return, in the same places, and the
+        return index varies along one axis.
+    """
+    if not len(numbers) or (numbers != numbers[0]).any():
+        return None
+    first = numbers[0]
+    size = int(first.max()) + 1
+    places = [np.flatnonzero(first == number) for number in range(size)]
+    if len({len(place) for place in places}) > 1:
+        return None
+    varying = [axis for axis in range(first.ndim) if np.diff(first, axis=axis).any()]
+    if len(varying) > 1:
+        return None
+    shape = list(first.shape)
+    for axis in varying:
+        shape[axis] //= size
+        if shape[axis] == 1:
+            del shape[axis]
+    rows = np.arange(len(numbers)).reshape(-1, *(1,) * len(shape), 1)
+    inside = np.stack(places, axis=-1).reshape(*shape, size)
+    indices: NDArray[np.intp] = rows * first.size + inside
+    return indices
+
+
+def _gather(cloud: PointCloud, indices: NDArray[np.intp]) -> NDArray[Any]:
+    """Return a structured array of points at some indices; missing points are not valid."""
+    columns = {**cloud.columns, "valid": cloud.valid}
+    is_missing = indices == MISSING
+    kinds = [(name, column.dtype) for name, column in columns.items()]
+    gathered = np.zeros(indices.shape, [*kinds, ("missing", np.bool_)])
+    if len(cloud):
+        for name, column in columns.items():
+            gathered[name] = column[indices]
+            if column.dtype.kind == "f":
+                gathered[name][is_missing] = np.nan
+            else:
+                gathered[name][is_missing] = 0
+    gathered["missing"] = is_missing
+    return gathered

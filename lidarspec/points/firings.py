@@ -1,0 +1,124 @@
+"""Group the returns of each firing, and choose one of them.
+
+Returns belong to one firing if they have the same column and ring. The points of most sensors have
+no column; their returns have the same time and ring. Points that agree in these are firings one
+after another: the first point with return index 0 and the first with return index 1 are the first
+firing.
+
+A firing may lack a return: it was not sent, or its packet is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError
+from lidarspec.points.cloud import PointCloud
+
+#: a choice among the returns of each firing.
+Returns = Literal["first", "last", "strongest", "all"]
+RETURNS: tuple[Returns, ...] = ("first", "last", "strongest", "all")
+#: index of a return that is missing.
+MISSING = -1
+#: ranks of returns that are not valid, and of returns that are missing, in the choice of one.
+_INVALID_RANK = 1e30
+_MISSING_RANK = 1e31
+
+
+def group_firings(cloud: PointCloud) -> NDArray[np.intp]:
+    """Return the indices of the returns of each firing, (firings, returns).
+
+    Firings are in the order of their first points. The index of a missing return is `MISSING`.
+    """
+    count = len(cloud)
+    if cloud.return_index is None or not count:
+        return np.arange(count)[:, None]
+    numbers = cloud.return_index.astype(np.intp)
+    size = int(numbers.max()) + 1
+    if count % size == 0 and (numbers.reshape(-1, size) == np.arange(size)).all():
+        return np.arange(count).reshape(-1, size)  # adjacent returns
+    cloud.load("column", "time", "ring")
+    place = cloud.time if cloud.column is None else cloud.column
+    rings = np.zeros(count, np.uint16) if cloud.ring is None else cloud.ring
+    occurrences = _count_occurrences(place, rings, numbers)
+    order = np.lexsort((occurrences, rings, place))
+    is_first = _find_changes(place[order], rings[order], occurrences[order])
+    firings = np.full((int(is_first.sum()), size), MISSING, np.intp)
+    firings[np.cumsum(is_first) - 1, numbers[order]] = order
+    first_points = np.where(firings == MISSING, count, firings).min(axis=1)
+    return firings[np.argsort(first_points)]
+
+
+def _count_occurrences(*keys: NDArray[Any]) -> NDArray[np.intp]:
+    """Return how many earlier points have the same keys, (n,)."""
+    order = np.lexsort(keys)  # stable
+    starts = np.flatnonzero(_find_changes(*(key[order] for key in keys)))
+    positions = np.arange(len(order))
+    positions -= np.repeat(starts, np.diff(starts, append=len(order)))
+    occurrences = np.empty(len(order), np.intp)
+    occurrences[order] = positions
+    return occurrences
+
+
+def _find_changes(*keys: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return a mask of the points that differ from the point before in a key, (n,)."""
+    changes = np.ones(len(keys[0]), np.bool_)
+    changes[1:] = False
+    for key in keys:
+        changes[1:] |= key[1:] != key[:-1]
+    return changes
+
+
+def choose_returns(cloud: PointCloud, which: Returns, names: Sequence[str] = ()) -> Any:
+    """Return the index of the chosen return of each firing, (firings,).
+
+    Only valid returns are chosen. A firing without a valid return keeps its return with the lowest
+    index.
+
+    Args:
+        which: "first", "last" or "strongest". The strongest return has the highest intensity.
+        names: the names of the returns, by return index (`Sensor.returns`). Without names the first
+            return has the lowest index. If no return has the name `which`, the first is the nearest
+            and the last the farthest.
+
+    Raises:
+        UsageError: for "strongest" if there is neither an intensity nor a return of this name.
+    """
+    firings = group_firings(cloud)
+    is_missing = firings == MISSING
+    if which == "strongest" and cloud.intensity is not None:
+        ranks = -cloud.intensity[firings]
+    elif which in names:
+        ranks = np.where(np.arange(firings.shape[1]) == names.index(which), 0.0, 1.0)
+        ranks = np.broadcast_to(ranks, firings.shape)
+    elif which == "strongest":
+        raise UsageError("the strongest return is unknown: the points have no intensity")
+    else:
+        ranks = np.broadcast_to(np.arange(firings.shape[1]), firings.shape)
+        if names:
+            ranks = cloud.range[firings]
+        if which == "last":
+            ranks = -ranks
+    ranks = np.where(cloud.valid[firings], ranks, _INVALID_RANK)
+    ranks = np.where(is_missing, _MISSING_RANK, ranks)
+    chosen = np.argmin(ranks, axis=1)
+    return firings[np.arange(len(firings)), chosen]
+
+
+def take_returns(cloud: PointCloud, indices: NDArray[np.intp]) -> PointCloud:
+    """Return the points at the indices of one return of each firing.
+
+    The result is organised if the cloud is, and if the rings still repeat in every column.
+    """
+    picked = cloud[indices]
+    if cloud.shape is None or picked.ring is None:
+        return picked
+    rows = cloud.shape[1]
+    if len(picked) % rows or (picked.ring.reshape(-1, rows) != picked.ring[:rows]).any():
+        return picked
+    return replace(picked, shape=(len(picked) // rows, rows))

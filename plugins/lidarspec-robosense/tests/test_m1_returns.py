@@ -1,0 +1,108 @@
+"""Tests of the two returns of an RS-LiDAR-M1, which consecutive packets contain.
+
+Source: M1 user guide, 2.1.2 and Table 5. A packet has 25 blocks of 5 channels; with dual return the
+odd packets have the first (nearer) and the even packets the second (farther) return.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+
+M1 = ls.sensor("robosense-m1")
+PACKETS = 1260
+NEAR_M = 5.0
+FAR_M = 7.5
+
+
+def make_packet(number: int) -> bytes:
+    """Return the packet with this counter, 1 to 1260; its two returns are 5 and 7.5 m away."""
+    second = (number - 1) % 2
+    firing = (number - 1) // 2 * 25
+    blocks = [
+        {
+            "time_offset": block * 10 // 3,
+            "return_seq": 1 + second,
+            "channels": [
+                {
+                    "radius": (1500 if second else 1000),
+                    "elevation": 32768,
+                    "azimuth": 32768 + (firing + block) % 2000 + 2400 * channel,
+                    # the second return of channel 4 is the stronger one
+                    "intensity": 100 + 50 * (second == (channel == 4)),
+                    "reserved": bytes(2),
+                }
+                for channel in range(5)
+            ],
+        }
+        for block in range(25)
+    ]
+    return M1.build(
+        "data",
+        pkt_psn=number,
+        protocol_version=0,
+        wave_mode=0,
+        time_sync_mode=0,
+        seconds=1000,
+        microseconds=number * 79,
+        reserved=bytes(10),
+        lidar_type=0x10,
+        mems_tmp=105,
+        blocks=blocks,
+        tail=bytes(3),
+    )
+
+
+@pytest.fixture(scope="module")
+def packets() -> list[bytes]:
+    """Return the packets of one frame with dual return."""
+    return [make_packet(number) for number in range(1, PACKETS + 1)]
+
+
+def test_odd_and_even_packets_are_the_returns_of_the_same_firings(packets: list[bytes]) -> None:
+    decoded = M1.decode(packets[:200])
+    returns = decoded.returns()
+    assert returns.shape == (100, 25, 5, 2)
+    np.testing.assert_allclose(returns["range"], np.broadcast_to([NEAR_M, FAR_M], returns.shape))
+    np.testing.assert_array_equal(returns["azimuth"][..., 0], returns["azimuth"][..., 1])
+    assert decoded.stats.incomplete_returns == 0
+
+
+def test_a_lost_half_is_counted(packets: list[bytes]) -> None:
+    decoded = M1.decode(packets[:40] + packets[41:])
+    assert (decoded.stats.lost, decoded.stats.incomplete_returns) == (1, 1)
+    assert "incomplete_returns 1" in str(decoded.stats)
+    assert np.flatnonzero(decoded.returns()["missing"].any(axis=(1, 2, 3))).tolist() == [20]
+
+
+@pytest.mark.parametrize(("which", "metres"), [("first", NEAR_M), ("last", FAR_M)])
+def test_a_frame_has_one_point_of_each_firing(
+    packets: list[bytes], which: str, metres: float
+) -> None:
+    (scan,) = M1.scans(packets, select=ls.Selection(returns=which))
+    assert scan.points.shape == (630 * 25, 5)
+    assert (scan.points.range == metres).all()
+    assert scan.points.column.tolist() == np.repeat(np.arange(630 * 25), 5).tolist()
+
+
+def test_the_strongest_return_has_the_highest_intensity(packets: list[bytes]) -> None:
+    (scan,) = M1.scans(packets, select=ls.Selection(returns="strongest"))
+    assert (scan.points.intensity == 150).all()
+    assert (scan.points.return_index == (scan.points.ring == 4)).all()
+
+
+def test_the_command_line_reads_one_return(packets: list[bytes], tmp_path: Path) -> None:
+    file = tmp_path / "dual.hex"
+    file.write_text("\n\n".join(packet.hex() for packet in packets[:4]))
+    options = f"-s {M1.id} --returns last --columns range --json"
+    command = shlex.split(f"{sys.executable} -m lidarspec read {file} {options}")
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert [json.loads(line)["range"] for line in lines] == [FAR_M] * 250
