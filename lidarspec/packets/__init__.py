@@ -17,4 +17,5 @@ that the packets need are kept with them. Modules in reading order:
 * `packet_type`: the clock and the loss detection of one frame type.
 * `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
+* `clock_estimate`: offset and drift between the sensor's clock and the host's.
 """

@@ -33,6 +33,7 @@ from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
+from lidarspec_ros2.clock import describe_jump
 from lidarspec_ros2.diagnostics import LOST_STATES, make_status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
@@ -262,7 +263,11 @@ class LidarNode(LifecycleNode):
             "clock set": f"{clock.jumps} times",
         }
         status = make_status(
-            self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more
+            self.get_name(),
+            device,
+            reading,
+            [*filter(None, (describe_jump(clock), topics.fault))],
+            more,
         )
         self._diagnostics.publish(
             DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status])

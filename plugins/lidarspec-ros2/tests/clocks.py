@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec_ros2.clock import DeviceClock
+from lidarspec.packets.clock_estimate import DeviceClock
+from lidarspec_ros2.clock import describe_jump
 
 Random = np.random.Generator
 Floats = NDArray[np.float64]
@@ -96,7 +97,7 @@ def simulate_stamps(
         if each > 1:
             clock.observe(device[first : first + each], host[first : first + each])
         stamps.append(clock.stamp(int(device[first]), int(host[first])))
-        said |= {clock.jump: None}
+        said |= {describe_jump(clock): None}
     which = slice(0, len(stamps) * each, each)
     return Run(times[which], device[which], host[which], np.array(stamps), clock, list(said)[1:])
 

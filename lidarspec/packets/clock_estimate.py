@@ -1,0 +1,290 @@
+"""Conversion of a sensor's clock to the clock of the host, by the arrival times of packets.
+
+The sensor's time has an arbitrary start, runs fast or slow by some millionths, and may restart. The
+host's time of arrival has the correct rate, but is late by some milliseconds, which vary from
+packet to packet with the line and the operating system. A packet is never early. So the delays,
+arrival minus sensor's time, lie above a line, and many lie close to it. The line is that of packets
+without delay: its height is the offset between the clocks, its slope the drift.
+
+The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
+computes their lower convex hull. The line is the highest that lies below all of them at their
+middle: the edge of the hull there. If the slopes of the hull shortly before and after the middle
+include the previous slope, it is kept, because the delays do not determine a better one. Stamps
+approach the line smoothly. The clock was set if several consecutive packets are too early, or if
+for a second all packets are late, by much more than their delays differ from each other.
+
+Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
+measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
+for network measurements, INFOCOM 2002 (the hull).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+PART_NS = 250_000_000  # the smallest delay of each part is kept
+PARTS = 120  # kept parts: half a minute
+MIN_PARTS_FOR_SLOPE = 20
+MIDDLE_PARTS = 8  # hull edges so far before and after the middle limit the slope
+SETTLED_PARTS = 40  # after which the line is reliable
+MAX_DRIFT = 0.02  # share of the time, for a microcontroller without a crystal
+SLEW_TIME_NS = 1_000_000_000  # in which stamps approach the line
+MAX_SLEW = 0.05  # share of the time: 50,000 ppm
+# Deviations from the line at which the clock was not set, before it is settled, and after.
+UNSETTLED_LIMIT_NS = 1_000_000_000
+EARLY_LIMIT_NS = 5_000_000
+LATE_LIMIT_NS = 10_000_000
+# Consecutive outliers that show that the clock was set.
+CERTAIN_OUTLIERS = 3
+LATE_OUTLIERS = 5  # if they are only late
+LATE_OUTLIERS_NS = 1_000_000_000  # minimum duration if they are only late
+
+
+class ClockSample(NamedTuple):
+    """A time of the sensor, and the delay until its arrival, ns."""
+
+    device: int
+    delay: int
+
+
+class ClockLine(NamedTuple):
+    """The line of packets without delay: a point on it, and its slope.
+
+    Attributes:
+        device: a time of the sensor, ns.
+        delay: arrival minus sensor's time there, ns.
+        slope: change of the delay per time of the sensor.
+    """
+
+    device: int
+    delay: int
+    slope: float
+
+    def delay_at(self, device: int) -> int:
+        """Return the delay at a time of the sensor, ns."""
+        return self.delay + round(self.slope * (device - self.device))
+
+
+class ClockJump(NamedTuple):
+    """A change of the sensor's clock, as when it is set or restarts.
+
+    Attributes:
+        change_ns: the sensor's time after the change minus the time that it would have had.
+        host_ns: the arrival time of the first packet after the change.
+    """
+
+    change_ns: int
+    host_ns: int
+
+
+class DeviceClock:
+    """Conversion of the times of a sensor to those of the host.
+
+    A constant delay looks the same as an offset: the time on the line, and the time that the sensor
+    needs before it sends, remain in the result.
+
+    Attributes:
+        jumps: how often the sensor's clock was set.
+        jump: the last change, until ten seconds after it; otherwise None.
+    """
+
+    def __init__(self) -> None:
+        self._stamp = -(1 << 62)
+        self.jumps = 0
+        self.jump: ClockJump | None = None
+        self._min_delays = deque[ClockSample](maxlen=PARTS)
+        self._outliers = deque[ClockSample](maxlen=LATE_OUTLIERS)
+        self._first_outlier_ns = 0
+        self._line = ClockLine(0, 0, 0.0)
+        self._reliable_slope = 0.0
+        self._last_stamped: ClockSample | None = None
+
+    @property
+    def offset_ns(self) -> int:
+        """The host's time minus the sensor's, at the newest packet."""
+        return self._line.delay
+
+    @property
+    def drift_ppm(self) -> float:
+        """The share by which the sensor's clock is fast, in millionths."""
+        return (1 / (1 + self._line.slope) - 1) * 1e6
+
+    def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> None:
+        """Update the conversion with packets.
+
+        Args:
+            device_ns, host_ns: when the packets were sent by the sensor's clock, and when they
+                arrived; int64 ns, shape (n,) or a number each.
+        """
+        device = np.atleast_1d(np.asarray(device_ns, np.int64))
+        delays = np.asarray(host_ns, np.int64) - device
+        edges = np.flatnonzero(np.diff(device // PART_NS)) + 1
+        for times, late in zip(np.split(device, edges), np.split(delays, edges), strict=True):
+            if len(late):
+                self._add_sample(ClockSample(times.item(late.argmin()), late.item(late.argmin())))
+
+    def stamp(self, device_ns: int, host_ns: int) -> int:
+        """Return the host's time of a scan, later than all stamps before.
+
+        Also updates the conversion with the scan.
+
+        Args:
+            device_ns: the time of the first point of the next scan.
+            host_ns: when its packet arrived, ns.
+        """
+        self.observe(device_ns, host_ns)
+        offset = host_ns - device_ns
+        went_back = self._last_stamped is not None and device_ns <= self._last_stamped.device
+        if not went_back:
+            offset = min(self._slewed_delay(device_ns), offset)
+        self._last_stamped = ClockSample(device_ns, offset)
+        self._stamp = max(device_ns + offset, self._stamp + 1)
+        return self._stamp
+
+    def _slewed_delay(self, device: int) -> int:
+        """Return the delay at a time of the sensor, on the way to the line."""
+        if self._last_stamped is None:
+            return self._line.delay_at(device)
+        step = device - self._last_stamped.device
+        unchanged = self._last_stamped.delay + round(self._line.slope * step)
+        correction = (self._line.delay_at(device) - unchanged) * min(step / SLEW_TIME_NS, 1.0)
+        limit = MAX_SLEW * step
+        return unchanged + round(min(max(correction, -limit), limit))
+
+    def _add_sample(self, sample: ClockSample) -> None:
+        """Update the line, or count an outlier, with the sample of smallest delay."""
+        deviation = self._deviation(sample)
+        has_paused = (
+            bool(self._min_delays) and sum(sample) - sum(self._min_delays[-1]) > PARTS * PART_NS
+        )
+        if has_paused and abs(deviation) < UNSETTLED_LIMIT_NS:
+            self._forget_offset()  # the drift is not known well enough for such a pause
+        early_limit = UNSETTLED_LIMIT_NS
+        late_limit = UNSETTLED_LIMIT_NS
+        if len(self._min_delays) >= SETTLED_PARTS:
+            early_limit = EARLY_LIMIT_NS
+            late_limit = LATE_LIMIT_NS
+        if not self._min_delays or -early_limit < deviation < late_limit:
+            self._outliers.clear()
+            self._update_line(sample)
+            return
+        if not self._outliers:
+            self._first_outlier_ns = sum(sample)
+        self._outliers.append(sample)
+        if self._was_set(sum(sample) - self._first_outlier_ns):
+            self._restart_at_outliers()
+
+    def _forget_offset(self) -> None:
+        """Forget all samples, but not the drift."""
+        self._min_delays.clear()
+        self._outliers.clear()
+        self._last_stamped = None
+
+    def _deviation(self, sample: ClockSample) -> int:
+        """Return the height of a sample above the line, ns."""
+        return sample.delay - self._line.delay_at(sample.device)
+
+    def _was_set(self, lasting: int) -> bool:
+        """Return whether the outliers show that the clock was set.
+
+        `lasting` is the time since the first outlier, ns.
+        """
+        newest = self._min_delays[-1].device
+        outliers = list(self._outliers)
+        are_early = [
+            self._deviation(sample) < 0 or sample.device < newest
+            for sample in outliers[-CERTAIN_OUTLIERS:]
+        ]
+        if len(are_early) == CERTAIN_OUTLIERS and all(are_early):
+            return True
+        delays = [sample.delay for sample in outliers]
+        spread = sum(delays) / len(delays) - min(delays)
+        return (
+            len(outliers) == LATE_OUTLIERS
+            and lasting >= LATE_OUTLIERS_NS
+            and min(map(self._deviation, outliers)) > 4 * spread
+        )
+
+    def _restart_at_outliers(self) -> None:
+        """Restart with the newest outliers, because the clock was set; the drift remains."""
+        outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
+        self.jumps += 1
+        host_ns = sum(outliers[-1])
+        delay_before = self._line.delay_at(host_ns - self._line.delay)
+        delay_after = min(sample.delay for sample in outliers)
+        self.jump = ClockJump(delay_before - delay_after, self._first_outlier_ns)
+        self._forget_offset()
+        for sample in outliers:
+            self._update_line(sample)
+
+    def _update_line(self, sample: ClockSample) -> None:
+        """Keep a sample if it is the smallest of its part, and fit the line again."""
+        slope = self._line.slope
+        if self._min_delays and sample.device // PART_NS <= self._min_delays[-1].device // PART_NS:
+            last = self._min_delays[-1]
+            if sample.device < last.device or sample.delay - last.delay > slope * (
+                sample.device - last.device
+            ):
+                return
+            self._min_delays.pop()
+        self._min_delays.append(sample)
+        self._line = fit_line(self._min_delays, self._reliable_slope)
+        if len(self._min_delays) >= SETTLED_PARTS:
+            self.jump = None
+        if len(self._min_delays) == PARTS:
+            self._reliable_slope = self._line.slope
+
+
+def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
+    """Return the highest line below the samples, with a slope that they determine.
+
+    Args:
+        samples: one or more samples in order.
+        slope_before: the previous slope; the result is the nearest slope that the samples allow.
+    """
+    hull = lower_hull(samples)
+    last = samples[-1]
+    slope = slope_before
+    middle = (len(samples) - 1) / 2
+    if len(samples) >= MIN_PARTS_FOR_SLOPE:
+        slope = min(
+            max(slope, slope_at(middle - MIDDLE_PARTS, samples, hull)),
+            slope_at(middle + MIDDLE_PARTS, samples, hull),
+        )
+        slope = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
+    height = min(
+        samples[index].delay - last.delay - slope * (samples[index].device - last.device)
+        for index in hull
+    )
+    return ClockLine(last.device, last.delay + round(height), slope)
+
+
+def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
+    """Return the indexes of the samples on the lower convex hull, from left to right."""
+    hull: list[int] = []
+    for index, (device, delay) in enumerate(samples):
+        while len(hull) > 1:
+            left, low = samples[hull[-2]]
+            right, high = samples[hull[-1]]
+            if (high - low) * (device - left) < (delay - low) * (right - left):
+                break
+            hull.pop()
+        hull.append(index)
+    return hull
+
+
+def slope_at(index: float, samples: Sequence[ClockSample], hull: Sequence[int]) -> float:
+    """Return the slope of the hull's edge at an index.
+
+    The index may be between two samples.
+    """
+    end = min(max(bisect_left(hull, index), 1), len(hull) - 1)
+    left, low = samples[hull[end - 1]]
+    right, high = samples[hull[end]]
+    return (high - low) / (right - left)
