@@ -26,7 +26,17 @@ from lidarspec.drafting.samples import (
     weigh_evidence,
 )
 from lidarspec.frames.row_checksums import compute_checksums
-from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
+from lidarspec.spec.checksums import (
+    ByteOrder,
+    Bytes,
+    Checksum,
+    Fletcher,
+    Fold15,
+    Sum,
+    Values,
+    WordXor,
+    Xor,
+)
 
 #: Maximum number of matches to return.
 MAX_MATCHES = 8
@@ -225,7 +235,7 @@ def _iter_matches(
     for order in orders:
         stored = few.fields(place, order)
         algorithms: list[Checksum]
-        if isinstance(algorithm, Fold15):
+        if isinstance(algorithm, Fletcher | Fold15):
             if are_enough(int((stored == computed).sum()), len(few)):
                 algorithms = [algorithm]
             else:
@@ -334,6 +344,7 @@ _WIDE: tuple[Checksum, ...] = (
         for groups in WORD_XOR_GROUPS
         for head in (WORD_XOR_HEADS if groups != (2,) else (0,))
     ),
+    Fletcher(),
     Fold15(),
 )
 

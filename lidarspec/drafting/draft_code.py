@@ -488,7 +488,7 @@ def _make_imports(text: dict[str, str]) -> dict[str, str]:
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}
     )
     names = re.findall(
-        r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|PacketCounter|Scaled|Serial|Sum|Udp|WordXor"
+        r"\b(Check(?:sum|summed)|Crc|Every|Fletcher|Fold15|OnWrap|PacketCounter|Scaled|Serial|Sum|Udp|WordXor"
         r"|Xor)\b",
         code,
     )

@@ -35,7 +35,17 @@ from lidarspec.exports.c_fields import (
     word,
 )
 from lidarspec.frames.wire_table import SizeFormula
-from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec import (
+    Checksum,
+    Crc,
+    Fletcher,
+    Fold15,
+    Sensor,
+    Sum,
+    WordXor,
+    Xor,
+    ZeroPadded,
+)
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflect
 from lidarspec.spec.tree import (
     Blob,
@@ -129,6 +139,12 @@ def _make_body(algorithm: Checksum) -> _ChecksumBody:
             )
         case WordXor():
             return _make_word_xor_body(algorithm)
+        case Fletcher():
+            return _ChecksumBody(
+                "uint64_t first = 0, second = 0;",
+                "first += byte;\nsecond += first;",
+                "(first & 0xff) | (second & 0xff) << 8",
+            )
         case Fold15():
             begin = (
                 "uint64_t total = 0;\nint64_t size = 0, first;\n"

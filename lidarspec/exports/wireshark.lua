@@ -108,6 +108,14 @@ function checksum.word_xor(words, data)
   end
   return total[0] + 256 * total[1]
 end
+function checksum.fletcher(_, data)
+  local first, second = 0, 0
+  for spot = 1, #data do
+    first = (first + data:byte(spot)) % 256
+    second = (second + first) % 256
+  end
+  return first + 256 * second
+end
 function checksum.fold15(_, data)
   local total, length = 0, #data
   if length % 2 == 1 then data = data .. "\0" end

@@ -30,6 +30,7 @@ from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import (
     Checksum,
     Crc,
+    Fletcher,
     Fold15,
     Sensor,
     Sum,
@@ -476,6 +477,8 @@ def _algorithm(algorithm: Checksum) -> Table:
         case WordXor():
             halves = [half for size in algorithm.groups for half in range(size)]
             return {"algorithm": "word_xor", "head": algorithm.head, "halves": halves}
+        case Fletcher():
+            return {"algorithm": "fletcher"}
         case Fold15():
             return {"algorithm": "fold15"}
         case ZeroPadded():

@@ -46,6 +46,7 @@ from lidarspec.spec.checksums import (
     REGISTER_BYTES,
     Checksum,
     Crc,
+    Fletcher,
     Fold15,
     Sum,
     Values,
@@ -185,6 +186,16 @@ def _group_word_masks(
     return [(which, both) for both, which in places.items()]
 
 
+def _compute_fletcher(algorithm: Fletcher, rows: NDArray[np.uint8], spans: Spans) -> Values:
+    rows = gather_spans(rows, spans)
+    # A byte is in as many of the added sums as there are bytes from it to the end. As all sums are
+    # modulo 256, bytes may overflow.
+    weights = np.arange(rows.shape[1], 0, -1).astype(np.uint8)
+    first = rows.sum(axis=1, dtype=np.uint8)
+    second = (rows * weights).sum(axis=1, dtype=np.uint8)
+    return first.astype(np.uint64) | second.astype(np.uint64) << _BYTE_BITS
+
+
 def _compute_fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
     rows = gather_spans(rows, spans)
     tail = rows[:, rows.shape[1] % 2 - 60 :]
@@ -207,6 +218,7 @@ _METHODS: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]
     Xor: _compute_xor,
     Sum: _compute_sum,
     WordXor: _compute_word_xor,
+    Fletcher: _compute_fletcher,
     Fold15: _compute_fold15,
     ZeroPadded: _compute_zero_padded,
 }

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
         Crc as Crc,
+        Fletcher as Fletcher,
         Fold15 as Fold15,
         Sum as Sum,
         WordXor as WordXor,
@@ -126,7 +127,16 @@ _NAMES = {
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
-    "spec.checksums": ("Checksum", "Crc", "Xor", "Sum", "WordXor", "Fold15", "ZeroPadded"),
+    "spec.checksums": (
+        "Checksum",
+        "Crc",
+        "Xor",
+        "Sum",
+        "WordXor",
+        "Fletcher",
+        "Fold15",
+        "ZeroPadded",
+    ),
     "spec.links": ("Assembled", "Serial", "Udp", "Tcp", "Http", "Link"),
     "spec.timing": (
         "Clock",

@@ -20,6 +20,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import accumulate
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -237,6 +238,32 @@ class Fold15(Checksum):
 
     def describe(self) -> str:
         return "15-bit folded sum"
+
+
+@dataclass(frozen=True)
+class Fletcher(Checksum):
+    """Two 8-bit sums: that of all bytes, and that of the first sum after each byte.
+
+    Both are modulo 256. The low byte of the checksum is the first sum, so that a little-endian
+    field has the first sum first.
+
+    Source: RFC 1145; UBX checksum of u-blox.
+    """
+
+    order: ByteOrder = "little"
+    width = 16
+
+    def __post_init__(self) -> None:
+        _require(self, order=("little", "big"))
+
+    def __call__(self, data: Bytes) -> int:
+        values = bytes(data)
+        first = sum(values) & 0xFF
+        second = sum(accumulate(values)) & 0xFF
+        return first | second << 8
+
+    def describe(self) -> str:
+        return "Fletcher-16"
 
 
 @dataclass(frozen=True)

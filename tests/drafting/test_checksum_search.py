@@ -22,7 +22,7 @@ from lidarspec.drafting.crc_search import (
 )
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace, SampleFrames, sort_matches
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
+from lidarspec.spec import Checksum, Crc, Fletcher, Fold15, Sum, WordXor, Xor
 from lidarspec.spec.checksums import CRCS, name_of
 
 HEAD = b"\xaa\x55"
@@ -161,6 +161,7 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
         pytest.param(Sum(8), marks=pytest.mark.slow),
         Sum(16),
         Sum(32),
+        Fletcher(),
         Fold15(),
         pytest.param(WordXor(), marks=pytest.mark.slow),
         WordSum("little"),

@@ -20,7 +20,17 @@ from numpy.typing import NDArray
 
 from lidarspec import SpecError
 from lidarspec.frames.row_checksums import compute_checksums, compute_over_spans
-from lidarspec.spec import Checksum, Checksummed, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
+from lidarspec.spec import (
+    Checksum,
+    Checksummed,
+    Crc,
+    Fletcher,
+    Fold15,
+    Sum,
+    WordXor,
+    Xor,
+    ZeroPadded,
+)
 from tests.engine import against_construct
 from tests.evidence import vector_bytes
 
@@ -62,6 +72,7 @@ ALGORITHMS: list[Checksum] = [
         WordXor(head, groups)
         for head, groups in [(0, (2,)), (0, (1,)), (8, (1, 2)), (3, (2, 1)), (5, (1, 2, 2, 1))]
     ),
+    Fletcher(),
     Fold15(),
     *(
         ZeroPadded(inner, to)
@@ -82,6 +93,7 @@ QUICK_ALGORITHMS = [
     Sum(20),
     M1C1,
     WordXor(3, (2, 1)),
+    Fletcher(),
     Fold15(),
     ZeroPadded(CRC32, 4),
 ]
@@ -299,6 +311,12 @@ def test_sums_and_xors_by_hand() -> None:
     )  # the last word is cut short
     assert WordXor(head=3, groups=(2, 1))(data) == 0x3412 ^ 0x00FF ^ 0x0780  # so is the head's
     assert WordXor()(data) == WordXor(head=8, groups=(1,))(data) == 0x3412 ^ 0x80FF ^ 0x0007
+
+
+def test_fletcher_by_its_formula() -> None:
+    # 1 + 2 + 3, and 1 + (1 + 2) + (1 + 2 + 3); then with sums above 255.
+    assert Fletcher()(bytes([1, 2, 3])) == 6 | 10 << 8
+    assert Fletcher()(b"\xff" * 300) == (300 * 255) % 256 | (300 * 301 // 2 * 255) % 256 << 8
 
 
 @pytest.mark.parametrize("length", [5, 58, 60, 61, 63, 64, 99, 3000])

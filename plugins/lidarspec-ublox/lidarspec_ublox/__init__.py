@@ -32,14 +32,13 @@ from construct import (
     Struct,
     this,
 )
-from numpy.typing import NDArray
 
 from lidarspec.spec import (
-    Checksum,
     Checksummed,
     Clock,
     Command,
     Fields,
+    Fletcher,
     Frame,
     HexCheck,
     Scaled,
@@ -56,30 +55,6 @@ CFG = 0x06
 MAX_PAYLOAD_BYTES = 1200  # of other UBX messages: more than RXM-RAWX with 35 signals
 MAX_SENTENCE_BYTES = 120  # NMEA 0183 allows 82; sentences of high precision are longer
 WEEK_S = 604_800.0
-
-
-class Fletcher(Checksum):
-    """The 8-bit Fletcher algorithm of RFC 1145: CK_A, then CK_B (3.4 UBX Checksum)."""
-
-    width = 16
-
-    def __call__(self, data: bytes | bytearray | memoryview) -> int:
-        return int(self.batch(np.frombuffer(data, np.uint8)[None])[0])
-
-    def describe(self) -> str:
-        return "Fletcher-16"
-
-    def batch(self, rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
-        weights = np.arange(rows.shape[1], 0, -1, dtype=np.uint64)
-        first: NDArray[np.uint64] = rows.sum(axis=1, dtype=np.uint64) & np.uint64(0xFF)
-        second: NDArray[np.uint64] = (rows * weights).sum(axis=1, dtype=np.uint64) & np.uint64(0xFF)
-        return first | second << np.uint64(8)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Fletcher)
-
-    def __hash__(self) -> int:
-        return hash(Fletcher)
 
 
 def make_ubx(message: bytes, size: int, *fields: Construct) -> Construct:
