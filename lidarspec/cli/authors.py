@@ -22,7 +22,13 @@ from lidarspec.drafting.distribution import (
 )
 from lidarspec.drafting.draft import make_draft
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
+from lidarspec.exports import (
+    EXPORTS,
+    ExportError,
+    describe_left_out,
+    export as exported,
+    select_frame,
+)
 from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, find_target, reports
@@ -247,3 +253,5 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     except ExportError as refused:
         raise suggest(refused, f"lidarspec show {sensor.id}") from None
     emit(text.removesuffix("\n"), output)
+    if left_out := describe_left_out(chosen, kind):
+        note(left_out)

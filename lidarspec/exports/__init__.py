@@ -14,6 +14,7 @@ cannot express the spec. Modules in reading order:
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,10 @@ EXPORTS: dict[str, str] = {
     "json": "lidarspec.exports.json:to_text",
     "pyi": "lidarspec.exports.stubs:pyi",
 }
+
+
+#: Exports that describe the bytes as they are sent.
+BYTE_EXPORTS = ("wireshark", "c", "ksy")
 
 
 class ExportError(UsageError):
@@ -115,27 +120,50 @@ class ExportedFrame:
 
 
 def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
-    """Return all frame types of a sensor, in their order.
+    """Return the frame types of a sensor, in their order.
 
     Args:
-        on_wire: whether the export describes the bytes as they are sent, not only the fields.
+        on_wire: whether the export describes the bytes as they are sent, not only the fields. Then
+            frame types with a wire form are left out, because other languages cannot decode them.
 
     Raises:
-        ExportError: if the sensor has no frames yet, or if a frame contains Python code or has a
-            wire form.
+        ExportError: if the sensor has no frames yet, if a frame contains Python code, or if all
+            frame types have a wire form.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id} has no frames until it is configured")
-    formed = [
-        f"{name} in {type(frame.wire).__name__}"
-        for name, frame in sensor.frames.items()
-        if frame.wire is not None and on_wire
-    ]
-    if formed:
+    with_form = _find_wire_forms(sensor) if on_wire else {}
+    if len(with_form) == len(sensor.frames):
         raise ExportError(
-            f"{sensor.id}: exports do not support frames with a wire form: {', '.join(formed)}"
+            f"{sensor.id}: this export does not support frame types with a wire form:"
+            f" {_join_forms(with_form)}"
         )
-    return tuple(_make_exported_frame(sensor, name, frame) for name, frame in sensor.frames.items())
+    return tuple(
+        _make_exported_frame(sensor, name, frame)
+        for name, frame in sensor.frames.items()
+        if name not in with_form
+    )
+
+
+def describe_left_out(sensor: Sensor, kind: str) -> str:
+    """Return a sentence that names the frame types that an export leaves out; "" if it has all."""
+    with_form = _find_wire_forms(sensor)
+    if kind not in BYTE_EXPORTS or not with_form:
+        return ""
+    return f"left out, because the frames have a wire form: {_join_forms(with_form)}"
+
+
+def _find_wire_forms(sensor: Sensor) -> dict[str, str]:
+    """Return the class name of the wire form of each frame type that has one."""
+    return {
+        name: type(frame.wire).__name__
+        for name, frame in sensor.frames.items()
+        if frame.wire is not None
+    }
+
+
+def _join_forms(forms: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} ({form})" for name, form in forms.items())
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:

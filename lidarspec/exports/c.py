@@ -22,7 +22,14 @@ from textwrap import indent
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import ExportedFrame, ExportError, c_fields, make_prefix, messages
+from lidarspec.exports import (
+    ExportedFrame,
+    ExportError,
+    c_fields,
+    describe_left_out,
+    make_prefix,
+    messages,
+)
 from lidarspec.exports.c_fields import (
     CEntry,
     CLayout,
@@ -508,10 +515,12 @@ def header(sensor: Sensor) -> str:
     head = _HEAD.format(
         title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H"
     )
+    left_out = describe_left_out(sensor, "c")
     helpers = resources.files("lidarspec.exports").joinpath("c_bytes.h").read_text(encoding="utf-8")
     return "\n".join(
         [
             head,
+            *([comment(left_out)] if left_out else []),
             helpers,
             *(checksum(algorithm, name) for algorithm, name in names.items()),
             *frames,

@@ -18,6 +18,7 @@ from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, Split
+from lidarspec.spec.wire_forms import WireForm
 
 #: Version of the format; it increases if a key changes its meaning or is removed.
 VERSION = 1
@@ -61,7 +62,7 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
             | {"last": None if callable(sequence.last) else sequence.last}
         ),
         "fillers": sensor.fillers.hex(),
-        "frames": {message.name: _frame(message) for message in messages(sensor)},
+        "frames": {message.name: _frame(message) for message in messages(sensor, on_wire=False)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
         **facts(sensor, "on_open", "on_close"),
     }
@@ -139,7 +140,20 @@ def _frame(message: ExportedFrame) -> dict[str, Any]:
         "size": frame_size(frame),
         **facts(frame, "max_length", "after", "confirm"),
         "plausible": frame.plausible is not None,
+        "wire": None if frame.wire is None else _wire_form(frame.wire),
         "layout": node_data(message.root),
+    }
+
+
+def _wire_form(form: WireForm) -> dict[str, Any]:
+    """Return the class of a wire form and its arguments; those that are objects as Python text."""
+    arguments = {
+        item.name: getattr(form, item.name)
+        for item in (dataclasses.fields(form) if dataclasses.is_dataclass(form) else ())
+    }
+    return {"form": type(form).__name__} | {
+        name: repr(value) if dataclasses.is_dataclass(value) else _to_json(value)
+        for name, value in arguments.items()
     }
 
 

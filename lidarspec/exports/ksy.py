@@ -18,7 +18,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lidarspec.exports import ExportedFrame, ExportError, make_prefix, messages
+from lidarspec.exports import (
+    ExportedFrame,
+    ExportError,
+    describe_left_out,
+    make_prefix,
+    messages,
+)
 from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
@@ -308,11 +314,15 @@ def ksy(sensor: Sensor) -> str:
             f"{sensor.id}: two frame types have the same name in lower case, as Kaitai requires it"
         )
     name = identifier(make_prefix(sensor))
+    remarks = [
+        sensor.source,
+        f"Made by lidarspec export ksy {sensor.id}",
+        "Checksums are not checked",
+        describe_left_out(sensor, "ksy"),
+    ]
     document = {
         "meta": {"id": name, "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
-        "doc": (
-            f"{sensor.source}. Made by lidarspec export ksy {sensor.id}. Checksums are not checked."
-        ),
+        "doc": ". ".join(filter(None, remarks)) + ".",
         "seq": [{"id": "frames", "type": identifier(main.name), "repeat": "eos"}],
         "types": types,
     }

@@ -21,6 +21,7 @@ from lidarspec._version import __version__
 from lidarspec.exports import (
     ExportedFrame,
     ExportError,
+    describe_left_out,
     find_held_formulas,
     find_references,
     messages,
@@ -559,7 +560,7 @@ USER_LINKS = tuple(range(45, 61))
 _HEAD = """\
 -- {title}: a dissector for Wireshark and tshark, made by lidarspec {version}.
 -- Source: {source}
---
+{left_out}--
 --     wireshark -X lua_script:THIS_FILE CAPTURE
 --
 -- or put it into the personal Lua plugins folder (Help, About Wireshark, Folders).
@@ -620,10 +621,12 @@ def dissector(sensor: Sensor) -> str:
         "places": _list_patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
+    left_out = describe_left_out(sensor, "wireshark")
     head = _HEAD.format(
         title=title,
         version=__version__,
         source=sensor.source,
+        left_out=f"-- {left_out}\n" if left_out else "",
         name=quote_lua(name),
         title_quoted=quote_lua(title),
     )

@@ -25,7 +25,7 @@ from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
 from tests.exports.trees import distinct_frames, installed_sensors, is_recoded, number
-from tests.shapes import SHAPES
+from tests.shapes import SHAPES, mixed, receiver
 
 SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 #: the shapes that other languages can read.
@@ -43,6 +43,23 @@ def list_exportable() -> list[Sensor]:
 @pytest.mark.parametrize("name", SPOKEN)
 def test_json_is_enough_to_decode_frames(name: str) -> None:
     assert_json_is_enough(SHAPES[name], SHAPES[name].frames)
+
+
+@pytest.mark.parametrize("kind", ["c", "ksy", "wireshark"])
+def test_text_frames_are_left_out_and_named(kind: str) -> None:
+    text = export(mixed.SENSOR, kind)
+    assert "left out, because the frames have a wire form: line (Tokens)" in text
+    fields = text.replace("line (Tokens)", "")
+    assert "latitude" in fields
+    assert "satellites" not in fields
+    assert "left out" not in export(receiver.SENSOR, kind)
+
+
+def test_json_has_text_frames_with_their_wire_form() -> None:
+    frames = json.loads(export(mixed.SENSOR, "json"))["frames"]
+    assert frames["fix"]["wire"] is None
+    wire = frames["line"]["wire"]
+    assert (wire["form"], wire["start"], wire["sep"]) == ("Tokens", b"$".hex(), b",".hex())
 
 
 @pytest.mark.slow

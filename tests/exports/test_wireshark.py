@@ -18,7 +18,7 @@ from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
 from tests.exports.sharks import columns, dissector, needs_tshark, tshark, write_capture, written
-from tests.exports.trees import SHAPED, find_recoded, installed_sensors, is_recoded, values
+from tests.exports.trees import SHAPED, find_recoded, is_recoded, values
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.representatives import REPRESENTATIVES, load_sensor
 
@@ -66,13 +66,6 @@ def test_python_conditions_are_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(ExportError, match=reason):
             export(SHAPED[name], "wireshark")
-
-
-@pytest.mark.slow
-def test_sensors_that_the_dissector_cannot_express_are_refused() -> None:
-    for name, reason in find_recoded(installed_sensors().values()).items():
-        with pytest.raises(ExportError, match=reason):
-            export(installed_sensors()[name], "wireshark")
 
 
 @needs_tshark

@@ -16,7 +16,7 @@ from tests.shapes import SHAPES
 #: the invented sensors that have frames, by id.
 SHAPED = {sensor.id: sensor for sensor in (*SHAPES.values(), oddities.SENSOR) if sensor.frames}
 #: the reason of every refusal of a frame that stands on the wire in a form of its own.
-RECODED = "exports do not support frames with a wire form"
+RECODED = "this export does not support frame types with a wire form"
 
 
 @functools.cache
@@ -42,13 +42,17 @@ def distinct_frames(sensors: Iterable[Sensor]) -> list[tuple[Sensor, str]]:
 
 
 def is_recoded(sensor: Sensor) -> bool:
-    """Return whether a frame has a wire form that other languages cannot read."""
+    """Return whether a frame has a wire form, which other languages cannot read."""
     return any(frame.wire is not None for frame in sensor.frames.values())
 
 
 def find_recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
-    """Return the reason of the refusal, by id, of those sensors that are recoded."""
-    return {sensor.id: RECODED for sensor in sensors if is_recoded(sensor)}
+    """Return the reason of the refusal, by id, of sensors all of whose frames are recoded."""
+    return {
+        sensor.id: RECODED
+        for sensor in sensors
+        if all(frame.wire is not None for frame in sensor.frames.values())
+    }
 
 
 def number(value: Any) -> Any:
