@@ -186,8 +186,6 @@ def test_a_package_docstring_lists_its_modules(package: str) -> None:
         ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8")))
         or ""
     )
-    assert "In: " in text
-    assert "Out: " in text
     modules = {
         path.stem
         for path in (HOUSE / package).iterdir()
