@@ -1,9 +1,9 @@
-"""Columns: the fields of a batch of packets, aligned by the arrays that contain them.
+"""Evaluate or trace the `points`, `plausible` and clock functions of a sensor.
 
-In: tables of frames (`frames.frame_table`). Out: the results of `points`, `plausible` and clock
-functions for their columns, or the graph of their steps. Modules in reading order:
+The functions are called with the fields of a batch of packets as columns, which are read from
+tables of frames (`frames.frame_table`). Modules in reading order:
 
-* `columns`: `Batch`, `Fields` and `Column`: the reference evaluator, ordinary NumPy on arrays with
-  named axes.
-* `graph`: record the steps of a function by calling it once; iterate over them, evaluate them.
+* `columns`: `Batch`, `Fields` and `Column`, which evaluate a function with ordinary NumPy on arrays
+  with named axes.
+* `graph`: records the steps of a function by calling it once, and evaluates them.
 """

@@ -1,19 +1,19 @@
 """Columns: the operands of `points`, `plausible` and clock functions.
 
-A `Batch` is a table of packets with their context: where packets were lost, the last frame of each
-other type before each packet, and values left over from the previous batch. A function receives
-the fields of a batch as ``f``, a `Fields`; each attribute is a `Column`.
+A `Batch` is a table of packets with the breaks in the stream, the last frame of each other type
+before each packet, and values that were kept from the previous batch. A function receives the
+fields of a batch as ``f``, a `Fields`. Each attribute of ``f`` is a `Column`.
 
-A `Column` is an array with one axis for the packets and one for each array level of the struct; an
-axis has length 1 if the field is further out. Each axis is named after its array, so arithmetic
-aligns columns by name, and sibling arrays cannot be mixed by accident. A column also knows its
-batch, and therefore where packets were lost and how long variable arrays are, and how many packets
-are final (``ready``) if values depend on later packets. `FlatColumn` is a column as one run of
-values in stream order, without padding; `previous`, `following` and `last` work on it.
+A `Column` is an array with one axis for the packets and one for each array level of the struct. An
+axis has length 1 if the field is outside of this array. Each axis has the name of its array, so
+arithmetic aligns columns by name, and fields of different arrays cannot be mixed by accident. If
+values depend on later packets, ``ready`` is the number of packets with final values. `FlatColumn`
+has the values of a column in stream order, without padding. `previous`, `following` and `last` use
+it.
 
-`align` also aligns other arrays: an array made by `along` by the name of its array; a plain array
-by its length, if exactly one array of the frame has this length; and a plain array with as many
-axes as there are nested arrays by position, as in NumPy.
+`align` also aligns other arrays. An array made by `along` is aligned by the name of its array. A
+plain array is aligned by its length, if exactly one array of the frame has this length. A plain
+array with as many axes as there are nested arrays is aligned by position, as in NumPy.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis, row_numbers
 
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
-#: messages for operations that would need a single truth value of a column.
+#: The messages for operations that columns do not support.
 NO_TRUTH = (
     "a column has one value per packet: use & | ~ instead of `and`, `or`, `not` and a < f.x <"
     " b, and np.where instead of `if`"
@@ -47,13 +47,13 @@ NO_BITS = (
     " (f.a < 1) & (f.b < 2); declare bits in a BitStruct"
 )
 NO_TEXT = (
-    "columns are numbers and cannot be combined with {!r}; a field of bytes has one number"
+    "a column has numbers and cannot be combined with {!r}; a field of bytes has one number"
     " per byte, such as 65 for b'A'"
 )
 
 Carry = dict[int, NDArray[np.float64]]
 
-#: the key of `Batch.state` for the frames that contain the parts of this batch.
+#: The key of `Batch.state` for the frames that contain the packets, if the packets are parts.
 AROUND = "^"
 
 
@@ -62,12 +62,13 @@ class Batch:
     """The packets that a set of columns belongs to.
 
     Attributes:
-        table: their raw columns.
+        table: the raw columns of the packets.
         breaks: (n,) True if packets or bytes were lost before the packet.
-        state: per frame type, its table and for each packet the index of the last frame before it
-            (-1: no frame yet).
-        defaults: declared defaults of state columns, per frame type and path.
-        carry: values left by the previous batch for `previous` and `last`, by order of call.
+        state: for each other frame type, a table of its frames, and an array (n,) with the row of
+            the last frame before each packet (-1 if no frame has arrived yet).
+        defaults: the declared defaults of state columns, by frame type and path.
+        carry: the values that the previous batch kept for each call of `previous` or `last`, by the
+            number of the call.
     """
 
     table: Table
@@ -82,11 +83,11 @@ class Batch:
         return len(self.table)
 
     def carry_over(self, ready: int) -> Carry:
-        """Return the state for the next batch, if it starts with packet `ready` of this one."""
+        """Return the values to keep for the next batch, which starts with packet `ready`."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: LayoutRows) -> Batch:
-        """Return the packets of a group as a separate batch that no other batch follows."""
+        """Return the packets of a group as a batch of its own."""
         table = CompiledTable(
             self.table.schema, [LayoutRows(group.layout, np.arange(len(group.where)), group.rows)]
         )
@@ -95,20 +96,21 @@ class Batch:
 
 
 class Column(NDArrayOperatorsMixin):
-    """Numbers of a batch of packets, to which NumPy's functions apply.
+    """Numbers of a batch of packets; NumPy's functions can be applied to it.
 
     Attributes:
-        array: shape (n or 1, ...), one axis per array level of the struct, length 1 if the value is
-            further out.
-        axes: names of the axes after the first; None for an axis of length 1. A "?" marks an axis
-            that no field has confirmed: after a name given by `along`, before a name that was
-            guessed for a plain array.
-        ready: number of packets, from the start, whose values do not depend on later packets.
-        source: path of the field, as long as the column is an unchanged field.
+        array: the numbers, (n or 1, ...), with one axis for each array level of the struct; its
+            length is 1 if the field is outside of this array.
+        axes: the names of the axes after the first; None for an axis of length 1. A "?" marks an
+            axis that no field has confirmed. It follows a name that was given by `along`, and
+            precedes a name that was guessed for a plain array.
+        ready: the number of packets at the start of the batch with values that do not depend on
+            later packets.
+        source: the path of the field, if the column is an unchanged field, else "".
         frame: the other frame type that the field belongs to; "" for the packets themselves.
     """
 
-    #: a column cannot be iterated
+    #: A column cannot be iterated.
     __iter__ = None
 
     def __init__(
@@ -135,7 +137,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values that are known while a function runs: all values."""
+        """The values that are known while the function runs, which are all values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -150,13 +152,13 @@ class Column(NDArrayOperatorsMixin):
         """Return one element of an array field for each packet; nan if a packet has fewer."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
-                "only fields have elements, one per index: f.columns[0].timestamp, f.distances[-1]"
+                "only a field has elements, with one index for each array: f.columns[0].timestamp"
             )
         return _column(self.batch, self.frame, f"{self.source}[{index}]")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
-            raise SpecError("columns cannot be changed in place; write a new expression instead")
+            raise SpecError("a column cannot be changed in place: write a new expression")
         if method != "__call__":
             return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
         return self.apply_function(
@@ -172,7 +174,7 @@ class Column(NDArrayOperatorsMixin):
         return function(*plain, **kwargs)
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Column:
-        """Return `function` of the values, after aligning them by axes.
+        """Return `function` of the values, which are first aligned by their axes.
 
         Plain arrays align by their last axes, as in NumPy.
         """
@@ -195,7 +197,7 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """Return the same values on other axes, named after arrays of the frame.
 
-        The column's own axes become the last of the named axes. Elements beyond the length of the
+        The column's own axes become the last of the named axes. Elements beyond the end of the
         column are nan, for example in frames that lack the field.
 
         Raises:
@@ -204,7 +206,7 @@ class Column(NDArrayOperatorsMixin):
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
-            raise SpecError(f"a column with {len(own)} axes cannot be moved to {axes}")
+            raise SpecError(f"a column in {len(own)} nested arrays cannot be moved to {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
         array = self.array
@@ -234,13 +236,13 @@ class Column(NDArrayOperatorsMixin):
         ):  # of one element in all packets
             names = list(schema.fields[self.source].axes)
         if not names:
-            raise SpecError("index requires values inside an array")
+            raise SpecError("index requires a field inside an array")
         return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return 0, 1, 2 ... below the largest value, (m,).
+        """Return 0, 1, 2 ... up to the largest value minus 1, (m,).
 
-        These are the indices of the array whose length this column counts.
+        If this column is the length of an array, these are the indices of the array.
         """
         schema = self.batch.table.schema
         most = int(np.nanmax(self.array, initial=0))
@@ -260,12 +262,12 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return rows of a table, selected by these indices, on one more axis.
+        """Return the rows of a table that the values select, with one more axis.
 
-        The new axis is the one array of the frame with k elements.
+        The new axis is that array of the frame which has k elements.
 
         Args:
-            table: (m + 1, k); the last row is nan, for missing indices.
+            table: (m + 1, k); the last row is nan, for indices out of range.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -328,9 +330,9 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def latest(self, where: Any = None) -> Column:
-        """Return the last value at or before each element for which `where` is true.
+        """Return for each element the last value, up to this element, for which `where` is true.
 
-        Elements before the first such value are nan.
+        The result is nan before the first such value.
 
         Args:
             where: a condition that aligns with the column; by default, whether the value is finite.
@@ -354,12 +356,12 @@ class Column(NDArrayOperatorsMixin):
 
 
 class FlatColumn:
-    """A column as one run of values in stream order, without padding.
+    """The values of a column in stream order, without padding.
 
     Attributes:
-        values: (k,) as float64.
-        starts: (n + 1,) index of the first value of each packet.
-        edges: ascending indices of the values that follow a loss.
+        values: (k,) float64.
+        starts: (n + 1,) the index of the first value of each packet, and k.
+        edges: the indices of the values that follow a loss, ascending.
     """
 
     def __init__(self, column: Column) -> None:
@@ -380,7 +382,7 @@ class FlatColumn:
         self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
 
     def unflatten(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values in stream order in the column's shape, with nan as padding."""
+        """Return k values in stream order as an array of the column's shape, padded with nan."""
         if self._mask is None:
             return values.reshape(self._shape)
         full = np.full(self._mask.shape, np.nan)
@@ -391,9 +393,9 @@ class FlatColumn:
 def padding_mask(
     axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
 ) -> NDArray[np.bool_] | None:
-    """Return the mask of elements that are not padding, None if there is no padding.
+    """Return a mask of the elements that are not padding; None without padding.
 
-    The mask has shape (n, product of the other lengths).
+    The mask has the shape (n, product of the other lengths).
     """
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
@@ -416,10 +418,13 @@ def padding_mask(
 def align(
     values: tuple[Any, ...], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
-    """Return arrays that broadcast, the names of their common axes, the smallest `ready`.
+    """Align columns and other arrays, so that they broadcast.
+
+    Returns:
+        The arrays, the names of their common axes, and the smallest `ready`.
 
     Raises:
-        SpecError: if axes of different arrays meet.
+        SpecError: if the values belong to different arrays of the frame.
     """
     columns = [value for value in values if isinstance(value, Column)]
     if (
@@ -475,10 +480,10 @@ def align(
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return arrays cut so that they broadcast: each axis to its shortest length.
+    """Cut each axis of arrays to its shortest length, so that they broadcast.
 
-    Without packets an array of variable length is empty, but a plugin's own table for it is not.
-    Axes of length 1 stay.
+    This is needed without packets: an array of variable length is then empty, but a plugin's table
+    for this array is not. Axes of length 1 are not changed.
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
@@ -492,10 +497,12 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
-    """Return the name of an axis with two names, each of which may be None.
+    """Return the name of an axis that has a name in each of two values.
+
+    A name may be None.
 
     Raises:
-        SpecError: if they name different arrays and neither is a guess.
+        SpecError: if the names are of different arrays, and neither was guessed.
     """
     if first is None or name is None:
         return first or name
@@ -523,10 +530,16 @@ def _length(value: AlongAxis, axis: str) -> int:
 def _place(
     array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table
 ) -> NDArray[Any]:
-    """Return a plain array reshaped to axes of these lengths; name axes without a name.
+    """Reshape a plain array to the given axes, and name axes that have no name.
+
+    Args:
+        array: the plain array.
+        axes: the names of the axes, which are changed in place.
+        lengths: the lengths of the axes.
+        table: the table of the packets.
 
     Raises:
-        SpecError: if its length fits several axes, or no array of the frame.
+        SpecError: if the length of the array fits several arrays of the frame, or none.
     """
     depth = len(lengths)
     if array.size == 1:
@@ -554,12 +567,13 @@ def _find_axis(
     table: Table,
     without: Sequence[int] = (),
 ) -> int:
-    """Return the axis for the first axis of a plain array, found by its lengths.
+    """Return the position among the axes for the first axis of a plain array.
 
-    Axes of the other operands are tried first, then the arrays of the frame.
+    The position is found by the lengths of the plain array. The axes of the other operands are
+    tried first, then the arrays of the frame.
 
     Args:
-        without: axes that are excluded.
+        without: the positions that are excluded.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
@@ -596,24 +610,27 @@ def _find_axis(
         if found:
             names = [" x ".join(names) for names in found.values()]
             reason = (
-                f"matches {' as well as with '.join(names)}: choose one with"
-                f" along({found[max(found)][-1]!r}, ...)"
+                f"has the length of several arrays of the frame, {' and '.join(names)}: choose"
+                f" one with along({found[max(found)][-1]!r}, ...)"
             )
             break
     else:
         arrays = ", ".join(f"{axis} {length}" for (_, length), axis in whole.items())
-        reason = f"matches no array of the frame: {arrays or 'it has none'}"
+        reason = f"has the length of no array of the frame ({arrays or 'it has no arrays'})"
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
 def align_points(
     parts: Mapping[str, Any], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
-    """Return the parts of points aligned, their axes, `ready`, and common shape (n, ...).
+    """Align the parts of the result of `points`.
+
+    Returns:
+        The arrays, the names of their axes, the smallest `ready`, and their common shape (n, ...).
 
     Raises:
-        SpecError: if axes of different arrays meet, lengths do not fit, or a plain array is
-            along an axis that no field has.
+        SpecError: if parts belong to different arrays of the frame, if their lengths differ, or if
+            a plain array is along an axis that no field has.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
@@ -632,7 +649,7 @@ def align_points(
         else:
             where = "along a further axis"
         raise SpecError(
-            f"points vary {where}, but none of their fields does"
+            f"the points vary {where}, but none of their fields does"
             f" ({_describe_lengths(named, axes)}); use along(...) for numbers along an array",
             rule="LS214",
         )
@@ -640,9 +657,10 @@ def align_points(
 
 
 def _find_extent(table: Table, axis: str, length: int) -> int:
-    """Return the extent of values along an axis, at most the array's length in the frames.
+    """Return the length of values along an axis.
 
-    The limit applies only if some frame lacks an array around this one.
+    If some frame lacks an array that contains this one, the length is limited to the length of the
+    array in the frames.
     """
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
@@ -650,10 +668,10 @@ def _find_extent(table: Table, axis: str, length: int) -> int:
 
 
 def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
-    """Return an array extended with nan, or cut, to the length of an array of the frame.
+    """Extend an array with nan, or cut it, to the length of an array of the frame.
 
     Args:
-        place: the axis of `array`.
+        place: the index of the axis of `array`.
         axis: the name of the array.
     """
     length = array.shape[place]
@@ -672,11 +690,11 @@ def broadcast_shape(
     """Return the shape that arrays broadcast to.
 
     Args:
-        arrays: by name; arrays named "" are left out of the message.
-        axes: names of their axes after the first.
+        arrays: the arrays by name. An array named "" is not listed in the error message.
+        axes: the names of their axes after the first.
 
     Raises:
-        SpecError: if lengths do not fit.
+        SpecError: if the arrays have different lengths.
     """
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
@@ -687,7 +705,7 @@ def broadcast_shape(
 
 
 def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
-    """Return the lengths of arrays by axis: "range: samples 3, azimuth: samples 4"."""
+    """Return a list of the lengths of arrays, such as "range: samples 3, azimuth: samples 4"."""
     names = ("packets", *((name or "").strip("?") for name in axes))
     texts = []
     for what, array in arrays.items():
@@ -702,7 +720,7 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
 
 
 def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
-    """Return whether all operands are columns or numbers, so that no array needs aligning."""
+    """Return whether all operands are columns or numbers."""
     return all(isinstance(value, Column | int | float) for value in values)
 
 
@@ -712,9 +730,10 @@ def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray
 
 
 def remainder(values: Any, full: Any) -> NDArray[Any]:
-    """Return ``np.remainder``, bit by bit the same.
+    """Return exactly the same values as ``np.remainder``.
 
-    It takes a quarter of the time for values at most one turn outside, as nearly all angles are.
+    This is four times as fast if the values are less than one turn outside of [0, full), as nearly
+    all angles are.
     """
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
@@ -729,7 +748,12 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
 def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
-    """Return the last values before `end` that follow its latest loss, at most `size`."""
+    """Return at most `size` values directly before `end`, back to the last loss.
+
+    Args:
+        values: the values in stream order.
+        edges: the indices of the values that follow a loss.
+    """
     if end == 0 or size == 0:
         return np.empty(0)
     lost = edges[edges < end]
@@ -747,8 +771,8 @@ def field_column(
     """Return a field in its unit as a column with `depth` array axes.
 
     Args:
-        which: for each packet the row of `table`; None: the packets are the rows.
-        frame: the frame type of `table`, if it is not that of the packets.
+        which: for each packet the row of `table`; None if the packets are the rows.
+        frame: the frame type of `table`, if it is another type than that of the packets.
     """
     array = field_array(info, table, depth)
     if which is not None:
@@ -761,12 +785,13 @@ def field_column(
 
 
 def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False) -> NDArray[Any]:
-    """Return a field in its unit, (n, ...), each array at its axis.
+    """Return a field in its unit, (n, ...), with one axis for each array level.
 
-    The result has at least `depth` axes after the first; further axes have length 1.
+    The result has at least `depth` axes after the first; axes of arrays that do not contain the
+    field have length 1.
 
     Args:
-        raw: return the integers of the wire, in their own type.
+        raw: whether to return the integers of the frames, in their own type.
     """
     if raw:
         array = table.raw(info.path)
@@ -782,7 +807,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
-    """Return the name of an axis, None if it has length 1 and no packet lacks the element."""
+    """Return the name of an axis; None if it has one element, which no packet lacks."""
     if length != 1 or (
         known
         and not isinstance(table.schema.arrays.get(name), int)
@@ -797,7 +822,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     array = table.raw(info.path)
     if array.dtype == object:
         raise SpecError(
-            "its values are not numbers: declare text as bytes",
+            "the values of this field are not numbers: declare text as bytes",
             path=info.path,
         )
     with np.errstate(invalid="ignore"):  # a signalling nan is a nan
@@ -812,14 +837,15 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as columns.
+    """The fields of a batch of packets as attributes, which are columns.
 
-    ``f.points.distance`` is a field, ``f.state.difop.vertical`` a field of another frame type. For
-    parts, ``f.frame.counter`` is a field of the frame that contains the part.
+    ``f.points.distance`` is a field, and ``f.state.difop.vertical`` is a field of another frame
+    type. If the packets are parts, ``f.frame.counter`` is a field of the frame that contains the
+    part.
 
     Args:
-        prefix: the names so far, each followed by a dot.
-        frame: the other frame type; "" for the packets themselves.
+        prefix: the names of the enclosing structs, each followed by a dot.
+        frame: the other frame type that the fields belong to; "" for the packets themselves.
     """
 
     def __init__(self, batch: Batch, prefix: str = "", frame: str = "") -> None:
@@ -856,7 +882,7 @@ class Fields:
         """Return one element of an array of structs; a negative index counts from the end."""
         if not self._prefix or not isinstance(index, int):
             raise SpecError(
-                "expected one index per array, as in f.columns[0].timestamp or f.distances[-1]"
+                "expected one index for each array, as in f.columns[0].timestamp or f.distances[-1]"
             )
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
@@ -875,7 +901,7 @@ def _paths(batch: Batch, frame: str) -> Iterable[str]:
 
 
 class _States:
-    """``f.state``: the frames of other types that were last before each packet."""
+    """``f.state``: the fields of the last frame of each other type before each packet."""
 
     def __init__(self, batch: Batch) -> None:
         self._batch = batch
@@ -891,8 +917,8 @@ class _States:
 def _column(batch: Batch, frame: str, path: str) -> Column:
     """Return a field of a batch as a column.
 
-    For another frame type it is, for each packet, the field of the last such frame before it, or
-    the declared default.
+    For a field of another frame type, the value of a packet is the value of the last such frame
+    before the packet, or the declared default.
     """
     depth = batch.table.schema.depth()
     table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
@@ -901,7 +927,7 @@ def _column(batch: Batch, frame: str, path: str) -> Column:
         and path not in table.schema.columns
         and without_indices(path)[0] in table.schema.columns
     ):
-        raise SpecError("the array has no such element", path=path)
+        raise SpecError("the array has no element with this index", path=path)
     if not frame:
         return field_column(batch.table.schema.columns[path], batch.table, depth, batch)
     defaults = batch.defaults.get(frame, {})

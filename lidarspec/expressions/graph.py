@@ -2,19 +2,18 @@
 
 `trace` calls a `points`, `plausible` or clock function with `TracedFields`, and returns its result
 and the `Trace` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
-step that depends on the order of packets (`on`, `shift`, `latest`). Every node carries the result
-for two sample packets, so shapes and axes need no rules of their own. A step that cannot be
-recorded (a branch on data, a reduction, an attribute of an array) raises `UntraceableError` with
-the reason.
+step that depends on the order of packets (`on`, `shift`, `latest`). Every node has its result for
+two sample packets, which defines its shape and axes. A step that cannot be recorded (a branch on
+data, a reduction, an attribute of an array) raises `UntraceableError` with the reason.
 
-`traverse` iterates over the nodes of a graph, and `compute` evaluates it; the callers differ only
-in the values that they give for the fields. The compilers of points (`points.numpy_plan`,
-`points.numba_kernels`) translate a graph; the functions that they need to take conditions and sums
-apart are here, too. In them a value is *full* if each point has its own value. Otherwise it is
-*low*, and is computed once for its packet or block by the reference evaluator.
+`traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
+fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph, and
+use the functions in this module that split conditions and sums. In these functions a value is
+*full* if each point has its own value. Otherwise it is *low*: the reference evaluator computes it
+once for its packet or block.
 
-The axes of a node are those of its sample. Other operands (`vocabulary.AlongAxis`, plain arrays)
-are aligned when they are recorded, so evaluating the graph only broadcasts arrays.
+Operands that are not nodes (`vocabulary.AlongAxis`, plain arrays) are aligned when they are
+recorded, so that evaluating the graph only broadcasts arrays.
 """
 
 from __future__ import annotations
@@ -37,23 +36,23 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis
 
 
 class UntraceableError(Exception):
-    """An operation that only the reference evaluator can execute; the message has the reason."""
+    """An operation that only the reference evaluator can execute; the message is the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One step of the computation.
+    """One step of a traced function.
 
     Attributes:
-        kind: "field", "state", "shift", "latest", "on", "running", "rows" (of a table, at indices)
-            or "call".
+        kind: "field", "state", "shift", "latest", "on", "running", "rows" (rows of a table,
+            selected by indices) or "call".
         function: for "call", a function of arrays that broadcast; for "field" and "state", a
             function of `Fields` that returns the column; otherwise a function of columns that
             returns a column.
-        args: nodes, numbers and arrays.
-        sample: the result for the sample.
-        number: position in the order of evaluation.
-        path: of a field or state column, as written after ``f.``.
+        args: the arguments: nodes, numbers and arrays.
+        sample: the result for the sample packets.
+        number: the position of the node in the order of evaluation.
+        path: the path of a field or state column, as written after ``f.``.
     """
 
     kind: str
@@ -65,12 +64,12 @@ class Node:
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
-        """Lengths after the packets' axis."""
+        """The lengths of the axes after the axis of packets."""
         return self.sample.shape[1:]
 
     @cached_property
     def width(self) -> int:
-        """Number of values per packet; 0 if all packets share them."""
+        """The number of values of each packet; 0 if all packets share the values."""
         size = int(np.prod(self.shape, dtype=np.intp))
         if self.sample.shape[0] > 1:
             return size
@@ -78,9 +77,9 @@ class Node:
 
     @cached_property
     def fields(self) -> tuple[Node, ...] | None:
-        """The fields that the node is computed from element by element, each once.
+        """The fields that the node is computed from, each once.
 
-        None if other kinds of steps are needed.
+        None if the computation has steps that are not elementwise calls.
         """
         if self.kind == "field":
             return (self,)
@@ -107,7 +106,11 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """Per argument: (True, missing axes) of a node, or (False, the constant as an array)."""
+        """A pair for each argument, which shows how to read its value.
+
+        The pair is (True, the lengths of missing axes) for a node, and (False, the array) for a
+        constant.
+        """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
             (
@@ -121,7 +124,7 @@ class Node:
     def value(self, args: list[Any]) -> Any:
         """Return the value, computed from the arguments.
 
-        It is a column if the arguments are columns, otherwise an array.
+        The value is a column if the arguments are columns, otherwise an array.
         """
         if self.kind != "call":
             return self.function(*args)
@@ -137,12 +140,12 @@ class Node:
 
 @dataclass
 class Trace:
-    """The nodes of a trace in the order in which they were made, and its assumptions.
+    """The steps of a traced function, and the assumptions of the trace.
 
     Attributes:
-        nodes: in order.
-        steps: (node, largest value) of counts that were used for indices; the trace is valid only
-            for these counts.
+        nodes: the nodes in the order in which they were made.
+        steps: pairs of a node and the number of indices that `steps` returned for it. The trace is
+            valid only for packets with the same numbers.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -157,7 +160,10 @@ class Trace:
         sample: Column,
         path: str = "",
     ) -> TracedColumn:
-        """Return a new node as a traced column; reuse the node of a field that was read before."""
+        """Add a node, and return it as a traced column.
+
+        If the node is a field that was read before, return the earlier node.
+        """
         if path in self._read:
             return TracedColumn(self._read[path], self)
         node = Node(kind, function, tuple(map(get_node, args)), sample, len(self.nodes), path)
@@ -176,16 +182,16 @@ class TracedColumn(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values that are known while a function runs: those of the sample."""
+        """The values that are known while the function runs: the values of the sample packets."""
         return self.node.sample.array
 
     def __array_ufunc__(
         self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any
     ) -> TracedColumn:
         if kwargs.get("out") is not None:
-            raise SpecError("columns cannot be changed in place; write a new expression instead")
+            raise SpecError("a column cannot be changed in place: write a new expression")
         if method != "__call__":
-            raise UntraceableError(f"np.{ufunc.__name__}.{method} combines several values")
+            raise UntraceableError(f"np.{ufunc.__name__}.{method} combines several elements")
         return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
@@ -224,12 +230,15 @@ class TracedColumn(NDArrayOperatorsMixin):
         return self.node.sample.index
 
     def on(self, *axes: str) -> Any:
-        """Record `Column.on`; return nan if frames of this layout lack the column's array."""
+        """Record `Column.on`.
+
+        Return nan if frames of this layout lack the column's array.
+        """
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
-            raise UntraceableError("an array that is shorter than the target of .on()")
+            raise UntraceableError("the array is shorter than the target of .on()")
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
@@ -253,7 +262,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return `Column.steps` of the sample, and record their number on the tape."""
+        """Return `Column.steps` of the sample packets, and record the number of indices."""
         indices = self.node.sample.steps()
         self._tape.steps.append((self.node, len(indices)))
         return indices
@@ -280,16 +289,16 @@ class TracedColumn(NDArrayOperatorsMixin):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise UntraceableError(f"attribute .{name} of a column")
+        raise UntraceableError(f"the function reads the attribute .{name} of a column")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        raise UntraceableError("conversion of a column to an array")
+        raise UntraceableError("the function converts a column to an array")
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
 
     def __len__(self) -> int:
-        raise UntraceableError("the length of a column")
+        raise UntraceableError("the function reads the length of a column")
 
     def __getitem__(self, index: Any) -> TracedColumn:
         """Record one element of an array field as a field."""
@@ -304,7 +313,7 @@ class TracedColumn(NDArrayOperatorsMixin):
 
 
 class TracedFields:
-    """The fields of the sample during a trace; operations on them are recorded."""
+    """The fields of the sample packets, as columns that record the operations on them."""
 
     def __init__(
         self,
@@ -343,9 +352,9 @@ class TracedFields:
 
 
 def _check_raw(schema: Schema, path: str) -> None:
-    """Raise UntraceableError unless a field's values are numbers on the wire."""
+    """Raise UntraceableError unless a field is sent as a number."""
     if path in schema.derived:
-        raise UntraceableError(f"{path} is computed, and has no bytes of its own")
+        raise UntraceableError(f"{path} is computed from other fields, and not sent")
     if schema.fields[path].adapter is not None:
         raise UntraceableError(f"a Python function makes the values of {path}")
 
@@ -353,17 +362,18 @@ def _check_raw(schema: Schema, path: str) -> None:
 def _fold(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
-    """Return a function of table rows as rows of a new table, if all operands allow it.
+    """Apply a function to the rows of tables, instead of to the rows that are looked up.
 
-    The operands must be rows of tables at the same indices, numbers, or one row that all packets
-    share. Sines and cosines of looked-up directions, and their products, are then computed once,
-    for the table.
+    This is possible if the operands are rows of tables at the same indices, numbers, or a row that
+    all packets share. Sines and cosines of directions in a table are then computed once.
 
     Args:
-        arrays: the values; values that are not columns are aligned with the others.
+        function: the elementwise function.
+        values: the operands.
+        arrays: the operands after alignment.
 
     Returns:
-        The indices and the table, or None.
+        The node of the indices, and the new table. None if this is not possible.
     """
     nodes = [value.node for value in values if isinstance(value, TracedColumn)]
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
@@ -397,7 +407,7 @@ def get_node(value: Any) -> Any:
 
 
 def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
-    """Return the result of a function of traced columns, and the tape of its steps.
+    """Call a function with traced columns, and return its result and the trace of its steps.
 
     Raises:
         UntraceableError: if a step cannot be recorded.
@@ -408,9 +418,9 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
 
 
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
-    """Return a batch for tracing: the first frame of a group, twice.
+    """Return a batch for tracing, with the first frame of a group as two packets.
 
-    Two packets show which values all packets share.
+    With two packets, values that all packets share can be distinguished from others.
     """
     return batch.of(
         LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
@@ -418,10 +428,11 @@ def make_sample(batch: Batch, group: LayoutRows) -> Batch:
 
 
 def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
-    """Yield the nodes of some values, including themselves, each once.
+    """Yield the nodes in the graph of some values, each once.
 
     Args:
-        into: whether to continue to the arguments of a node.
+        values: nodes, traced columns, or constants, which have no nodes.
+        into: a function that returns whether to continue to the arguments of a node.
     """
     seen = set[Node]()
     waiting = [get_node(value) for value in values]
@@ -436,16 +447,16 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
 def compute(
     node: Node, results: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
 ) -> Any:
-    """Return the value of a node, given the fields.
+    """Compute the value of a node and of the nodes that it depends on.
 
     Args:
-        results: the values of nodes, columns or arrays with one row for each packet. New values
-            are added, so each node is computed once.
-        source: the value of a node that is not computed from others, such as a field; None for
-            other nodes.
+        results: the known values of nodes, as columns or as arrays with one row for each packet.
+            New values are added, so that each node is computed once.
+        source: a function that returns the value of a node that is not computed from others, such
+            as a field, and None for all other nodes.
 
     Returns:
-        A column or an array, like the values of the fields.
+        A column if the values of the fields are columns, otherwise an array.
     """
     value = results.get(node)
     if value is None:
@@ -462,7 +473,7 @@ def compute(
 
 
 def get_only_field(node: Node) -> Node | None:
-    """Return the field of an expression of one field and numbers, None for others."""
+    """Return the field of an expression of a single field; None for other expressions."""
     if node.fields is not None and len(node.fields) == 1:
         return node.fields[0]
     return None
@@ -470,11 +481,11 @@ def get_only_field(node: Node) -> Node | None:
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """An expression of fields of the frame that are all in the same arrays.
+    """An elementwise expression of fields that are all in the same array of the frame.
 
     Attributes:
-        node: the expression.
-        fields: its fields, each once.
+        node: the node of the expression.
+        fields: the fields of the expression, each once.
     """
 
     node: Node
@@ -485,19 +496,20 @@ class Expression:
         """Return a node as an expression.
 
         Raises:
-            UntraceableError: if it depends on more than fields of the frame in the same arrays.
+            UntraceableError: if the node depends on fields of different arrays, or on anything that
+                is not a field of the frame.
         """
         if node.fields is None:
-            raise UntraceableError("not only fields of the frame")
+            raise UntraceableError("the expression depends on more than fields of the frame")
         infos = tuple(schema.fields[source.path] for source in node.fields)
         if len({info.axes for info in infos}) != 1:
-            raise UntraceableError("fields of different arrays")
+            raise UntraceableError("the expression combines fields of different arrays")
         return cls(node, infos)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Return the values, element by element, given the raw values of the fields.
+        """Return the values of the expression, given the raw values of the fields by path.
 
-        Fields without a value are nan.
+        All arrays have the same shape. The result is nan if a field has no value.
         """
         (values,) = evaluate_expressions([self], raw)
         return values
@@ -506,7 +518,7 @@ class Expression:
 def evaluate_expressions(
     expressions: Sequence[Expression], raw: Mapping[str, NDArray[Any]]
 ) -> list[NDArray[Any]]:
-    """Return `Expression.values` of each expression; compute common nodes once."""
+    """Return `Expression.values` of each expression; common nodes are computed once."""
     infos = {info.path: info for expression in expressions for info in expression.fields}
     results = dict[Node, Any]()
     with np.errstate(all="ignore"):
@@ -520,22 +532,24 @@ def evaluate_expressions(
         ]
 
 
-#: maximum number of cached values of a term.
+#: The maximum number of cached values of a term.
 REMEMBERED = 64
 
-#: (values of a term, number of packets n) -> the term as integers, (n,) or (1,).
+#: A function that converts the values of a term to integers, (n,) or (1,), given the values and the
+#: number of packets n.
 Made = Callable[[Any, int], NDArray[np.int64]]
 
 
 class HeaderFunction:
-    """A function of header fields that recomputes only terms whose fields change.
+    """Evaluates a function of header fields, and caches the terms of its result.
 
-    Most of a clock is a date, and most counters depend on a setting: both are the same in thousands
-    of packets, and take dozens of operations to read.
+    The date in a clock, or the setting that a counter depends on, is the same in thousands of
+    packets, and needs many operations to compute. A term is therefore computed again only if its
+    fields have changed.
 
     Args:
-        function: a function of `Fields` that returns a column, or several: the terms.
-        made: converts the values of a term to integers.
+        function: a function of `Fields` that returns a column, or several columns (the terms).
+        made: a function that converts the values of a term to integers.
     """
 
     def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
@@ -545,7 +559,7 @@ class HeaderFunction:
         self._is_tried = False
 
     def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
-        """Return the integers of each term, (n,) or (1,)."""
+        """Return the integers of each term, (n,), or (1,) if they are the same in all packets."""
         table = batch.table
         if not self._is_tried and isinstance(table, CompiledTable):
             self._is_tried, self._terms = True, self._split_terms(batch, table)
@@ -573,7 +587,7 @@ def _several(terms: Any) -> Sequence[Any]:
 
 
 class _ResultPart:
-    """One term of a `HeaderFunction`, with cached values.
+    """Evaluates one term of a `HeaderFunction`, and caches its values.
 
     Raises:
         UntraceableError: if a field is optional or in an array.
@@ -581,7 +595,7 @@ class _ResultPart:
 
     def __init__(self, expression: Expression, made: Made) -> None:
         if any(info.axes or info.optional for info in expression.fields):
-            raise UntraceableError("a field that occurs several times or is optional")
+            raise UntraceableError("a field is in an array, or is optional")
         self._expression = expression
         self._made = made
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}
@@ -603,7 +617,11 @@ class _ResultPart:
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-        """Return the integer of one packet, (1,), cached by the raw values of its fields."""
+        """Return the integer for one packet, (1,), from the cache if its fields were seen before.
+
+        Args:
+            columns: the raw values of the fields, (1,) each.
+        """
         key = tuple(column.item(0) for column in columns)
         cached = self._known.get(key)
         if cached is None:
@@ -622,12 +640,12 @@ class _ResultPart:
 
 @lru_cache(maxsize=256)
 def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) -> HeaderFunction:
-    """Return the `HeaderFunction` of a function and a schema, with its cached values."""
+    """Return the `HeaderFunction` for a function and a schema; repeated calls share it."""
     return HeaderFunction(function, made)
 
 
 def split_condition(node: Node) -> Iterator[Node]:
-    """Yield the conditions that a condition combines with "and"."""
+    """Yield the operands of a condition that combines conditions by "and"."""
     both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
     if both and all(
         isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args
@@ -638,16 +656,19 @@ def split_condition(node: Node) -> Iterator[Node]:
         yield node
 
 
-#: one-argument functions that are a multiplication.
+#: The functions of one argument that are a multiplication by a number.
 FACTORS = {np.negative: -1.0, np.positive: 1.0, np.deg2rad: np.pi / 180, np.radians: np.pi / 180}
 FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A part of a sum: `full` times a number, or `low` times a row that all packets share.
+    """A term of a sum, which is the product of a factor and a node.
 
-    `low` None stands for 1.
+    Attributes:
+        row: the factor, a number or a row of numbers that all packets share.
+        low: the node, if it is not full; None for 1.
+        full: the node, if each point has its own value.
     """
 
     row: NDArray[np.float64]
@@ -665,9 +686,10 @@ def is_full(value: Any, width: int) -> bool:
 
 
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
-    """Return condition and both options of a ``np.where``, None if it has another form.
+    """Return the condition and the two options of a ``np.where``.
 
-    The condition must be low, and each option a number or a full expression of one field.
+    Returns None unless the condition is low, and each option is a number or a full expression of
+    one field.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
@@ -735,9 +757,9 @@ def split_sum(value: Any, width: int) -> list[Term]:
 
 
 def _scale(value: Node, parts: list[Term], factor: Any) -> list[Term]:
-    """Return the terms of a sum times a factor.
+    """Multiply the terms of a sum by a factor.
 
-    The sum stays one term if a full part would be multiplied by a row.
+    If a full term would be multiplied by a row, the whole product is returned as one term.
     """
     if np.ndim(factor) and any(part.full is not None for part in parts):
         return [Term(np.ones(()), full=value)]
@@ -745,5 +767,5 @@ def _scale(value: Node, parts: list[Term], factor: Any) -> list[Term]:
 
 
 def last_axis(shape: tuple[int, ...]) -> int:
-    """Return the number of axes up to the last axis longer than 1."""
+    """Return the number of axes up to and including the last axis longer than 1."""
     return max((index + 1 for index, length in enumerate(shape) if length > 1), default=0)

@@ -1,10 +1,10 @@
 """Convert packets to points by the sensor's `points` function, a batch at a time.
 
-In: `Packets`. Out: a `PointCloud` that computes columns when they are first read. Three
+`Packets` are converted to a `PointCloud`, which computes each column when it is first read. Three
 evaluators give the same columns: the reference evaluator, a NumPy plan, and compiled kernels.
 Modules in reading order:
 
-* `conventions`: the definitions of columns: axes, ranges, coordinates, types.
+* `conventions`: the definitions of axes, ranges, coordinates and types of columns.
 * `column_sources`: sources of the columns of consecutive points.
 * `table_types`: PCL's structured layout and the schema of Arrow.
 * `cloud`: point clouds.
@@ -12,12 +12,12 @@ Modules in reading order:
 * `mount`: the position of a sensor on its carrier.
 * `colours`: the scale of colours for values, on a dark and on a light ground.
 * `appearance`: the extent and the colours of a drawn cloud.
-* `reference_evaluator`: `points` evaluated with ordinary NumPy; other evaluators must agree.
+* `reference_evaluator`: evaluates `points` with ordinary NumPy; other evaluators must agree.
 * `lookup_tables`: fields of one or two bytes, and tables of all their values.
 * `plan`: `points` traced once for a layout, as expressions of the columns.
-* `layout_groups`: the packets of one layout in a batch, with their plan and plain results.
+* `layout_groups`: the packets of one layout in a batch, with their plan.
 * `batch_columns`: the columns of planned points, computed when they are first read.
 * `evaluate`: the points of a batch, by plans if `points` can be traced.
 * `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, names)`.
-* `backends`: the choice between them.
+* `backends`: chooses between the back ends.
 """

@@ -1,4 +1,4 @@
-"""Choose how to draw a cloud: its extent, its colours and the values that they show.
+"""Choose how to draw a cloud: its extent, and the values that its colours show.
 
 All drawings use this module, so that a scan looks the same in a terminal, on paper and in other
 tools.
@@ -16,43 +16,44 @@ from numpy.typing import NDArray
 from lidarspec.errors import UnknownName
 from lidarspec.points.cloud import PointCloud
 
-#: the percentile of ranges that a picture reaches to, if the farthest point is more than
+#: A picture extends to this percentile of the ranges, if the farthest point is more than
 #: `FAR_BEYOND_FACTOR` times as far.
 REACH_PERCENTILE = 99.0
 FAR_BEYOND_FACTOR = 1.5
-#: the largest number of rings between the middle and an edge.
+#: The maximum number of rings between the middle and an edge.
 MAX_RINGS = 4
-#: a cloud is flat if all elevations are below this, radians.
+#: A cloud is flat if all elevations are below this angle, radians.
 MAX_FLAT_RAD = 1e-3
-#: a reach is rounded up to these numbers, so that the picture keeps its scale from scan to scan.
+#: A reach is rounded up to these numbers, so that most scans are drawn at the same scale.
 ROUND_NUMBERS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-#: the percentile of intensity at the end of the ramp.
+#: This percentile of the intensities has the last colour.
 RAMP_PERCENTILE = 98.0
-#: the number of colours of a ramp: few, so that noise does not change every colour in every scan.
+#: The number of colours. It is small, so that noise changes few colours from scan to scan.
 RAMP_STEPS = 20
-#: the share of the points that a fitted picture shows.
+#: The share of the points that are inside a fitted picture.
 CENTRAL_SHARE = 0.98
-#: the share of the values at each end of an axis that is ignored for its scale. Distant points are
-#: found by this scale.
+#: The share of the values at each end of an axis that is ignored to find the extent of most points.
+#: Distant points are then found by their distance in units of this extent.
 TAIL_SHARE = 0.05
-#: the factor by which a fitted picture extends beyond these points.
+#: A fitted picture is larger than the extent of its points by this factor.
 MARGIN_FACTOR = 1.08
-#: the share of their size that points keep at least in a picture that shows the sensor too.
+#: A fitted picture shows the sensor if the points keep at least this share of their size.
 MIN_SIZE_SHARE = 0.93
 
 
 @dataclass(frozen=True)
 class CloudAppearance:
-    """The look of a drawn cloud.
+    """The extent and the colours of a drawn cloud.
 
     Attributes:
-        ramp: the values that colours show: "range", "intensity", or a column in `PointCloud.extra`.
-        reach: metres from the middle to the nearer edge.
-        full: the value at the end of the ramp: metres for ranges, else in `unit`.
-        middle: the point in the middle, metres forward and left of the sensor.
+        ramp: the column that the colours show: "range", "intensity", or a column in
+            `PointCloud.extra`.
+        reach: the distance from the middle of the picture to its nearer edge, metres.
+        full: the value with the last colour, in metres for ranges, else in `unit`.
+        middle: the point in the middle of the picture, metres forward and left of the sensor.
         flat: whether all points are in the plane of the sensor, so that only a view from above is
             useful.
-        low: the value at the beginning of the ramp.
+        low: the value with the first colour.
         unit: the unit of the values; "" for ranges and plain numbers.
     """
 
@@ -66,13 +67,13 @@ class CloudAppearance:
 
     @property
     def ends(self) -> tuple[str, str]:
-        """The values at the beginning and end of the ramp, as text."""
+        """The values with the first and the last colour, as texts with the unit."""
         unit = "m" if self.ramp == "range" else self.unit
         return f"{self.low:g}", f"{self.full:g} {unit}".rstrip()
 
 
 def list_ramps(cloud: PointCloud) -> list[str]:
-    """Return the names of the values that colours can show for a cloud."""
+    """Return the names of the columns of a cloud that colours can show."""
     if cloud.intensity is None:
         return ["range", *cloud.extra]
     return ["range", "intensity", *cloud.extra]
@@ -83,12 +84,12 @@ def choose_appearance(
 ) -> CloudAppearance:
     """Return how to draw a cloud so that all of it is visible.
 
-    Intensity falls back to range if the cloud has no intensity.
+    If `ramp` is "intensity" and the cloud has no intensity, the colours show the range.
 
     Args:
         points: the cloud.
-        ramp: the values that colours show.
-        reach: metres from the middle to the nearer edge; None to fit the cloud.
+        ramp: the column that the colours show.
+        reach: the distance from the middle to the nearer edge, metres; None to fit the cloud.
 
     Raises:
         UnknownName: if the cloud does not have the column.
@@ -127,7 +128,8 @@ def is_flat(cloud: PointCloud) -> bool:
 def find_reach(cloud: PointCloud) -> float:
     """Return the range to draw for a cloud of valid points, metres, rounded up.
 
-    It is the range of the farthest point, or of most points if a few are far beyond the others.
+    This is the range of the farthest point. If a few points are much farther than the others, it is
+    a percentile of the ranges.
     """
     if not len(cloud):
         return 1.0
@@ -138,9 +140,9 @@ def find_reach(cloud: PointCloud) -> float:
 
 
 def fit_to_points(points: PointCloud, look: CloudAppearance) -> CloudAppearance:
-    """Return the look with which the central 98 % of the points fill a top view.
+    """Return a copy of `look` in which the central 98 % of the points fill a top view.
 
-    The sensor is shown too if the points become at most 7 % smaller by that.
+    The picture is extended to the sensor, unless this makes the points more than 7 % smaller.
     """
     low, high = find_bounds(points[points.valid])
     with_sensor = np.minimum(low, 0.0), np.maximum(high, 0.0)
@@ -159,8 +161,8 @@ def find_bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.floa
         cloud: valid points.
 
     Returns:
-        Two arrays (3,) in metres, zeros if there are no points. 2 % of the points, the farthest
-        from the others, may be outside.
+        Two arrays (3,) in metres, zeros if there are no points. The outermost 2 % of the points may
+        be outside these bounds.
     """
     if not len(cloud):
         return np.zeros(3), np.zeros(3)
@@ -188,22 +190,25 @@ def round_up(value: float, rounds: Sequence[float] = ROUND_NUMBERS) -> float:
 
 
 def ring_step(reach: float) -> float:
-    """Return the metres from ring to ring: 1, 2 or 5 times a power of ten.
+    """Return the distance between range rings, metres: 1, 2 or 5 times a power of ten.
 
-    There are at most four rings up to `reach`.
+    At most four rings are within `reach`.
     """
     return round_up(reach / MAX_RINGS, (1, 2, 5, 10))
 
 
 def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float64]:
-    """Return the position of each point along the ramp, (n,), from 0 to 1 at its end."""
+    """Return the position of each point on the colour scale, (n,), from 0 to 1.
+
+    Values beyond the last colour have positions above 1.
+    """
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
     return np.nan_to_num((_read_shown(cloud, look.ramp) - look.low) / (look.full - look.low))
 
 
 def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
-    """Return the index of each point's colour in the ramp, (n,).
+    """Return the index of the colour of each point, (n,).
 
     Points without a return have the first colour.
     """

@@ -1,7 +1,7 @@
-"""Choose the back end that computes columns: NumPy, or compiled kernels once they pay.
+"""Choose the back end that computes columns: NumPy or compiled kernels.
 
-Loading Numba and compiling a kernel take about a second. With the back end "auto" a kernel is used
-only for as many points as it takes to save this time.
+Loading Numba and compiling a kernel take about a second. The back end "auto" uses a kernel only
+after enough points were computed to save this time.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from weakref import WeakKeyDictionary
 from lidarspec.points import numpy_plan
 from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction
 
-#: the number of points from which a cached kernel, or a kernel yet to be compiled, saves time.
+#: A cached kernel, or a kernel that has to be compiled, saves time from this number of points on.
 MIN_WARM_KERNEL_POINTS = 1 << 26
 MIN_COLD_KERNEL_POINTS = 1 << 28
-#: a count of points that stays below these limits, so that no kernel is tried again.
+#: A count of points that never reaches these limits, so that kernels are not tried again.
 _NEVER = -(1 << 62)
 
-#: points computed so far, by the names of their columns.
+#: The numbers of points computed so far, by the names of the computed columns.
 _POINT_COUNTS: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
@@ -45,7 +45,8 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
     """Count the points of these frames, and return a kernel if it saves time.
 
-    Returns None if it does not, or if Numba is missing or fails."""
+    Returns None if a kernel saves no time, or if Numba is missing or fails.
+    """
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width
     if counts[names] < MIN_WARM_KERNEL_POINTS:

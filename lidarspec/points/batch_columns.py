@@ -1,9 +1,9 @@
 """The columns of the points of a batch, computed from plans when they are first read.
 
-`BatchColumns.columns` decides for which points columns are computed: for the whole batch, for
-a large slice alone, or for a block of points that small slices share. `_compute` decides which
-columns are computed together. A program of `points.numpy_plan` or a kernel of
-`points.numba_kernels` fills them for each `GroupPoints` of the batch.
+Columns are computed for the whole batch, for a large slice of it, or for a block of points that
+several small slices share (`BatchColumns.columns`). Some columns are computed together
+(`_compute`). A program of `points.numpy_plan` or a kernel of `points.numba_kernels` computes them
+for each layout in the batch (`GroupPoints`).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from lidarspec.points.conventions import (
 from lidarspec.points.layout_groups import GroupPoints
 from lidarspec.points.reference_evaluator import PacketBatch
 
-#: columns that one program or kernel computes.
+#: The columns that one program or kernel computes together.
 COMPILED_TOGETHER = ("x", "y", "z", "intensity")
-#: a slice of at least `MIN_OWN_POINTS` points has its own columns. Smaller slices share the columns
-#: of a block of `BLOCK_POINTS` points.
+#: The columns of a slice of at least `MIN_OWN_POINTS` points are computed for this slice alone.
+#: Smaller slices share the columns of a block of `BLOCK_POINTS` points.
 MIN_OWN_POINTS = 1 << 14
 BLOCK_POINTS = 1 << 16
 
 
 class PointBlock(NamedTuple):
-    """Points of a batch, from `start` to `stop`, and their columns computed so far."""
+    """The points of a batch from `start` to `stop - 1`, and their columns computed so far."""
 
     start: int
     stop: int
@@ -53,10 +53,11 @@ class BatchColumns(ColumnSource):
 
     Args:
         packets: the packets of the batch.
-        shares: the packets by layout.
-        size: the number of points, without the points of packets that wait.
-        base: the time that times count from, ns.
-        grids, nominal: as in `ColumnSource`.
+        shares: the packets of the batch, grouped by layout.
+        size: the number of points, without the points of packets that wait for the next batch.
+        base: the time that the column "time" counts from, int64 ns.
+        grids: the organisation of the points of each packet, see `ColumnSource`.
+        nominal: whether a default calibration is used, see `ColumnSource`.
     """
 
     def __init__(
@@ -123,7 +124,10 @@ class BatchColumns(ColumnSource):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def _block_at(self, index: int) -> PointBlock:
-        """Return the block of points around an index; blocks do not overlap."""
+        """Return the block that contains the point at an index; make it on first use.
+
+        Blocks do not overlap.
+        """
         place = bisect.bisect(self._blocks, index, key=lambda block: block.start)
         if place and index < self._blocks[place - 1].stop:
             return self._blocks[place - 1]
@@ -141,7 +145,7 @@ class BatchColumns(ColumnSource):
     def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Compute columns of the points from `start` to `stop`.
 
-        `names` has all columns that are compiled together, or none of them.
+        If `names` has one of the columns that are compiled together, it has all of them.
         """
         main = [name for name in names if name in self._main_columns]
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
@@ -208,7 +212,10 @@ class BatchColumns(ColumnSource):
         }
 
     def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
-        """Return the range of packets of some points; all packets if layouts differ."""
+        """Return the first packet with some points, and the packet after the last one.
+
+        If the layouts of packets differ, the range is (0, None), which means all packets.
+        """
         if not self._is_regular:
             return 0, None
         width = self._plan.width
@@ -217,7 +224,7 @@ class BatchColumns(ColumnSource):
     def _flatten(
         self, values: Sequence[NDArray[Any]], dtype: np.dtype[Any], start: int, stop: int
     ) -> NDArray[Any]:
-        """Return the points from `start` to `stop` in stream order.
+        """Return a column of the points from `start` to `stop`, in stream order.
 
         Args:
             values: for each layout, the values of all points of its packets in `_packet_range`.
@@ -233,7 +240,7 @@ class BatchColumns(ColumnSource):
         return column
 
     def _times(self, share: GroupPoints, first: int, last: int | None) -> NDArray[np.float64]:
-        """Return the times of the points of some packets, (packets, *shape), from `base`."""
+        """Return the times of the points of some packets, (packets, *shape), s since `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(
@@ -262,11 +269,12 @@ def _slice_columns(
 def scatter_points(
     values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
 ) -> None:
-    """Write the points of packets at the index of each packet's first point.
+    """Copy the values of points into a column, packet by packet.
 
     Args:
-        values: the points, `width` for each packet.
-        first: the index in `column` of each packet's first point; -1 leaves a packet out.
+        values: the values, `width` for each packet.
+        first: the index in `column` of the first point of each packet; packets with -1 are left
+            out.
         width: the number of points of a packet.
         column: the array to write to.
     """
@@ -287,7 +295,11 @@ def scatter_points(
 def _turn_coordinates(
     columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
 ) -> dict[str, NDArray[Any]]:
-    """Return x, y and z in the vendor's axes, each an axis of REP-103 or its opposite."""
+    """Return x, y and z in the vendor's axes, which are REP-103 axes or their opposites.
+
+    Args:
+        turn: the (3, 3) matrix from REP-103 to the vendor's axes, with entries 0, 1 and -1.
+    """
     turned = {}
     for axis, row in zip("xyz", turn, strict=True):
         source = int(np.flatnonzero(row)[0])

@@ -1,7 +1,7 @@
 """Point clouds: flat arrays in SI units, with REP-103 axes and REP-117 ranges.
 
-A `PointCloud` holds its columns. A `LazyCloud` reads each column from a `ColumnSource` on first use
-and keeps it. Columns that only some sensors have are in `extra`.
+A `PointCloud` contains its columns. A `LazyCloud` computes each column when it is first read, from
+a `ColumnSource`, and keeps it. Columns that only some sensors have are in `extra`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lidarspec.points.column_sources import ColumnSource, JoinedColumns, LazyCol
 from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, whole_columns
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type
 
-#: names of the columns that a cloud can have, in the order in which files list them.
+#: The names of the columns that a cloud can have, in the order of the columns in files.
 COLUMNS = tuple(TYPES)
 
 
@@ -30,7 +30,7 @@ class PointCloud:
     """N points in stream order.
 
     Attributes:
-        x, y, z: (N,) float32 metres, REP-103 (x forward, y left, z up); nan unless `valid`.
+        x, y, z: (N,) float32 metres, forward, left and up (REP-103); nan unless `valid`.
         range: (N,) float32 metres; inf without a return, nan if the sensor marks the point as
             invalid.
         azimuth: (N,) float32 radians in [-pi, pi), counter-clockwise.
@@ -50,7 +50,7 @@ class PointCloud:
         extra: (N,) further columns of the sensor by name, for example "velocity", each of its own
             type.
         units: the units of the columns in `extra`, by name; "" for a plain number.
-        chosen: the columns selected by `select_columns`; () for all.
+        chosen: the names of the columns selected by `select_columns`; () for all columns.
     """
 
     x: Floats
@@ -99,9 +99,9 @@ class PointCloud:
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
-        """The columns of this cloud by name, `extra` last.
+        """The columns of this cloud by name; the columns in `extra` come last.
 
-        After `select_columns`, only the selected columns.
+        After `select_columns`, these are only the selected columns.
         """
         names = self.chosen or (*COLUMNS, *self.extra)
         self.load(*names)
@@ -111,17 +111,18 @@ class PointCloud:
         return {name: column for name, column in columns.items() if column is not None}
 
     def has_column(self, name: str) -> bool:
-        """Return whether a column is selected; x, y and z always are."""
+        """Return whether a column is selected; always True for x, y and z."""
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def select_columns(self, *names: str) -> PointCloud:
         """Return the same points with only these columns.
 
-        The selection applies to `columns`, `to_structured` and files. x, y and z remain if a format
-        requires them.
+        The selection applies to `columns`, `to_structured` and files. x, y and z are kept if a
+        format requires them.
 
         Raises:
-            UnknownName: if the cloud does not have a column; it lists the columns of the cloud.
+            UnknownName: if the cloud does not have a column. The error lists the columns of the
+                cloud.
         """
         lacking = [
             name
@@ -145,7 +146,7 @@ class PointCloud:
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
         """Return columns by name, including "valid" and columns in `extra`.
 
-        They are computed together, which is faster than computing each when it is first read.
+        The columns are computed together, which is faster than one after another.
 
         Raises:
             UnknownName: if the cloud does not have a column.
@@ -160,10 +161,7 @@ class PointCloud:
 
     @property
     def calibration(self) -> str:
-        """The origin of the calibration.
-
-        "own" is the sensor's own calibration, "nominal" a default one.
-        """
+        """The calibration of the points: "own" (of this sensor) or "nominal" (a default)."""
         if self.nominal:
             return "nominal"
         return "own"
@@ -176,7 +174,7 @@ class PointCloud:
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `xyz`, as NumPy, SciPy and Open3D expect points.
 
-        `to_structured` has the other columns too.
+        Use `to_structured` for the other columns.
 
         Raises:
             ValueError: with ``copy=False``, since x, y and z are separate columns.
@@ -204,21 +202,21 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organise(self, columns: int) -> PointCloud:
-        """Return the points as an image of `columns` columns, by their column numbers.
+        """Return the points sorted into an image with `columns` columns, by `column`.
 
-        A missing column becomes a gap of invalid points.
+        A missing column is filled with invalid points.
 
         Args:
-            columns: the number of columns of a revolution. The points must be of one revolution at
-                most.
+            columns: the number of columns of a revolution. The points must not be of more than one
+                revolution.
 
         Raises:
-            UsageError: if the points have no `column` or are not organised, or if a number occurs
-                twice or is too large.
+            UsageError: if the points have no `column` or are not organised, or if a column number
+                occurs twice or is too large.
         """
         if self.shape is None or self.column is None:
             raise UsageError(
-                "an image requires organised points with a column number: Polar(..., column=...)"
+                "an image requires organised points with column numbers, and this cloud has none"
             )
         column_size = grid_of(self).column
         numbers, counts = np.unique(self.column[::column_size], return_counts=True)
@@ -227,7 +225,7 @@ class PointCloud:
             if wrong[0] < columns:
                 reason = f"occurs {int(counts[numbers == wrong[0]][0])} times"
             else:
-                reason = f"exceeds the {columns} columns"
+                reason = f"does not fit into {columns} columns"
             raise UsageError(
                 f"column {wrong[0]} {reason}: pass the points of one revolution, and its"
                 " number of columns"
@@ -243,7 +241,7 @@ class PointCloud:
     def destagger(self, shifts: Sequence[int]) -> PointCloud:
         """Return the points of an image with each row shifted by a number of columns.
 
-        Rows wrap around. Afterwards all points of a column have one direction.
+        Rows wrap around. The points of a column then have the same azimuth.
 
         Args:
             shifts: the shift of each row in columns, (rows,), as in the sensor's metadata.
@@ -253,10 +251,12 @@ class PointCloud:
         """
         if self.shape is None or np.shape(shifts) != (self.shape[1],):
             if self.shape:
-                what = f"{self.shape[1]} rows"
+                reason = (
+                    f"expected one shift for each of {self.shape[1]} rows, got {np.size(shifts)}"
+                )
             else:
-                what = "points that are not organised"
-            raise UsageError(f"expected shifts for {what}, got {np.size(shifts)}")
+                reason = "the points are not organised in rows and columns"
+            raise UsageError(reason)
         grid = grid_of(self)
         columns, rows = self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
@@ -267,9 +267,9 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at some indices, which form whole columns.
+        """Return the points at some indices, as whole columns.
 
-        Index -1 becomes an invalid point in its row.
+        An index of -1 becomes an invalid point.
         """
         indices = indices.reshape(-1)
         column_size = grid_of(self).column
@@ -284,10 +284,9 @@ class PointCloud:
     def to_structured(self) -> NDArray[Any]:
         """Return a structured array (N,) with PCL's layout.
 
-        The fields are x y z intensity ring time, itemsize 32. Missing values are 0.
-
-        The columns in `extra` follow from byte 32 on, aligned to their size, and the itemsize is a
-        multiple of 16.
+        The fields are x y z intensity ring time, and the itemsize is 32. Missing columns are 0. If
+        the cloud has columns in `extra`, they follow from byte 32 on, each aligned to its size, and
+        the itemsize is a multiple of 16.
         """
         names = [name for name in STRUCTURED.names or () if self.has_column(name)]
         self.load(*names, *self.extra)
@@ -322,13 +321,13 @@ class PointCloud:
         return import_library("pyarrow", "arrow").table(columns, schema)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return the stream by which DuckDB, Polars and pandas read `to_arrow`."""
+        """Return the Arrow stream through which DuckDB, Polars and pandas read the points."""
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:
         """Return a `pandas.DataFrame` of `columns`, without copying them.
 
-        `attrs` has "units" and "stamp_ns".
+        The attribute `attrs` of the result contains "units" and "stamp_ns".
 
         Raises:
             UsageError: if pandas is not installed.
@@ -347,7 +346,7 @@ class PointCloud:
 
 
 def units_of(cloud: PointCloud) -> dict[str, str]:
-    """Return the units of a cloud's columns, by name; plain numbers are left out."""
+    """Return the units of a cloud's columns by name, without columns of plain numbers."""
     return {
         name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))
     }
@@ -360,21 +359,21 @@ def _select(value: Any, which: Any) -> Any:
 
 
 def grid_of(cloud: PointCloud) -> Grid:
-    """Return the columns and rows of organised points; an empty Grid for others."""
+    """Return how the points of a cloud are organised; an empty Grid if they are not."""
     if cloud.shape:
         return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
     return Grid()
 
 
 def find_organised_shape(number: int, grid: Grid) -> tuple[int, int] | None:
-    """Return the (columns, rows) of a number of points; None if not organised."""
+    """Return (columns, rows) for a number of points; None if they are not organised."""
     if grid.rows:
         return (number // grid.column, grid.rows)
     return None
 
 
 class CloudColumns(ColumnSource):
-    """The columns of a cloud, as a source."""
+    """A `ColumnSource` with the columns of a cloud."""
 
     def __init__(self, cloud: PointCloud, grids: Grids | None = None) -> None:
         self._cloud = cloud
@@ -412,19 +411,20 @@ class LazyCloud(PointCloud):
     """A cloud with columns that are computed when they are first read.
 
     Attributes:
-        lazy: the columns. The cloud and its `extra` share them, without a reference cycle that
-            would keep the memory of the columns until the next garbage collection.
+        lazy: the columns, which the cloud and its `extra` share. `extra` does not refer to the
+            cloud, because a reference cycle would keep the columns in memory until the next garbage
+            collection.
     """
 
     lazy: LazyColumns
 
     def __new__(cls, *args: Any, **columns: Any) -> PointCloud:  # type: ignore[misc]
-        """Return a plain cloud of given columns, because `dataclasses.replace` calls this."""
+        """Return a `PointCloud` with these columns, as `dataclasses.replace` requires."""
         return PointCloud(*args, **columns)
 
     @classmethod
     def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
-        """Return the cloud of a source.
+        """Return a cloud that reads its columns from a source.
 
         Args:
             stamp_ns: the time that the times of the source count from, ns.

@@ -2,10 +2,11 @@
 
 Low values are blue, medium values green and high values yellow.
 
-The scale is a helix in the colour space OKLab, in which equal steps look equal. Its lightness rises
-all the way, so that readers who confuse red and green, or blue and yellow, still see the order.
-Each theme takes its own part of the lightness, so that every colour has a contrast of 3:1 with the
-ground. The page of ``view --web`` has the same scale, in ``colours.ts`` of `lidarspec-web`.
+The scale is a helix in the colour space OKLab, in which equal distances look equal. The lightness
+increases along the whole scale, so that readers who confuse red and green, or blue and yellow, can
+still see the order. Each theme uses its own range of lightness, so that every colour has a contrast
+of at least 3:1 with the background. The page of ``view --web`` uses the same scale, in
+``colours.ts`` of `lidarspec-web`.
 
 Source: Ottosson, A perceptual color space for image processing (2020), for the matrices.
 """
@@ -19,7 +20,8 @@ from typing import Literal
 Rgb = tuple[int, int, int]
 Theme = Literal["dark", "light"]
 
-#: matrices from OKLab to the cube roots of the cone responses, and from these responses to sRGB.
+#: The matrices from OKLab to the cube roots of the cone responses, and from the cone responses to
+#: linear sRGB.
 _CONES = (
     (1.0, 0.3963377774, 0.2158037573),
     (1.0, -0.1055613458, -0.0638541728),
@@ -34,9 +36,12 @@ _LINEAR = (
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale by lightness, hue and chroma.
+    """A colour scale in OKLab.
 
-    Lightness runs from 0 to 1 and hue in degrees, each given as the first and the last value.
+    Attributes:
+        lightness: the first and the last lightness, from 0 to 1.
+        hue: the first and the last hue, degrees.
+        chroma: the chroma of all colours.
     """
 
     lightness: tuple[float, float]
@@ -51,7 +56,7 @@ SCALES: dict[Theme, Scale] = {
 
 
 def colour(share: float, theme: Theme) -> Rgb:
-    """Return the colour at a share of the way along the scale, from 0 to 1."""
+    """Return the colour at a position on the scale, from 0 (first) to 1 (last)."""
     scale = SCALES[theme]
     lightness = _interpolate(scale.lightness, share)
     hue = math.radians(_interpolate(scale.hue, share))
@@ -60,7 +65,7 @@ def colour(share: float, theme: Theme) -> Rgb:
 
 
 def make_ramp(theme: Theme, count: int) -> list[Rgb]:
-    """Return `count` colours, evenly from the first to the last of the scale."""
+    """Return `count` colours at even distances, from the first to the last of the scale."""
     return [colour(step / (count - 1), theme) for step in range(count)]
 
 
@@ -70,12 +75,12 @@ def to_hex(rgb: Rgb) -> str:
 
 
 def _interpolate(ends: tuple[float, float], share: float) -> float:
-    """Return the value at a share of the way from one end to the other."""
+    """Return the value at a position between two values, from 0 (first) to 1 (second)."""
     return ends[0] + (ends[1] - ends[0]) * share
 
 
 def _srgb(lightness: float, a: float, b: float) -> list[int]:
-    """Return a colour of OKLab as sRGB, limited to the colours of a screen."""
+    """Return a colour of OKLab as red, green and blue in sRGB, from 0 to 255."""
     cones = [(row[0] * lightness + row[1] * a + row[2] * b) ** 3 for row in _CONES]
     parts = []
     for row in _LINEAR:

@@ -1,10 +1,10 @@
 """Sources of the columns of consecutive points.
 
-A cloud or a scan reads its columns from a `ColumnSource` when they are first used. A source has one
-method that computes columns for a slice of points. There are three kinds: the points of a batch of
-packets (`batch_columns.BatchColumns`), the points of a cloud that has its columns
-(`cloud.CloudColumns`), and slices of other sources, concatenated (`JoinedColumns`). Slices and
-scans use the third kind, so scans are cut out of batches without computing a column.
+A cloud or a scan reads its columns from a `ColumnSource` when they are first used. The method
+`columns` of a source computes columns for a slice of its points. `batch_columns.BatchColumns` is a
+source for the points of a batch of packets, and `cloud.CloudColumns` for the points of a cloud with
+known columns. `JoinedColumns` is a concatenation of slices of other sources. Scans are joined from
+slices of batches in this way, without computing any column.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ColumnSource:
 
     Attributes:
         size: the number of points.
-        base: the time that times count from, int64 ns.
+        base: the time that the column "time" counts from, int64 ns.
         grid: the organisation of all points together.
         grids: the organisation of the points of each packet, if packets have several shapes.
         nominal: whether a default calibration is used instead of the sensor's own.
@@ -42,9 +42,9 @@ class ColumnSource:
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
-        Columns that the sensor does not have are missing. Other columns that were computed together
-        with the requested columns may be included. A source may leave out "valid", which follows
-        from x. It leaves out "z" if it is level.
+        The result has no entry for a column that the sensor does not have. It may have further
+        columns that were computed together with the requested ones. It may lack "valid", which can
+        be computed from x, and it lacks "z" if `is_level`.
 
         Args:
             names: the names of columns of `PointCloud`, or of columns in `extra`.
@@ -63,7 +63,7 @@ class ColumnSource:
         return picked
 
     def seconds_after(self, time_ns: int) -> float:
-        """Return the seconds from a time to the base of this source."""
+        """Return the seconds from `time_ns` to the base of this source."""
         return (self.base - time_ns) * 1e-9
 
 
@@ -104,7 +104,7 @@ class LazyColumns:
 
 
 def level_z(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the z of points in the horizontal plane: 0, or nan like x."""
+    """Return the z of points in the horizontal plane: 0, or nan if x is nan."""
     z: NDArray[Any] = x - x
     return z
 
@@ -127,8 +127,8 @@ class JoinedColumns(ColumnSource):
 
     Args:
         parts: the slices, at least one.
-        from_first: whether times count from the first point; else from the base of the first
-            source.
+        from_first: True if times count from the first point, False if they count from the base of
+            the first source.
     """
 
     def __init__(self, parts: Sequence[SourcePart], *, from_first: bool = False) -> None:

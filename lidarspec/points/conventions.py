@@ -1,9 +1,10 @@
 """Conventions of the columns of points, independent of the back end.
 
-They are REP-103 axes, REP-117 ranges, coordinates, types and organised shapes.
+The module defines axes (REP-103), ranges (REP-117), coordinates, types and the organisation of
+points in columns and rows.
 
-The formulas accept both arrays (in the reference evaluator) and traced columns (in plans), so that
-each formula is written once.
+The reference evaluator calls the formulas with arrays, and plans call them with traced columns, so
+that each formula is written once.
 """
 
 from __future__ import annotations
@@ -22,37 +23,36 @@ from lidarspec.spec.sensor import DIRECTIONS, SensorDescription
 
 Floats = NDArray[np.float32]
 
-#: names of the columns that a cloud can have, in the order in which files list them, and their
-#: types.
+#: The types of the columns that a cloud can have, in the order of the columns in files.
 TYPES: Mapping[str, Any] = {
     **dict.fromkeys(("x", "y", "z", "range", "azimuth", "elevation", "intensity"), np.float32),
     **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8, "column": np.uint16},
 }
 
-#: units of columns by name; columns that are not listed are plain numbers.
+#: The units of columns by name; columns that are not listed are plain numbers.
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("x", "y", "z", "range"), "m"),
     **dict.fromkeys(("azimuth", "elevation"), "rad"),
     "time": "s",
 }
 
-#: the directions of x, y and z by REP-103.
+#: The directions of x, y and z in REP-103.
 REP_103 = ("forward", "left", "up")
 
-#: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
+#: The largest float32 below pi, so that azimuths are in [-pi, pi) in float32 and in float64.
 _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
-#: the largest coordinate that float32 can hold, metres.
+#: The largest coordinate that float32 can represent, metres.
 MAX_COORDINATE_M = float(np.finfo(np.float32).max)
 
-#: angles larger than this lose precision if whole turns are subtracted, radians.
+#: Subtracting whole turns from angles larger than this loses precision, radians.
 _MAX_SUBTRACTED_RAD = 1e6
 
 
 def shown_range(measured: Any, invalid: Any) -> Any:
-    """Return the range in a cloud, metres (REP-117).
+    """Return the range of points in a cloud, metres (REP-117).
 
-    It is inf without a return, and nan if the sensor marks the point as invalid.
+    The range is inf without a return, and nan if the sensor marks the point as invalid.
 
     Args:
         measured: the measured range, metres; 0 without a return.
@@ -64,9 +64,9 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
 
 def returned_range(measured: Any) -> Any:
-    """Return the range of a return, metres; nan without a return.
+    """Return measured ranges, metres, with nan for points without a return.
 
-    For a traced column the function is one node, which the compilers recognize.
+    For a traced column the result is a single node, which the compilers recognize.
     """
     if isinstance(measured, TracedColumn):
         return measured.apply_function(returned_range, measured)
@@ -74,7 +74,7 @@ def returned_range(measured: Any) -> Any:
 
 
 def mark_invalid(measured: Any, invalid: Any) -> Any:
-    """Return ranges, nan if the sensor marks the point as invalid."""
+    """Return ranges, with nan for points that the sensor marks as invalid."""
     if isinstance(invalid, TracedColumn) or np.any(invalid):
         return np.where(invalid, np.nan, measured)
     return measured
@@ -86,8 +86,9 @@ def coordinates(
     """Return x, y and z of points, metres.
 
     Args:
-        distance: metres along the beam.
-        azimuth, elevation: radians.
+        distance: the distance along the beam, metres.
+        azimuth: the azimuth of the beam, radians.
+        elevation: the elevation of the beam, radians.
         origin: x, y and z of the start of the beam, metres.
     """
     level: Any = np.cos(elevation)
@@ -122,7 +123,7 @@ def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
 
 
 def find_direction(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-    """Return the range, azimuth and elevation of coordinates, metres and radians."""
+    """Return range (metres), azimuth and elevation (radians) of coordinates in metres."""
     level = np.hypot(x, y)
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
@@ -134,15 +135,15 @@ def _product(first: Any, second: Any) -> Any:
 
 
 def _is_row(value: Any) -> bool:
-    """Return whether a value is a row of a table.
+    """Return whether a traced value is a lookup of rows in a table.
 
-    Computations with table rows are done once, for the whole table.
+    Computations with such a value are done once, for the whole table.
     """
     return isinstance(value, TracedColumn) and value.node.kind == "rows"
 
 
 def is_zero(value: Any) -> bool:
-    """Return whether a value is 0 everywhere and does not depend on data."""
+    """Return whether a value is a constant 0, which does not depend on data."""
     return not isinstance(value, TracedColumn) and bool(np.all(np.asarray(value) == 0))
 
 
@@ -152,11 +153,11 @@ def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
 
 
 class Grid(NamedTuple):
-    """The organisation of the points of a packet.
+    """How the points of a packet are organised in columns and rows.
 
     Attributes:
         rows: the number of directions in a column; 0 if the points are not organised.
-        returns: the number of returns of each direction, which are adjacent.
+        returns: the number of returns of each direction; they are adjacent.
     """
 
     rows: int = 0
@@ -169,9 +170,12 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
-    """Return the organisation of points with this shape and these axis names.
+    """Return how points with a shape are organised.
 
-    `stack` adds the axis of returns.
+    Args:
+        shape: the lengths of the axes of the points.
+        axes: the names of the axes. The axis that `stack` adds for returns has a name that starts
+            with "<".
     """
     is_stacked = bool(axes) and (axes[-1] or "").startswith("<")
     *lengths, returns = shape if is_stacked else (*shape, 1)
@@ -183,11 +187,11 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
 
 
 class Grids(NamedTuple):
-    """The organisation of the points of packets with several shapes, in stream order.
+    """How the points of packets with several shapes are organised, in stream order.
 
     Attributes:
         ends: (n,) the index after the last point of each packet.
-        which: (n,) the index in `grids` of each packet; any index for a packet without points.
+        which: (n,) the index in `grids` for each packet; any index for a packet without points.
         grids: the different organisations.
     """
 
@@ -196,7 +200,7 @@ class Grids(NamedTuple):
     grids: Sequence[Grid]
 
     def between(self, start: int, stop: int) -> Grid:
-        """Return the organisation of the points from `start` to `stop`.
+        """Return how the points from `start` to `stop` are organised.
 
         They are not organised if their packets differ, or if they are not whole columns.
         """
@@ -212,13 +216,13 @@ class Grids(NamedTuple):
 
 
 def whole_columns(grid: Grid, first: int, number: int) -> Grid:
-    """Return the organisation of a slice of organised points.
+    """Return how a slice of organised points is organised.
 
     The slice is not organised unless it consists of whole columns.
 
     Args:
-        grid: the organisation of all points.
-        first: the number of points between the start of a column and the slice.
+        grid: how all points are organised.
+        first: the index of the first point of the slice, counted from the start of any column.
         number: the number of points of the slice.
     """
     if grid.rows and first % grid.column == 0 and number % grid.column == 0:
@@ -227,14 +231,14 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
 
 
 class ExtraType(NamedTuple):
-    """The type of an additional column of points, and its unit, "" for a plain number."""
+    """The type and the unit of a column in `extra`; the unit is "" for a plain number."""
 
     dtype: np.dtype[Any]
     unit: str
 
     @classmethod
     def of(cls, extra: Extra, values: Any) -> ExtraType:
-        """Return the declared type and unit, by default the type and unit of the field."""
+        """Return the declared type and unit; by default those of the field in the column."""
         is_own = isinstance(values, Column) and not values.frame
         if is_own:
             info = values.batch.table.schema.fields.get(values.source)
@@ -258,14 +262,14 @@ class ExtraType(NamedTuple):
         return cls(dtype, unit)
 
     def column(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values converted to the type, of the same shape."""
+        """Return values converted to this type, with the same shape."""
         if self.dtype.kind == "f":
             return values.astype(self.dtype, copy=False)
         return convert_numbers(values, self.dtype)
 
 
 def convert_numbers(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
-    """Return numbers converted to a type, of the same shape; nan becomes 0."""
+    """Return numbers converted to a type, with the same shape; nan becomes 0."""
     return np.asarray(np.nan_to_num(values) if values.dtype.kind == "f" else values, dtype)
 
 
@@ -285,7 +289,7 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
     """Return the directions of the x, y and z axes of a sensor's points.
 
-    They follow REP-103, unless the vendor's axes are configured.
+    The axes are the REP-103 axes, unless the vendor's axes are configured.
     """
     if sensor.options.get("frame") == "vendor":
         wanted = sensor.vendor_axes
@@ -298,7 +302,7 @@ def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
 def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
     """Return the (3, 3) matrix from REP-103 to the configured axes.
 
-    Returns None if the configured axes follow REP-103.
+    Returns None if the configured axes are the REP-103 axes.
     """
     axes = find_axes(sensor)
     if axes == REP_103:
@@ -307,7 +311,7 @@ def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
 
 
 def turn_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return azimuths of the same directions in rotated axes, radians in [-pi, pi].
+    """Convert azimuths to rotated axes, radians in [-pi, pi].
 
     Args:
         angles: the azimuths, radians.

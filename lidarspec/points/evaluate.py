@@ -1,8 +1,8 @@
-"""Evaluate packets to points: by plans if `points` can be traced, else by the reference evaluator.
+"""Evaluate the points of packets by plans, or by the reference evaluator.
 
-Only the work that later batches depend on is done at once: stateful values are computed, and the
-conditions of plans are checked. Columns are computed when they are first read. The values of
-a packet do not depend on the batch that contains it.
+Plans are used if the `points` function can be traced. At first, only values that later batches
+depend on are computed, and the conditions of plans are checked. Columns are computed when they are
+first read. The points of a packet do not depend on the batch that contains it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lidarspec.points.reference_evaluator import (
     find_stamp,
 )
 
-#: how many numbers are checked together, so that they stay in the cache.
+#: The number of floats that are checked together, so that they fit in the cache of the processor.
 NUMBERS_CHECKED_TOGETHER = 1 << 15
 
 
@@ -41,9 +41,9 @@ def evaluate(
     final: bool = True,
     epoch: int | None = None,
 ) -> EvaluatedPoints:
-    """Return the points of a batch by the fastest applicable evaluation.
+    """Return the points of a batch, evaluated in the fastest possible way.
 
-    The columns equal the columns of `evaluate_plainly` within a few units in the last place.
+    The columns are the same as those of `evaluate_plainly`, within a few units in the last place.
 
     Args:
         carry: the state left by the previous batch.
@@ -64,7 +64,7 @@ def evaluate(
 def _evaluate_by_plans(
     packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
 ) -> EvaluatedPoints | None:
-    """Return the points of a batch by plans; None if no valid plan exists."""
+    """Return the points of a batch, evaluated by plans; None without a valid plan."""
     table = packets.table
     if not isinstance(table, CompiledTable) or not table.groups:
         return None
@@ -110,7 +110,7 @@ def _make_group(
     whole: PlainValues,
     remembered: Mapping[int, Column],
 ) -> GroupPoints:
-    """Return the packets of a group with their plan.
+    """Return the packets of one layout with their plan.
 
     Args:
         whole: the values of the whole batch.
@@ -125,7 +125,8 @@ def _make_group(
 def _is_valid(share: GroupPoints) -> bool:
     """Return whether a plan is valid for its packets.
 
-    This checks the lengths of axes, the sign of factors, and the size of floating-point fields.
+    This checks the lengths of axes, the signs of factors, and the magnitude of floating-point
+    fields.
     """
     values = share.plain_values
     for node, number in share.plan.tape.steps:
@@ -139,9 +140,9 @@ def _is_valid(share: GroupPoints) -> bool:
 
 
 def _is_moderate(share: GroupPoints, node: Node) -> bool:
-    """Return whether all numbers of a floating-point field are of moderate size.
+    """Return whether all numbers of a field are suitable for computation in float32.
 
-    They are finite, and neither too small nor too large for float32.
+    They have to be finite, and neither too small nor too large (`MODERATE_SIZES`).
     """
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
@@ -154,9 +155,9 @@ def _is_moderate(share: GroupPoints, node: Node) -> bool:
 
 
 def _are_moderate(values: NDArray[Any]) -> bool:
-    """Return whether floating-point numbers are all 0 or of moderate size.
+    """Return whether all numbers are 0 or within `MODERATE_SIZES`.
 
-    Without the sign bit, their bits compare like integers, which is faster.
+    Without their sign bits, floats can be compared as integers, which is faster.
     """
     kind = np.dtype(f"u{values.dtype.itemsize}")
     least, most = (
@@ -191,7 +192,7 @@ def _make_source(
 
 
 def _count_points(shares: list[GroupPoints], number: int) -> NDArray[Any]:
-    """Return an array with 1 for each point, by packet and axis, and 0 in padding."""
+    """Return an array with 1 for each point and 0 for padding, (number, *lengths)."""
     if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
         return repeat(1, number, *shares[0].plan.shape)
     shape = tuple(
@@ -209,7 +210,7 @@ def evaluate_guarded(
 ) -> EvaluatedPoints | None:
     """Return the points of a batch of a stream; None if the plugin fails.
 
-    Errors are counted in the `Counters` of the packets.
+    An error is counted in the `Counters` of the packets.
 
     Args:
         carry: the state left by the previous batch.

@@ -1,7 +1,7 @@
 """The packets of one layout in a batch, with their plan and their values.
 
-A batch has a `GroupPoints` for each layout. `PlainValues` evaluates nodes of the plan for its
-packets by the reference evaluator, each node once.
+A batch has a `GroupPoints` for each layout. Its `PlainValues` evaluates nodes of the plan by the
+reference evaluator, each node once.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from lidarspec.frames.arrays import add_axes
 from lidarspec.frames.frame_table import LayoutRows
 from lidarspec.points.plan import STATEFUL_KINDS, ColumnMaker, Plan
 
-#: integers of up to this size are exact in float64.
+#: Integers with at most this number of bytes are exact in float64.
 MAX_EXACT_BYTES = 4
 
 
 class PlainValues:
     """The values of nodes for one batch, computed once by the reference evaluator.
 
-    Values are columns if the names of axes are needed, else arrays.
+    `column` returns values with the names of their axes; `array` returns plain arrays.
     """
 
     def __init__(self, batch: Batch) -> None:
@@ -52,8 +52,8 @@ class PlainValues:
     def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
         """Return the integers of a field as they were sent, (n, ...).
 
-        They are from packet `first` up to packet `stop`. Returns None if the node is not an
-        unscaled integer field that every packet has.
+        The integers are those of packets `first` to `stop - 1`. Returns None unless the node is an
+        integer field without scale that every packet has.
         """
         if node.kind == "field":
             info = self._table.schema.fields.get(node.path)
@@ -101,8 +101,8 @@ class GroupPoints:
     """The packets of one layout in a batch, with their plan and their values.
 
     Attributes:
-        first: the index of the first point of each packet, (n,); -1 for a packet that waits. None
-            if the batch has one layout, in order.
+        first: the index in the batch of the first point of each packet, (n,); -1 for a packet that
+            waits for the next batch. None if all packets of the batch have this layout.
     """
 
     plan: Plan
@@ -115,7 +115,7 @@ class GroupPoints:
         return len(self.group.where)
 
     def fill(self, maker: ColumnMaker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
-        """Return columns of the packets from `first` to `stop` (None: all).
+        """Return columns of packets `first` to `stop - 1`; a `stop` of None means all.
 
         Args:
             maker: computes the columns.
@@ -133,11 +133,11 @@ class GroupPoints:
         return columns
 
     def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return a part of the `points` result by the reference evaluator.
+        """Return a part of the result of `points`, computed by the reference evaluator.
 
-        The shape is (packets from `first` to `stop`, *the shape of the plan); `stop` None means
-        all. A column in `extra` that is a field as it was sent has the type of the field; all other
-        parts are float64.
+        The shape is (stop - first, *plan.shape); a `stop` of None means all packets. A column in
+        `extra` that is a field as it was sent has the type of the field. All other parts are
+        float64.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]
@@ -161,7 +161,7 @@ class GroupPoints:
     def part(
         cls, plan: Plan, batch: Batch, group: LayoutRows, remembered: Mapping[int, Column]
     ) -> GroupPoints:
-        """Return the group of some packets of a batch.
+        """Return a group for some packets of a batch.
 
         Args:
             remembered: the values of stateful nodes for all packets of the batch, by node number.
@@ -179,7 +179,11 @@ class GroupPoints:
         return share
 
     def some(self, which: NDArray[np.intp]) -> GroupPoints:
-        """Return the group of some of the packets, by index, with their known values."""
+        """Return a group for some of the packets, with the values that are already computed.
+
+        Args:
+            which: the indices of the packets.
+        """
         remembered = {
             node.number: self.plain_values.column(node)
             for node in self.plan.eager

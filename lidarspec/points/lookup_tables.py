@@ -1,12 +1,12 @@
 """Tabulate expressions of one field for all values of its bytes.
 
-If a field is in at most two bytes (its window), an expression of this field alone has at most
-65,536 values. The table is made by evaluating the expression for every value of the window. Looking
-up a value while decoding then includes byte order, bits, scale, "0 is no return", sines and
-cosines, without a special case for each. Both compilers of points use these tables, and the plan
-uses them to find out whether an expression can be infinite or nan.
+If a field occupies at most two bytes (its window), an expression of this field alone has at most
+65,536 values. A table has the value of the expression for every value of the window. A lookup in
+this table replaces all computations with byte order, bits, scale, sines and cosines. Both compilers
+of points use such tables, and the plan uses them to find out whether an expression can be infinite
+or nan.
 
-For frames with a wire form, windows refer to the bytes of the struct.
+If frames are encoded on the wire (`Frame.wire`), windows refer to the decoded bytes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import Expression, Node, get_only_field
 from lidarspec.frames.layout import Leaf
 
-#: functions that are hardly slower than a lookup. Of finite numbers their results are finite
-#: (overflow apart).
+#: Functions that are hardly slower than a lookup. For finite numbers their results are finite,
+#: unless they overflow.
 CHEAP: set[Any] = {
     np.add,
     np.subtract,
@@ -36,16 +36,19 @@ CHEAP: set[Any] = {
     np.maximum,
 }
 CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
-#: functions with a finite result if the divisor is a constant other than 0.
+#: Functions with a finite result if the divisor is a constant other than 0.
 _DIVISIONS = {np.true_divide, np.mod}
 
 
 @dataclass(frozen=True)
 class FieldWindow:
-    """The bytes of a field in its element, little-endian.
+    """The one or two bytes that contain a field, read as a little-endian integer.
 
-    The window has `size` bytes, 1 or 2, and begins at `offset` of the frame. Its value is the index
-    in a table.
+    This integer is the index in a lookup table.
+
+    Attributes:
+        offset: the offset of the first byte in the frame, in the first element of each array.
+        size: the number of bytes, 1 or 2.
     """
 
     offset: int
@@ -53,7 +56,7 @@ class FieldWindow:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The type as which the window is loaded."""
+        """The dtype of the window."""
         return np.dtype(f"<u{self.size}")
 
 
@@ -103,7 +106,7 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
-    Returns None unless it is an expression of one field with a window.
+    Returns None unless the expression depends on one field, which has a window.
     """
     source = get_only_field(node)
     if source is not None:
@@ -116,7 +119,7 @@ def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any]
 
 
 def is_number(value: Any, leaves: Any) -> bool:
-    """Return whether an expression is finite if its fields are.
+    """Return whether an expression is finite whenever its fields are finite.
 
     Returns False if this is not certain.
 

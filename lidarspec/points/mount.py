@@ -13,16 +13,17 @@ from lidarspec.points.conventions import narrow_angle
 
 @dataclass(frozen=True)
 class Mount:
-    """Position and orientation of a sensor on its carrier; both have REP-103 axes.
+    """Position and orientation of a sensor on its carrier.
 
-    The sensor is turned over if it is `inverted`, then rotated by roll, pitch and yaw about the
-    carrier's fixed axes.
+    The axes of both point forward, left and up (REP-103). An inverted sensor is first turned upside
+    down. The sensor is then rotated by roll, pitch and yaw about the fixed axes of the carrier.
 
     Attributes:
-        x, y, z: the sensor's origin, metres forward, left and up.
-        roll_deg, pitch_deg, yaw_deg: degrees about x, y and z, right-handed: with a yaw of 90
-            the sensor faces to the left.
-        inverted: whether it hangs upside down: rotated by half a turn about its forward axis.
+        x, y, z: the position of the sensor's origin, metres forward, left and up.
+        roll_deg, pitch_deg, yaw_deg: the angles about x, y and z, degrees, right-handed. With a yaw
+            of 90 the sensor faces to the left.
+        inverted: whether the sensor is mounted upside down, which is half a turn about its forward
+            axis.
     """
 
     x: float = 0.0
@@ -54,11 +55,11 @@ class Mount:
         """Return a cloud in the axes of the carrier.
 
         Args:
-            cloud: in the axes of the sensor.
+            cloud: the cloud in the axes of the sensor.
 
         Returns:
-            The cloud with x, y and z from the carrier's origin, and azimuth and elevation of the
-            beams in its axes. `range` remains the distance from the sensor.
+            The cloud with x, y and z relative to the carrier's origin, and with azimuth and
+            elevation in the carrier's axes. `range` is still the distance from the sensor.
         """
         turn = self.rotation
         azimuth = cloud.azimuth.astype(np.float64)
@@ -90,5 +91,6 @@ class Mount:
             if getattr(self, f.name)
         ]
         return (
-            ", ".join([*given, *(["inverted"] if self.inverted else [])]) or "as the sensor stands"
+            ", ".join([*given, *(["inverted"] if self.inverted else [])])
+            or "no rotation or translation"
         )

@@ -1,20 +1,25 @@
 """Plan the columns of a sensor's points as expressions of its fields.
 
-The `points` function is traced once for a layout. `Plan` converts its result to columns by the
-formulas of `points.conventions`, which the reference evaluator uses too, and lists the conditions
-that each batch has to meet. It computes nothing: a back end (`points.numpy_plan`,
-`points.numba_kernels`) compiles it to a `ColumnMaker`. A layout keeps its plans, so a stream of
-packets is traced once.
+The `points` function is traced once for each layout. `Plan` converts its result to expressions of
+the columns, by the formulas of `points.conventions` that the reference evaluator uses as well, and
+lists the conditions that each batch has to meet. A back end (`points.numpy_plan` or
+`points.numba_kernels`) compiles the plan to a `ColumnMaker`, which computes the columns. A layout
+keeps its plans.
 
-Points of a `Cartesian` result are three expressions and a mask (`conventions.place_points`); their
-range and angles are further expressions. They are exact: computed in float64 in the order in which
-they are written, for any values of floating-point fields.
+The coordinates of a `Cartesian` result are three expressions and a mask
+(`conventions.place_points`); range and angles are computed from the coordinates. These columns are
+exact, which means that they are computed in float64 in the order in which they are written, for any
+values of floating-point fields.
 
-Points of a `Polar` result are computed in another order and partly in float32. Their plan is valid
-if the floating-point fields of a batch are of moderate size (`MODERATE_SIZES`).
+The columns of a `Polar` result are computed in another order and partly in float32. The plan is
+valid only if the floating-point fields of a batch are within `MODERATE_SIZES`.
 
-Columns in `extra` are compiled if they are float32 (exact too), or integers of a field as they were
-sent. All others are evaluated by the reference evaluator and converted to their type.
+Columns in `extra` are compiled if they are float32, which are exact as well, or if they are
+integers of a field as they were sent. All other columns in `extra` are evaluated by the reference
+evaluator and converted to their type.
+
+A value is called full if it has one value for each point. All other values have one value for each
+packet or block.
 """
 
 from __future__ import annotations
@@ -55,14 +60,14 @@ from lidarspec.spec.vocabulary import AlongAxis, row_numbers
 
 PointsFunction = Callable[[Any], Any]
 
-#: returns the value of a node by the reference evaluator, shape (n or 1, ...).
+#: A function that returns the value of a node, (n or 1, ...), by the reference evaluator.
 Values = Callable[[Node], NDArray[Any]]
 
-#: kinds of nodes that depend on other packets, other batches or other frames.
+#: The kinds of nodes that depend on other packets, other batches or other frames.
 STATEFUL_KINDS = ("shift", "latest", "state")
 
-#: the smallest and the largest absolute value, other than 0, of floating-point fields for which
-#: float32 and another order of sums are precise enough.
+#: The smallest and the largest absolute value, other than 0, of floating-point fields that can be
+#: computed in float32 and in another order with enough precision.
 MODERATE_SIZES = 2.0**-60, 2.0**60
 
 
@@ -70,13 +75,13 @@ class ColumnMaker(Protocol):
     """A compiled program that computes some columns of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """Return empty arrays for the columns of `number` frames, (number * width,) each."""
+        """Return uninitialized arrays for the columns of frames, (number * width,) each."""
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill the columns of all frames.
 
         Args:
-            rows: the frames, with one stride.
+            rows: the frames, (n, size), evenly spaced in memory.
             values: returns the value of a node by the reference evaluator, shape (n or 1, ...).
             columns: the arrays to fill, flat and contiguous, as `columns` returns them.
         """
@@ -89,29 +94,31 @@ class Plan:
         function: the `points` function.
         layout: the layout of the frames.
         tape: the traced operations of `points`.
-        parts: the parts of its result, by name, as nodes, or as arrays if they do not depend on
-            data.
+        parts: the parts of the result of `points`, by name, as nodes, or as arrays if they do not
+            depend on data.
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
         sent: the fields of columns in `extra` that are integers as they were sent, by name.
-        exact: whether coordinates and range are computed in float64 as they are written. All other
-            columns are.
-        positive: nodes that have to be positive numbers, or the plan is not valid.
+        exact: whether coordinates and range are computed in float64 in the order in which they are
+            written. All other columns are always computed in this way.
+        positive: nodes whose values have to be positive numbers for the plan to be valid.
         nominal: whether a default calibration is used instead of the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
         tables: the lookup tables of back ends, shared by the plans of the function.
-        programs, kernels: the compiled programs of back ends, by the names of their columns.
+        programs: the compiled programs of `numpy_plan`, by the names of their columns.
+        kernels: the compiled kernels of `numba_kernels`, by the names of their columns.
 
     Raises:
-        UntraceableError: if only the reference evaluator can compute the points; the text says why.
+        UntraceableError: if only the reference evaluator can compute the points. The text is the
+            reason.
     """
 
     def __init__(self, function: PointsFunction, sample: Batch, layout: Layout) -> None:
         result, self.tape = graph.trace(function, sample)
         self._schema = schema = sample.table.schema
         if not isinstance(result, Polar | Cartesian):
-            raise UntraceableError(f"a result of type {type(result).__name__}")
+            raise UntraceableError(f"the function returns a {type(result).__name__}")
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
@@ -133,13 +140,13 @@ class Plan:
         self.programs: dict[tuple[str, ...], ColumnMaker] = {}
         self.kernels: dict[tuple[str, ...], ColumnMaker] = {}
         if 0 in self.shape:
-            raise UntraceableError("packets without points")
+            raise UntraceableError("the packets have no points")
         self.exact = isinstance(result, Cartesian)
         if not any(
             is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
         ):
             raise UntraceableError(
-                f"points that share {'coordinates' if self.exact else 'a range'}"
+                f"several points share {'coordinates' if self.exact else 'a range'}"
             )
         self.positive = list[Node]()
         named = {
@@ -179,10 +186,7 @@ class Plan:
 
     @cached_property
     def floats(self) -> list[Node]:
-        """The floating-point fields that have to be of moderate size.
-
-        Otherwise the plan is not valid.
-        """
+        """The floating-point fields that have to be within `MODERATE_SIZES`."""
         if self.exact:
             return []
         return self._list_floats(
@@ -190,13 +194,14 @@ class Plan:
         )
 
     def is_exact(self, name: str) -> bool:
-        """Return whether a column is computed in float64 as it is written, then rounded."""
+        """Return whether a column is computed in float64 in the written order, then rounded."""
         return self.exact or name == "intensity" or name in self.extra
 
     def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """Return the field that is equal to a column in `extra`, value by value.
+        """Return the field whose integers are the values of a column in `extra`.
 
-        Returns None unless each point has its own value of an integer field, of the same type.
+        Returns None unless each point has its own value of a single integer field, and the column
+        has the type of the field.
         """
         if isinstance(part, Node) and part.kind == "field":
             leaf = self.layout.leaves.get(part.path)
@@ -234,8 +239,8 @@ class Plan:
     def eager(self) -> list[Node]:
         """The nodes to compute for every batch, in order.
 
-        They remember values between batches, are inputs of these nodes, or are checked for each
-        batch.
+        They are nodes that keep values between batches, nodes that are checked for each batch, and
+        the inputs of these nodes.
         """
         wanted = [node for node in self.tape.nodes if node.kind in STATEFUL_KINDS]
         wanted += [node for node, _ in self.tape.steps] + self.positive
@@ -248,7 +253,7 @@ class Plan:
 
         Args:
             parts: the parts of the result.
-            named: the parts that are arrays along a named axis.
+            named: the parts that are arrays along a named axis, by name.
         """
         distance = mark_invalid(self._mark_distance(parts["range"]), parts["invalid"])
         azimuth, elevation, *origin = (
@@ -273,9 +278,10 @@ class Plan:
         return dict(zip("xyz", place_points(places, parts["invalid"]), strict=True)) | columns
 
     def _mark_distance(self, measured: TracedColumn) -> Any:
-        """Return the distance of a return; nan without a return.
+        """Return the distance of points, nan without a return.
 
-        If a value that is not full scales the distance, it is added to `positive`.
+        If the distance is a product of a field and a factor that is not full, the factor is added
+        to `positive`.
         """
         node = measured.node
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
@@ -293,9 +299,9 @@ class Plan:
         return returned_range(measured)
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
-        """Return whether all directions are finite if their inputs are.
+        """Return whether all azimuths and elevations of a batch are finite.
 
-        Then a nan in one coordinate of a point is a nan in all of them.
+        If so, the coordinates of a point are either all nan or all finite.
 
         Args:
             values: returns the value of a node for the batch.
@@ -313,9 +319,9 @@ class Plan:
 
     @cached_property
     def _may_be_safe(self) -> bool:
-        """Whether all values of the directions that are known in advance are finite.
+        """Whether the parts of azimuth and elevation that are known in advance are finite.
 
-        Values that are known only with a batch are checked by `safe`.
+        `safe` checks the parts that are known only with a batch.
         """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
@@ -353,13 +359,13 @@ class Plan:
         return is_number(node, self.layout.leaves)
 
 
-#: lookup tables by their contents, shared by the plans of a `points` function. Several sensors may
-#: share a function, so the info of a field identifies it.
+#: The lookup tables of each `points` function, shared by its plans. The key of a table includes the
+#: `FieldInfo`, because several sensors may share a function.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
-    """Return the plan for frames of a group's layout, or the reason why there is none.
+    """Return the plan for a group of frames, or the error that explains why it has none.
 
     The layout keeps the result.
     """

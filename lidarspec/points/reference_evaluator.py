@@ -1,10 +1,8 @@
 """Evaluate points with ordinary NumPy: the reference evaluator.
 
 The sensor's `points` function is called once per batch with columns as NumPy arrays, and its result
-is flattened.
-
-This evaluator is used if `points` cannot be traced, and as the reference in tests. Plans
-(`points.plan`) use its names for the parts of a result, and the same formulas
+is flattened. This evaluator is used if `points` cannot be traced, and as the reference in tests.
+Plans (`points.plan`) use the same names for the parts of a result, and the same formulas
 (`points.conventions`).
 """
 
@@ -33,12 +31,13 @@ _OPTIONAL = ("intensity", "ring", "return_index", "column")
 
 
 class PacketBatch(Protocol):
-    """Packets of one frame type in stream order, as evaluation needs them.
+    """The attributes of `Packets` that evaluation needs.
 
     Attributes:
-        sensor, frame: the sensor, and the name of the frame type.
+        sensor: the sensor.
+        frame: the name of the frame type.
         table: the raw columns of the frames.
-        time_ns: (n,) int64.
+        time_ns: the times of the packets, (n,) int64 ns.
         stats: the counters of the decoder.
         backend: the back end that computes points: "auto", "numpy" or "jit".
     """
@@ -66,9 +65,10 @@ class EvaluatedPoints:
 
     Attributes:
         source: the columns of the points, flat, in stream order.
-        ready: the number of these packets; the others wait for the next packets.
-        counts: (ready, ...) 1 for each point and 0 in padding, with an axis for each array level.
-        axes: names of the axes of `counts` after the first.
+        ready: the number of packets with points; all later packets of the batch wait for the next
+            batch.
+        counts: (ready, ...) 1 for each point and 0 for padding, with an axis for each array level.
+        axes: the names of the axes of `counts` after the first.
         batch: all packets of the batch.
     """
 
@@ -85,7 +85,7 @@ class EvaluatedPoints:
 
     @property
     def carry(self) -> Carry:
-        """The state for the next batch, which starts with packet `ready`."""
+        """The values to pass to the next batch, which starts with packet `ready`."""
         return self.batch.carry_over(self.ready)
 
     @property
@@ -121,12 +121,12 @@ def evaluate_plainly(
     ):
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
-            raise TypeError(f"must return Polar or Cartesian, not {type(result).__name__}")
+            raise TypeError(f"must return Polar or Cartesian, got {type(result).__name__}")
         return _make_points(packets, result, batch, find_stamp(packets, epoch), final=final)
 
 
 def find_stamp(packets: PacketBatch, epoch: int | None) -> int:
-    """Return the stamp of a cloud, int64 ns: `epoch` or the time of the first packet."""
+    """Return the stamp of a cloud, int64 ns: `epoch`, or else the time of the first packet."""
     if epoch is not None:
         return epoch
     if len(packets):
@@ -192,10 +192,10 @@ def _make_points(
 
 
 def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
-    """Return the organisation of the points of packets.
+    """Return how the points of each packet are organised.
 
     Args:
-        inside: whether an element of the arrays is a point, not padding, (n, ...).
+        inside: whether an element of the arrays is a point and not padding, (n, ...).
     """
     inner = range(1, inside.ndim)
     lengths = np.stack(
@@ -215,7 +215,7 @@ def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conv
 def flatten_valid(
     array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
 ) -> NDArray[Any]:
-    """Return an array that broadcasts to a shape, (n, ...), flattened, (N,).
+    """Broadcast an array to a shape, and return the values of all points, (N,).
 
     Only the first `ready` packets are included. Padding is left out.
     """
@@ -235,7 +235,8 @@ def make_cloud(
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
-        turn: the (3, 3) matrix from REP-103 to the configured axes; None if these follow REP-103.
+        turn: the (3, 3) matrix from REP-103 to the configured axes; None if the configured axes are
+            the REP-103 axes.
         kinds: the types of the columns in `extra`, by name.
         facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
@@ -270,7 +271,7 @@ def make_cloud(
         return PointCloud(**columns, extra=extra, units=units, **facts)
 
 
-#: range, azimuth and elevation of points, (N,) each, and their coordinates, (3, N).
+#: The range, azimuth and elevation of points, (N,) each, and their coordinates, (3, N).
 _Placement = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float64]]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarspec.optional_libraries import import_library
 
-#: x y z intensity ring time at PCL's offsets.
+#: The fields x y z intensity ring time at PCL's offsets.
 STRUCTURED = np.dtype(
     {
         "names": ["x", "y", "z", "intensity", "ring", "time"],
@@ -20,12 +20,12 @@ STRUCTURED = np.dtype(
         "itemsize": 32,
     }
 )
-#: the size of a structured point is a multiple of this.
+#: The size of a structured point in bytes is a multiple of this.
 ALIGNMENT_BYTES = 16
 
 
 def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
-    """Return PCL's layout followed by further columns, each aligned to its size."""
+    """Return the dtype of PCL's layout, followed by further columns aligned to their size."""
     formats = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}
     end = STRUCTURED.itemsize
     for name, dtype in extra.items():
@@ -47,7 +47,7 @@ def arrow_schema(
 ) -> Any:
     """Return the `pyarrow.Schema` of some columns of points.
 
-    Float columns are not nullable, which is faster to write: nan marks a missing value.
+    Float columns are not nullable, because this is faster to write. A missing value is nan.
 
     Args:
         units: the units of columns by name, without plain numbers. They are stored in the metadata

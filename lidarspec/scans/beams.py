@@ -1,10 +1,10 @@
 """Project planar scans onto one grid of angles.
 
-These are the scans of a planar sensor, or of one ring or layer of another sensor.
+A planar scan is a scan of a planar sensor, or one ring or layer of another sensor.
 
-The first complete scan determines the grid: the number of beams, and the first and the last angle.
-The grid begins at the angle at which the scans of the sensor begin, so that times increase or
-decrease linearly over all beams. If the sensor sees less than a full turn, the grid covers its
+The first complete scan determines the grid, which is the number of beams and the first and the last
+angle. The grid begins at the angle at which the scans of the sensor begin, so that times increase
+or decrease linearly over all beams. If the sensor sees less than a full turn, the grid covers its
 field of view.
 """
 
@@ -19,25 +19,25 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.laserscan import FULL_TURN, LaserScan, unwrap_azimuths
 from lidarspec.scans.scan import Scan
 
-#: the largest elevation, radians, of points in the plane of a sensor: the rotation of a mount
-#: leaves rounding errors of up to this size.
+#: The largest elevation, radians, of points in the plane of a sensor. Rotating points to a mount
+#: causes rounding errors of up to this size.
 MAX_LEVEL_RAD = 1e-5
-#: the share of a turn from which a scan counts as a whole turn.
+#: A scan over at least this share of a turn counts as a whole turn.
 MIN_TURN_SHARE = 0.98
 
 Field = tuple[float, float]
 
 
 class PlanarScans:
-    """The planar scans of one sensor.
+    """Projects the scans of one sensor onto one grid of angles.
 
     Args:
-        beams: the number of beams. By default it is the number that the scans or the sensor
-            declare, or the number of points of the first complete scan.
+        beams: the number of beams; by default the number that the scan or the sensor declares, or
+            else the number of points of the first complete scan.
         field: the first and the last angle, radians; by default the sensor's field of view.
         ring: the ring to use from a sensor with several rings.
-        heights: the points to use from a sensor with several rings, by z: the lowest z, and the z
-            above the highest, metres.
+        heights: the layer to use from a sensor with several rings, as a pair (low, high) in metres.
+            Points with low <= z < high belong to the layer.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class PlanarScans:
     def project(self, scan: Scan) -> LaserScan | None:
         """Return the scan on the grid; None if the points are not in one plane.
 
-        A ring or heights select the points of one plane.
+        With `ring` or `heights`, the points of this ring or layer are projected.
 
         Raises:
-            UsageError: if the points do not have the chosen ring.
+            UsageError: if the points do not have the ring.
         """
         level = self._take_level(scan)
         if level is None:
@@ -73,7 +73,10 @@ class PlanarScans:
         return level.to_laserscan(*self._grid)
 
     def _take_level(self, scan: Scan) -> Scan | None:
-        """Return the points of a scan that are in the plane; None if no plane is chosen."""
+        """Return the scan with the points of the chosen ring or layer only.
+
+        Without a ring or layer, return the scan if its points are in one plane, else None.
+        """
         cloud = scan.points
         if self._ring is None and self._heights is None:
             if self._is_flat is None and cloud.valid.any():
@@ -119,13 +122,14 @@ class PlanarScans:
 
 
 def _find_grid_start(begin: float, end: float, step: float) -> float:
-    """Return the first angle of a grid over the whole turn, from -pi to pi.
+    """Return the first angle of a grid over the whole turn, radians from -pi to pi.
 
-    The point measured first is at the first angle of the grid. If angles fall with time, it is at
-    the last angle, and the point measured last is at the first angle.
+    The grid begins at the point that was measured first. If angles decrease with time, the grid
+    begins at the point that was measured last.
 
     Args:
-        begin, end: the first and the last measured angle, radians.
+        begin: the first measured angle, radians.
+        end: the last measured angle, radians.
         step: the step of the grid, radians.
     """
     steps = round((begin + np.pi) / step)
@@ -135,6 +139,6 @@ def _find_grid_start(begin: float, end: float, step: float) -> float:
 
 
 def _project(cloud: PointCloud) -> PointCloud:
-    """Return points moved vertically to the plane of the sensor."""
+    """Return points that are moved vertically into the plane of the sensor."""
     ranges = np.where(cloud.valid, np.hypot(cloud.x, cloud.y), cloud.range)
     return replace(cloud, range=ranges, elevation=np.zeros_like(cloud.elevation))

@@ -1,8 +1,8 @@
 """Count the packets of the current scan, and the packets that are missing in it.
 
-The index of packets shows how many are missing before each (see `Packets.index`), and their breaks
-show that something is missing, even if the number is unknown. A frame counts once even if several
-of its parts have points.
+The index of packets shows how many packets are missing before each of them (see `Packets.index`). A
+break shows that an unknown number is missing. A frame counts as one packet, even if several of its
+parts have points.
 
 A packet in which one scan ends and the next one begins counts in both scans. Packets missing before
 it count in the first scan only.
@@ -24,14 +24,14 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class PacketCounts:
-    """The counts by which packets extend a scan, (n,) each.
+    """The counts that n packets add to a scan, (n,) each.
 
     Attributes:
         times: the times of the packets, ns.
         counts: 1 for each packet; for parts, 1 for the first part of a frame, and 0 for the others.
         sizes: the sizes of the packets, in bytes or in points.
-        missing: the number of packets missing before each.
-        is_broken: whether there is a break before each.
+        missing: the number of packets missing directly before each packet.
+        is_broken: whether there is a break directly before each packet.
     """
 
     times: Integers
@@ -53,8 +53,8 @@ class PacketCounts:
         Args:
             packets: the batch.
             number: the number of packets to count.
-            points: the number of points of each of them, (number,), used as sizes; None to use
-                bytes.
+            points: the number of points of each packet, (number,), used as its size; None to use
+                its number of bytes.
             previous_index: the index of the packet before the batch; None at the start of the
                 stream.
         """
@@ -87,7 +87,7 @@ class PacketCounts:
         return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
 
     def part(self, start: int, stop: int) -> PacketCounts:
-        """Return the counts of rows `start` to `stop`, which share memory with these."""
+        """Return the counts of rows `start` to `stop - 1`; they share memory with this object."""
         rows = slice(start, stop)
         return PacketCounts(
             self.times[rows],
@@ -98,7 +98,7 @@ class PacketCounts:
         )
 
     def share(self, row: int) -> None:
-        """Count a packet, or the frame that it is part of, in the next scan too.
+        """Count a packet, or the frame that it is part of, in the next scan as well.
 
         Packets missing before it are not counted again.
         """
@@ -114,12 +114,12 @@ class OpenScan(NamedTuple):
     """The counts of a scan that has not ended.
 
     Attributes:
-        has_start: whether its start was seen.
+        has_start: whether the start of the scan has arrived.
         since: the time of its first packet, ns.
         packets: the number of its packets.
-        size: its size in bytes or points.
-        lost: the number of packets missing between them.
-        is_broken: whether there is any break.
+        size: its size, in bytes or in points.
+        lost: the number of packets missing in it.
+        is_broken: whether there is a break in it.
     """
 
     has_start: bool = False
@@ -131,7 +131,7 @@ class OpenScan(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the start was seen, and at least half of the packets arrived."""
+        """Whether the start has arrived, and at least half of the packets."""
         return self.has_start and self.lost <= self.packets
 
     @property
@@ -140,7 +140,7 @@ class OpenScan(NamedTuple):
         return self.lost > 0 or self.is_broken
 
     def add(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts after adding packets; at least one."""
+        """Return the counts of the scan with further packets, at least one."""
         since = self.since
         if not self.packets:
             since = packets.times.item(0)
@@ -154,7 +154,7 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts after adding the losses before packets, not the packets."""
+        """Return the counts of the scan with the losses before packets, without the packets."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),

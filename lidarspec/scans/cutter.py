@@ -1,8 +1,7 @@
 """Decide where the scans of a stream end, and whether each of them is complete.
 
-No other module decides this. A scan ends at each end that the sensor's rule finds (`scan_ends`),
-and at the limits if no end arrives in time (`limits`). Missing packets are counted in
-`completeness`.
+A scan ends where the sensor's rule finds an end (`scan_ends`). If no end arrives in time, it ends
+when it reaches its limits (`limits`). Missing packets are counted in `completeness`.
 """
 
 from __future__ import annotations
@@ -22,14 +21,15 @@ from lidarspec.scans.scan_ends import EndFinder, ScanEnd, first_points
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
-#: the number of packets that are searched together for one that exceeds the limits.
+#: The number of packets that are searched together for one that exceeds the limits.
 SEARCHED_PACKETS = 1024
 
 
 class ScanCut(NamedTuple):
     """The end of one scan and the start of the next.
 
-    `point` is the first point of the next scan. The flags describe the scan that ends (see `Scan`).
+    `point` is the index of the first point of the next scan. The flags describe the scan that ends
+    (see `Scan`).
     """
 
     point: int
@@ -38,7 +38,7 @@ class ScanCut(NamedTuple):
 
 
 class ScanCutter:
-    """The cuts between the scans of one stream.
+    """Finds the cuts between the scans of one stream.
 
     Args:
         sensor: the sensor that sends the stream.
@@ -70,13 +70,13 @@ class ScanCutter:
 
         Args:
             sector: the masked sector.
-            angle: the angle of the last packet before it was found, in turns; None before any
-                packet.
+            angle: the angle of the last packet before the sector was found, in turns; None if there
+                was no packet.
         """
         self._ends.use_sector(sector, angle)
 
     def cut(self, packets: Packets, points: EvaluatedPoints) -> list[ScanCut]:
-        """Return the cuts in a batch, in order."""
+        """Return the cuts in a batch of packets, in order."""
         ends = self._ends.find(packets, points)
         number = points.ready
         if not number:
@@ -123,8 +123,9 @@ class ScanCutter:
         """End the scan at an end that the rule has found, and begin the next one.
 
         Args:
-            row: the packet with the end.
-            is_gap_shared: whether packets missing before that packet count in the next scan too.
+            row: the row of the packet with the end.
+            is_gap_shared: whether packets missing before this packet count in the next scan as
+                well.
         """
         scan = self._scan
         is_whole = scan.is_whole and not end.is_leap
@@ -141,7 +142,7 @@ class ScanCutter:
     def _add(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int, points: EvaluatedPoints
     ) -> list[ScanCut]:
-        """Add packets without an end to the scan, and return the cuts at the limits."""
+        """Add packets without an end to the scan, and return cuts if it reaches its limits."""
         if start >= stop:
             return []
         part = counts.part(start, stop)
@@ -155,7 +156,7 @@ class ScanCutter:
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
     ) -> NDArray[np.intp]:
-        """Add packets, and cut before each packet with which the scan exceeds the limits.
+        """Add packets, and cut before each packet with which the scan exceeds its limits.
 
         Returns:
             The rows of the packets before which the scan is cut.
@@ -180,7 +181,7 @@ class ScanCutter:
         return np.array(cuts, np.intp)
 
     def _step_ns(self, counts: PacketCounts, row: int) -> int:
-        """Return the time from the packet before a row to that row, ns."""
+        """Return the time from the previous packet to the packet of a row, ns."""
         if row:
             return counts.times.item(row) - counts.times.item(row - 1)
         assert self._last_ns is not None  # since the scan had packets
@@ -205,5 +206,5 @@ def _describe_missing_end(rule: Split) -> str:
             " was completed"
         )
     if isinstance(rule, Every):
-        return "no scan was completed by time"
-    return f"no scan was completed by {rule.name}"
+        return "no scan was completed"
+    return f"{rule.name} has not shown the end of a scan"

@@ -1,4 +1,4 @@
-"""Planar scans with ROS's names: the nearest return at each angle of an even grid."""
+"""Planar scans as in ROS: the nearest return at each angle of an even grid."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class LaserScan:
-    """A planar scan with ROS's names.
-
-    `ranges[i]` is the range at ``angle_min + i * angle_increment``, inf without a return.
+    """A planar scan with the attributes of the ROS message LaserScan.
 
     Attributes:
-        ranges, intensities: (n,) float32.
-        angle_min, angle_max, angle_increment: radians, counter-clockwise; ``angle_max = angle_min +
-            (n - 1) * angle_increment``.
-        time_increment: seconds from beam to beam, negative if the angle falls with time.
+        ranges: (n,) float32 metres; `ranges[i]` is the nearest return at the angle ``angle_min + i
+            * angle_increment``, inf without a return.
+        intensities: (n,) float32, 0 without a return.
+        angle_min: the first angle, radians, counter-clockwise.
+        angle_max: the last angle, ``angle_min + (n - 1) * angle_increment``.
+        angle_increment: the step between angles, radians.
+        time_increment: seconds from beam to beam; negative if the angle decreases with time.
         scan_time: seconds from scan to scan.
-        range_min, range_max: the limits of the sensor, metres.
+        range_min: the lowest range that the sensor measures, metres.
+        range_max: the greatest range that the sensor measures, metres.
         stamp_ns: the time at which `ranges[0]` was measured; `ranges[i]` was measured ``i *
             time_increment`` later.
         host_ns: the arrival time of the first packet, as in `Scan`.
@@ -50,10 +52,13 @@ def find_nearest_returns(
 ) -> tuple[Floats, Floats]:
     """Return the nearest return at each of `count` angles, and its intensity.
 
-    A return belongs to an angle if it is within half a step of it.
+    A return belongs to the angle nearest to its azimuth.
 
     Args:
-        first, step: the first angle, and the step between angles, radians.
+        points: the points.
+        count: the number of angles.
+        first: the first angle, radians.
+        step: the step between angles, radians.
 
     Returns:
         Ranges, (count,) metres, inf without a return; intensities, (count,), 0 without a return.
@@ -79,9 +84,9 @@ def find_nearest_returns(
 
 
 def unwrap_azimuths(points: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the azimuths and times of the points with a finite azimuth.
+    """Return the azimuths and times of the points with a finite azimuth, (k,) each.
 
-    Azimuths are unwrapped, radians. Times are in seconds since the stamp.
+    Azimuths are in radians, unwrapped. Times are in seconds since the stamp.
     """
     azimuths = points.azimuth.astype(np.float64)
     is_known = np.isfinite(azimuths)
@@ -91,8 +96,9 @@ def unwrap_azimuths(points: PointCloud) -> tuple[NDArray[np.float64], NDArray[np
 def fit_times(points: PointCloud, first: float, last: float) -> tuple[float, float]:
     """Return the time of a beam at azimuth `first`, and the seconds per radian.
 
-    Times are in seconds since the stamp. Both values follow from a straight line fitted to the
-    points. The line is shifted by whole turns so that most points lie between `first` and `last`.
+    Times are in seconds since the stamp. Both values come from a straight line that is fitted to
+    the azimuths and times of the points. The azimuths are shifted by whole turns, so that most of
+    them are between `first` and `last`.
     """
     azimuths, times = unwrap_azimuths(points)
     if len(azimuths) < 2:

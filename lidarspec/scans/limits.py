@@ -1,10 +1,10 @@
 """Limit the length and the size of a scan, so that it ends even if its end does not arrive.
 
-A scan takes at most twice as long as the slowest revolution, by the times of the packets. Its size
-is limited to twice the number of points of a scan, if that is constant. On a serial line, the limit
-is the number of bytes that the line carries in that time; otherwise it is `MAX_BYTES`. If packets
-are missing, and with them perhaps the end, the scan may become only slightly longer than the scan
-before.
+The duration of a scan, by the times of the packets, is limited to twice the slowest revolution. If
+the number of points of a scan is constant, its size is limited to twice this number. Otherwise its
+size is limited to the bytes that the serial line carries in the maximum duration, or to `MAX_BYTES`
+without a serial line. If packets are missing, the end may be missing with them, so the scan may
+then become only slightly longer than the previous scan.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every
 
-#: the time of the slowest revolution, if the sensor does not declare it.
+#: The duration of the slowest revolution, if the sensor does not declare it.
 SLOWEST_TURN_S = 1.0
-#: the lowest time limit if packets have arrival times, because arrival may pause.
+#: The lowest time limit if packets have only arrival times, because arrival may pause.
 MIN_LIMIT_S = 1.0
-#: the largest scan if neither points nor a serial line limit it.
+#: The size limit without a constant number of points and without a serial line.
 MAX_BYTES = 1 << 26
-#: how much longer than the last whole scan a scan with a gap may become, as a factor.
+#: A scan with a gap may become longer than the last whole scan by this factor.
 MAX_GROWTH = 1.125
 
 
 def longest_scan_s(sensor: SensorDescription) -> float | None:
-    """Return the seconds of the slowest scan; None if the sensor does not declare them."""
+    """Return the duration of the slowest scan, seconds; None if it is not declared."""
     if isinstance(sensor.scan, Every):
         return sensor.scan.seconds
     if sensor.turn:
@@ -39,8 +39,8 @@ class ScanLimits:
     """The limits of the scans of one sensor.
 
     Attributes:
-        seconds: the longest time that a scan takes.
-        longest_ns: the same in ns.
+        seconds: the maximum duration of a scan, seconds.
+        longest_ns: the maximum duration of a scan, ns.
         has_point_limit: whether the size is limited in points, not in bytes.
     """
 

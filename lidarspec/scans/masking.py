@@ -1,10 +1,9 @@
 """Find the masked sector of a rotating sensor, and mark the packets at it.
 
-The first revolutions of a stream show the sector.
-
-Packets pass at once until the angle leaps. They are then held until the leap recurs, which takes a
-revolution, or until all angles have been seen, so that the first scans are cut like all others.
-After the first whole revolution without a leap, or after a sector was found, no packets are held.
+The sector is found in the first revolutions of a stream. Packets are released at once until the
+angle leaps. They are then held until the leap recurs one revolution later, or until packets of all
+angles have arrived. The first scans are therefore cut in the same way as all others. No packets are
+held after a whole revolution without a leap, or after a sector was found.
 """
 
 from __future__ import annotations
@@ -27,23 +26,23 @@ from lidarspec.packets.packets import Packets, join_packets
 from lidarspec.scans.limits import SLOWEST_TURN_S
 from lidarspec.spec.sensor import SensorDescription
 
-#: the number of revolutions within which a leap has to recur.
+#: A leap has to recur within this number of revolutions.
 MAX_TURNS = 4
-#: the largest number of packets that are held.
+#: The maximum number of packets that are held.
 MAX_HELD = 1 << 15
 
 
 class Masking:
-    """The search for a masked sector, and the marking of packets at it.
+    """Searches for a masked sector, and marks the packets directly after it.
 
-    Packets have to be in order.
+    The packets have to be in order.
 
     Args:
         sensor: the sensor that sends the packets; its `AngleReader` has to be available.
 
     Attributes:
-        angle_before_sector: the angle of the last packet before the first marked one, in turns;
-            None before any packet.
+        angle_before_sector: the angle of the last packet before the first marked packet, in turns;
+            None if there was no packet.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -71,7 +70,10 @@ class Masking:
         return self._finder.sector
 
     def push(self, packets: Packets) -> list[Packets]:
-        """Return the packets that may be cut into scans now; at most two batches."""
+        """Add packets, and return a list of the packets that can now be cut into scans.
+
+        The list has at most two batches.
+        """
         if not len(packets):
             return []
         if self._is_settled:
@@ -96,15 +98,15 @@ class Masking:
         return [*map(self._remember_last, passed), *self._pass_on(held.take(slice(before, None)))]
 
     def finish(self) -> list[Packets]:
-        """Return the packets that are still held."""
+        """Return a list of the packets that are still held."""
         self._is_settled = True
         return self._release(None)
 
     def _pass_on(self, held: Packets) -> list[Packets]:
-        """Release packets, or hold them.
+        """Release or hold packets, and return a list of the released packets.
 
-        After a leap all packets are held from the one before the leap on, else only the last
-        packet.
+        After a leap, all packets from the last one before the leap on are held. Otherwise only the
+        last packet is held.
         """
         self._held = [held]
         if self._is_settled:
@@ -169,7 +171,7 @@ class Masking:
         """Return the angle from each packet to the next, (n,), in turns from 0 to 1.
 
         Args:
-            before: the angle of the packet before the first; None before any packet.
+            before: the angle of the previous packet; None if there was no packet.
         """
         assert self._finder is not None
         steps = np.diff(angles, prepend=angles[0] if before is None else before)
@@ -178,7 +180,7 @@ class Masking:
         return ahead
 
     def _remember_last(self, packets: Packets) -> Packets:
-        """Remember the angle and the index of the last packet, and return the packets."""
+        """Store the angle and the index of the last packet, and return the packets."""
         angles = self._reader.angles(packets.table)
         if angles is not None:
             self._marked_angle = float(angles[-1])
@@ -186,7 +188,7 @@ class Masking:
         return packets
 
     def _mark(self, packets: Packets) -> Packets:
-        """Return packets with the number before each that the masked sector leaves out."""
+        """Return packets with `masked`: the number of packets left out before each packet."""
         angles = self._reader.angles(packets.table)
         sector = self.sector
         if not self._has_marked:

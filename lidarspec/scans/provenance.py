@@ -20,8 +20,8 @@ class PointOrigin(NamedTuple):
         frame: the type of the frame.
         offset: the offset of its first byte in the input.
         host_ns: its arrival time, ns since 1970; 0 if unknown.
-        part: the index of the part with the point in the frame; 0 if frames have no parts.
-        number: the index of the point in the frame, or in that part.
+        part: the index of the part of the frame that contains the point; 0 if frames have no parts.
+        number: the index of the point in the part, or in the frame if it has no parts.
         data: the bytes of the frame. If the frame is encoded on the wire, these are the decoded
             bytes that contain its fields (`Frame.wire`).
     """
@@ -40,8 +40,10 @@ class PointRun(NamedTuple):
     Attributes:
         packets: the batch.
         points: the points of the batch.
-        start, stop: the indices of the run in `points`.
-        parts_before: the number of parts of the first frame in earlier batches.
+        start: the index in `points` of the first point of the run.
+        stop: the index in `points` after the last point of the run.
+        parts_before: the number of parts of the first frame of the batch that were in earlier
+            batches.
     """
 
     packets: Packets
@@ -52,7 +54,7 @@ class PointRun(NamedTuple):
 
 
 class Provenance:
-    """The frames that the points of a scan came from.
+    """Finds the frames that the points of a scan came from.
 
     Args:
         runs: the points of the scan, in stream order.
@@ -81,7 +83,7 @@ class Provenance:
         if self._indices is not None:
             size = len(self._indices)
         if not 0 <= point < size:
-            raise IndexError(f"point {point} of {size}")
+            raise IndexError(f"point {point} does not exist: the scan has {size} points")
         if self._indices is not None:
             point = int(self._indices[point])
         first = 0
@@ -120,7 +122,10 @@ def find_part(packets: Packets, row: int, parts_before: int) -> int:
     """Return the index of a packet among the parts of its frame, from 0.
 
     Args:
-        parts_before: the number of parts of the first frame in earlier batches.
+        packets: the batch.
+        row: the row of the packet.
+        parts_before: the number of parts of the first frame of the batch that were in earlier
+            batches.
     """
     _, rows = packets.frames
     if isinstance(rows, slice):

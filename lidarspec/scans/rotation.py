@@ -1,11 +1,11 @@
 """Find the rows at which a rotating angle passes a given angle.
 
-`WrapDetector` is for sensors with an unknown direction of rotation: `Rotation` finds it from the
-angles. `PassDetector` is for known directions, and for angles that skip the given angle.
+`WrapDetector` is for an unknown direction of rotation, which `Rotation` finds from the angles.
+`PassDetector` is for a known direction, and also finds leaps over the given angle.
 
-Both decide each row from the rows before it alone, so that the split into batches does not change
-the result. An angle has to move away from the given angle before it can pass it again, so that
-jitter is not counted as a second pass.
+Both classes decide about a row by this row and the rows before it, so that the division into
+batches does not change the result. An angle has to move away from the given angle before it can
+pass it again, so that jitter is not counted as a second pass.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from lidarspec.packets.masked_sector import JITTER
 
 Floats = NDArray[np.float64]
 
-#: how far an angle has to move away before it can pass again, in turns.
+#: An angle has to move away this far, in turns, before it can pass again.
 MIN_TURNS_AWAY = 1 / 8
-#: how far back an angle has to move to reverse the direction of rotation, in turns.
+#: The direction of rotation reverses when the angle has moved back this far, in turns.
 REVERSAL_TURNS = 0.5
-#: the number of rows that are searched together first; it doubles while nothing is found.
+#: The number of rows that are searched together at first; it doubles until a row is found.
 FIRST_CHUNK_ROWS = 64
 
 
 class Rotation:
-    """The direction in which an angle rotates.
+    """Finds the direction in which an angle rotates.
 
-    It is the direction of the last half turn; at the start, the direction of all steps so far.
+    The direction reverses when the angle has moved back far enough. The first direction is the
+    direction of all steps so far.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,7 @@ class Rotation:
     def push(self, steps: Floats) -> Floats:
         """Return the direction at each of the next steps, 1 or -1, (k,).
 
-        If all directions are equal, the length is 1.
+        If all directions are equal, the result has the shape (1,).
 
         Args:
             steps: steps of the angle, in turns, (k,), at least one.
@@ -54,11 +55,11 @@ class Rotation:
         return self._find_directions(totals)
 
     def _only_advances(self, total: float, steps: Floats) -> bool:
-        """Return whether the angle is farther than ever, without a step back afterwards.
+        """Return whether the angle is farther than ever before, and never steps back.
 
         Args:
-            total: the turns since the start, after the first step.
-            steps: the steps after the first.
+            total: the turns from the start to the first new step.
+            steps: the other new steps, in turns.
         """
         if self._direction * total < self._furthest:
             return False
@@ -68,7 +69,7 @@ class Rotation:
         """Return the direction at each total, (k,).
 
         Args:
-            totals: the turns since the start, (k,).
+            totals: the turns from the start to each new step, (k,).
         """
         directions = np.empty(len(totals))
         start = 0
@@ -98,7 +99,11 @@ class Rotation:
         return directions
 
     def _reverse(self, total: float) -> None:
-        """Reverse the direction, or set the first one from the turns since the start."""
+        """Reverse the direction, or set the first direction.
+
+        Args:
+            total: the turns from the start to this step.
+        """
         if self._direction:
             self._direction = -self._direction
         elif total > 0:
@@ -109,7 +114,7 @@ class Rotation:
 
 
 class WrapDetector:
-    """A detector of the rows at which an angle passes a given angle, in any direction."""
+    """Finds the rows at which an angle passes a given angle, in either direction."""
 
     def __init__(self) -> None:
         self._rotation = Rotation()
@@ -150,11 +155,12 @@ class WrapDetector:
     def _keep_armed(
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
-        """Return the passes before which the angle was away from the given angle.
+        """Return the passes before which the angle had moved away from the given angle.
 
         Args:
             passed: the rows of all passes.
-            behind: the angle after the given angle at each row.
+            behind: the angle at each row, measured from the given angle, (k,).
+            full: a whole turn in the unit of the angles.
         """
         armed = list[int]()
         start = 0
@@ -168,7 +174,7 @@ class WrapDetector:
 
 
 class PassDetector:
-    """A detector of the rows at which an angle passes a given angle, or skips it.
+    """Finds the rows at which an angle passes a given angle, or leaps over it.
 
     All angles are in turns.
 
@@ -189,7 +195,7 @@ class PassDetector:
         Args:
             at: the angle to pass.
             direction: 1 if angles grow, else -1.
-            angle: the angle of the row before; None before any row.
+            angle: the angle of the previous row; None if there was no row.
         """
         self._at = at
         self._direction = direction
@@ -219,11 +225,11 @@ class PassDetector:
 
 
 def previous_values(values: Floats, first: float | None) -> Floats:
-    """Return the value before each value.
+    """Return the previous value of each value, (k,).
 
     Args:
-        values: (k,).
-        first: the value before the first; None to use the first value itself.
+        values: the values, (k,).
+        first: the previous value of the first value; None to use the first value itself.
     """
     previous = np.empty_like(values)
     if first is None:
@@ -235,9 +241,9 @@ def previous_values(values: Floats, first: float | None) -> Floats:
 
 
 def _fold(angles: Floats, full: float) -> Floats:
-    """Return angles folded to [0, full), read-only.
+    """Return angles modulo a whole turn, in [0, full), as a read-only array.
 
-    The results equal those of `np.mod` and take a fraction of the time.
+    The result is the same as that of `np.mod`, but faster.
     """
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):
@@ -253,7 +259,12 @@ def _fold(angles: Floats, full: float) -> Floats:
 
 
 def _was_away(behind: Floats, full: float) -> bool:
-    """Return whether any angle is at least an eighth of a turn away from 0."""
+    """Return whether any angle is more than `MIN_TURNS_AWAY` away from 0.
+
+    Args:
+        behind: the angles, from 0 to `full`.
+        full: a whole turn in the unit of the angles.
+    """
     low = full * MIN_TURNS_AWAY
     high = full * (1 - MIN_TURNS_AWAY)
     if len(behind) and low < behind[len(behind) // 2] < high:

@@ -1,4 +1,4 @@
-"""Scans: the points of one revolution or frame period each."""
+"""`Scan`: the points of one revolution or frame period."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns
 from lidarspec.scans.provenance import Provenance
 from lidarspec.spec.sensor import SensorDescription
 
-#: the default name of the frame of reference: x forward, y left, z up (REP-103).
+#: The default name of the frame of reference, with x forward, y left and z up (REP-103).
 FRAME_ID = "laser"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scan:
-    """The points between two cuts: one revolution or frame period.
+    """The points of one revolution or frame period.
 
     Attributes:
         points: the points, in stream order.
-        rate_hz: scans per second, from the time to the next scan; nan if unknown, or if the scan is
-            not whole.
-        complete: whether both ends were seen and no packet is missing; the first and the last scan
-            of a stream are not complete.
+        rate_hz: scans per second, computed from the time between this scan and the next one; nan if
+            unknown, or if the scan is not whole.
+        complete: whether start and end have arrived and no packet is missing. The first and the
+            last scan of a stream are not complete.
         sensor: the sensor that measured the points.
-        whole: whether both ends were seen and at least half of the packets arrived.
-        imu: the samples of the IMU from the first point to the first point of the next scan; None
-            without an IMU, or if it has another clock.
+        whole: whether start, end and at least half of the packets have arrived.
+        imu: the samples of the IMU from the first point up to the first point of the next scan;
+            None without an IMU, or if its clock differs from the clock of the points.
         host_ns: the arrival time of the packet with the first point, int64 ns since 1970 by the
             clock of the computer; 0 if unknown.
         beams: the default number of beams of `to_laserscan`; None to use the number that the sensor
             declares, or the number of points.
         frame_id: the name of the frame of reference in ROS messages.
         number: the index of the scan in its file, if the file is read in pieces; else None.
-        mount: the position and rotation of the sensor on its carrier: the points are in the axes of
-            the carrier. None if they are in the axes of the sensor.
+        mount: the position and rotation of the sensor on its carrier, if the points are in the axes
+            of the carrier; None if they are in the axes of the sensor.
         provenance: finds the frame that a point came from.
     """
 
@@ -94,8 +94,8 @@ class Scan:
     def facts(self) -> dict[str, str]:
         """The origin of the points, as stored in files.
 
-        It has the keys `sensor`; `source`, the documents that define the format; `frame`, the
-        directions of x, y and z; and `calibration`, "nominal" or "own".
+        The keys are "sensor", the id of the sensor; "source", the documents that define its format;
+        "frame", the directions of x, y and z; and "calibration", which is "nominal" or "own".
         """
         directions = zip("xyz", find_axes(self.sensor), strict=True)
         return {
@@ -116,7 +116,7 @@ class Scan:
         return self.points.to_arrow(self.facts)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return the stream by which DuckDB, Polars and pandas read `to_arrow`."""
+        """Return the Arrow stream through which DuckDB, Polars and pandas read the points."""
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
@@ -138,9 +138,9 @@ class Scan:
 
         Args:
             beams: the number of angles; by default the attribute `beams`.
-            field: the first and the last angle, radians; by default the whole turn from -pi on. The
-                times of the beams are correct only if no scan begins inside the field;
-                `PlanarScans` finds a suitable field.
+            field: the first and the last angle, radians; by default a whole turn from -pi on. The
+                times of the beams are correct only if scans do not begin inside the field.
+                `PlanarScans` selects such a field.
 
         Raises:
             UsageError: if `beams` is not a positive whole number.
@@ -177,10 +177,10 @@ class Scan:
 
 
 def _check_count(count: Any, method: str) -> int:
-    """Return a number of sectors as an int.
+    """Return a number of sectors or beams as an int.
 
     Raises:
-        UsageError: if it is not a positive whole number.
+        UsageError: if the number is not a positive whole number.
     """
     is_whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
     if not is_whole or count < 1:

@@ -1,8 +1,8 @@
 """Find the ends of scans by the sensor's declared rule.
 
-Each end is before a point. A rule reads a column of the points, a field of the packets, a field of
-the rows of an array in them, or the time; `EndFinder` translates rows to points. The module
-`cutter` decides whether a scan ends there.
+Each end is between two points. A rule reads a column of the points, a field of the packets, a field
+in an array of the packets, or the time. `EndFinder` converts the rows of fields to the indices of
+points. The module `cutter` decides whether the scan ends there.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ScanEnd(NamedTuple):
         packet: the row of the packet that shows the end, which may have no points; None if a point
             shows the end.
         is_leap: whether the angle leaps by more than `MIN_TURNS_AWAY`, and twice as far as at the
-            end before. Then packets are missing there, or the value is not an angle.
+            previous end. If so, packets are missing there, or the value is not an angle.
     """
 
     point: int
@@ -51,7 +51,7 @@ class ScanEnd(NamedTuple):
 
 
 class EndFinder:
-    """The ends of scans in one stream of points.
+    """Finds the ends of scans in one stream of points.
 
     Args:
         sensor: the sensor that sends the stream.
@@ -76,12 +76,12 @@ class EndFinder:
     def use_sector(self, sector: Sector, angle: float | None) -> None:
         """Cut scans in a masked sector from now on.
 
-        A configured cut angle is kept.
+        If the user has configured an angle to cut at, it stays in use.
 
         Args:
             sector: the masked sector.
-            angle: the angle of the last packet before it was found, in turns; None before any
-                packet.
+            angle: the angle of the last packet before the sector was found, in turns; None if there
+                was no packet.
         """
         at = sector.middle
         if self._cut is not None:
@@ -91,7 +91,7 @@ class EndFinder:
         self._passes.restart(at, sector.direction, angle)
 
     def find(self, packets: Packets, points: EvaluatedPoints) -> list[ScanEnd]:
-        """Return the ends in a batch, ascending."""
+        """Return the ends in a batch of packets, in order."""
         rule = self._rule
         if self._passes is not None:
             return self._find_passes(self._passes, packets, points)
@@ -127,7 +127,12 @@ class EndFinder:
         return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
 
     def _cut_angle(self, rule: OnWrap, full: float) -> float:
-        """Return the angle at which scans are cut, in a unit in which a turn is `full`."""
+        """Return the angle at which scans are cut.
+
+        Args:
+            rule: the sensor's rule, which has the default angle.
+            full: a whole turn in the unit of the angle.
+        """
         if self._cut is None:
             return rule.at
         return self._cut * full
@@ -140,7 +145,7 @@ class EndFinder:
     def _find_passes(
         self, passes: PassDetector, packets: Packets, points: EvaluatedPoints
     ) -> list[ScanEnd]:
-        """Return the ends at which the angle of packets or rows passes an angle."""
+        """Return the ends at which the angle in a field passes the angle of `passes`."""
         if isinstance(self._rule, OnWrap):
             path = _make_own_path(packets, self._rule.name)
             column = _read_field(points, path)
@@ -161,7 +166,7 @@ class EndFinder:
         values: Floats,
         full: float | None,
     ) -> Indices:
-        """Return the rows that begin a scan by their value or the value before.
+        """Return the rows whose value, compared with the previous one, begins a scan.
 
         Args:
             values: the values of the rows.
@@ -185,7 +190,7 @@ class EndFinder:
         return np.flatnonzero(np.abs(steps) > rule.by)
 
     def _find_periods(self, rule: Every, packets: Packets, points: EvaluatedPoints) -> Indices:
-        """Return the packets with which a period begins."""
+        """Return the rows of the first packets of each period."""
         times = packets.time_ns[: points.ready]
         if not len(times):
             return np.empty(0, np.intp)
@@ -218,7 +223,7 @@ def _full_turn(packets: Packets, path: str) -> float | None:
 
 
 def _make_own_path(packets: Packets, path: str) -> str:
-    """Return the path of a field in the packets, from its path in the frame.
+    """Return the path of a field in the packets, given its path in the frame.
 
     The paths differ if the packets are parts of a frame.
     """
@@ -248,9 +253,9 @@ def _is_per_packet(column: Column) -> bool:
 
 
 def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices]:
-    """Return the values of a field row by row, and the first point of each row.
+    """Return the values of a field, and the index of the first point of each value.
 
-    Rows are in stream order. Rows of an array without points are left out.
+    Values are in stream order. Array elements without points are left out.
     """
     levels = 1 + max(
         (index for index, name in enumerate(column.axes) if name is not None), default=-1
@@ -277,7 +282,7 @@ def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices
 
 
 def first_points(points: EvaluatedPoints) -> Indices:
-    """Return the index of the first point of each packet, (ready,)."""
+    """Return the index of the first point of each evaluated packet, (points.ready,)."""
     points_per_packet = _sum_axes(points.counts, 1)
     return np.cumsum(points_per_packet) - points_per_packet
 
@@ -285,7 +290,8 @@ def first_points(points: EvaluatedPoints) -> Indices:
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
     """Return the sums over all axes but the first `axis_count`.
 
-    Axes with zero stride are multiplied instead of summed, which is faster.
+    An axis with zero stride is not summed: its first value is multiplied by its length, which is
+    faster.
     """
     times = 1
     while counts.ndim > axis_count:

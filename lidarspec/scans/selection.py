@@ -1,10 +1,12 @@
 """Select scans of a source by time or index, and parts of each scan.
 
-A `Selection` is a value. A `ScanSelector` applies it to the scans of one stream as they arrive, and
-reports when all selected scans have passed. `iter_received` selects bytes by their arrival time.
+A `Selection` describes the selected scans. A `ScanSelector` applies it to the scans of one stream
+as they arrive, and reports when all selected scans have passed. `iter_received` selects bytes by
+their arrival time.
 
-If a source can seek, the data before a slice is skipped without being read. Reading starts early
-enough that a whole scan comes before the slice, even if the clocks of sensor and host differ.
+If a source can seek, most of the data before the selected times is skipped without reading it.
+Reading starts early enough for a whole scan before the first selected time, even if the clocks of
+sensor and host drift apart.
 """
 
 from __future__ import annotations
@@ -25,16 +27,16 @@ from lidarspec.points.firings import RETURNS, Returns, choose_returns, take_retu
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: seconds from the first scan, or a date.
+#: A time, as seconds from the first scan or as a date.
 Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
-#: how many seconds before a slice reading starts.
+#: Reading starts this time before the first selected time.
 LEAD_S = 5.0
-#: how far the clocks of sensor and host may drift apart, as a share of the elapsed time.
+#: The maximum drift between the clocks of sensor and host, as a share of the elapsed time.
 MAX_CLOCK_DRIFT = 1e-3
-#: the shortest time that is skipped by seeking.
+#: The shortest time that is skipped by seeking.
 MIN_SKIP_S = 5.0
-#: times from this one on are dates; earlier times count from the start of the sensor.
+#: Later times are dates; earlier times count from the start of the sensor.
 MIN_DATE_NS = 10**18
 
 
@@ -45,22 +47,24 @@ class Selection:
     A scan is selected if `times`, `scans` and `every` all select it.
 
     Args:
-        times: the first time, and the time after the last one: seconds from the first scan, or a
-            `datetime`, in UTC if it has no zone; None leaves an end open.
-        scans: the index of the first scan, and the index after the last scan, counted from 0 with
-            incomplete scans: (5, 10) selects five; None leaves the end open.
+        times: a pair (start, end) of times; scans with start <= time < end are selected. A time is
+            a number of seconds from the first scan, or a `datetime`, in UTC if it has no zone. None
+            means no limit.
+        scans: a pair (start, end) of indices; scans with start <= index < end are selected. Indices
+            count from 0 and include incomplete scans. An end of None means no limit.
         every: the step between selected scans; 1 for all.
-        ranges: the least and the greatest range, metres. Points outside become invalid; their range
-            is -inf if they are nearer, and inf if they are farther (REP-117).
-        returns: one return of each firing: "first", "last" or "strongest"; "all" keeps all. The
-            choice is among the returns inside `ranges`.
-        columns: the names of the columns of the points, in this order; () for all.
-        time: the clock of the stamps and of `times`: "device", or "host" for the arrival time of
-            the first packet of a scan.
-        beams, frame_id: as in `Scan`.
+        ranges: the lowest and the greatest range, metres. All other points become invalid; their
+            range is -inf if they are nearer, and inf if they are farther (REP-117).
+        returns: the return of each firing to keep: "first", "last", "strongest", or "all" for all
+            returns. It is chosen among the returns inside `ranges`.
+        columns: the names of the columns of the points, in this order; () for all columns.
+        time: the clock of the stamps and of `times`: "device" for the sensor's clock, or "host" for
+            the arrival time of the first packet of a scan.
+        beams: the default number of beams, see `Scan`.
+        frame_id: the name of the frame of reference, see `Scan`.
 
     Raises:
-        UsageError: if the numbers cannot select any scan.
+        UsageError: if a limit is negative, or if no scan can be within the limits.
     """
 
     times: Times = (None, None)
@@ -104,14 +108,14 @@ class Selection:
 
 
 def _add_zone(moment: Moment | None) -> Moment | None:
-    """Return a time; a date without a zone becomes a date in UTC."""
+    """Return a time, with the zone UTC if it is a `datetime` without a zone."""
     if isinstance(moment, datetime) and moment.tzinfo is None:
         return moment.replace(tzinfo=UTC)
     return moment
 
 
 def _check_order(low: Any, high: Any) -> None:
-    """Raise UsageError unless an interval begins before it ends."""
+    """Raise UsageError unless `low` is less than `high`."""
     if isinstance(low, datetime) != isinstance(high, datetime):
         raise UsageError(f"expected two dates or two times, got {low} to {high}")
     if low > high:
@@ -120,7 +124,7 @@ def _check_order(low: Any, high: Any) -> None:
         raise UsageError(f"start and end are equal: {low}")
 
 
-#: selects all scans of a source.
+#: This selection has all scans of a source.
 EVERYTHING = Selection()
 
 
@@ -128,8 +132,9 @@ class TimeSlice:
     """The selected times of one stream.
 
     Attributes:
-        first, last: the first and the last time so far, ns; None before any.
-        ended: whether all further times are after the end of the slice.
+        first: the first time so far, ns; None if there was none.
+        last: the last time so far, ns; None if there was none.
+        ended: whether the end of the slice has passed, so that no later time is selected.
     """
 
     def __init__(self, times: Times) -> None:
@@ -139,7 +144,7 @@ class TimeSlice:
         self.last: int | None = None
 
     def holds(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask of the next times that are selected, (n,), and update the state.
+        """Return whether each of the next times is selected, (n,), and update the state.
 
         Args:
             at: the times, (n,) ns.
@@ -162,11 +167,11 @@ class TimeSlice:
     def missed_error(self, source: object, number: str = "data") -> UsageError:
         """Return the error to raise if no time of a source was selected.
 
-        It states the times that the source has.
+        The error states the first and the last time of the source.
 
         Args:
             source: the name of the source.
-            number: the items of the source, in words.
+            number: a description of the items that the source has, such as "12 scans,".
         """
         first = self.first or 0
         last = self.last or 0
@@ -174,8 +179,8 @@ class TimeSlice:
         if first > MIN_DATE_NS:
             dates = f" ({format_date(first)} to {format_date(last)})"
         text = (
-            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and the"
-            " selection is outside"
+            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}; the"
+            " selection is outside this range"
         )
         return suggest(UsageError(text), f"lidarspec info {quote(str(source))}")
 
@@ -187,9 +192,9 @@ class TimeSlice:
         return (self.ns(self._times[0]) or 0) - (self.first or 0)
 
     def ns(self, moment: Moment | None) -> int | None:
-        """Return a moment as a time of the stream, ns.
+        """Return one of the limits as a time of the stream, ns.
 
-        Returns None if the moment is None, or if it counts from a first time that is still unknown.
+        Returns None if there is no limit, or if it counts from a first time that is still unknown.
         """
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
@@ -234,13 +239,13 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
 
 
 class ScanSelector:
-    """A selection, applied to the scans of one stream.
+    """Applies a selection to the scans of one stream.
 
     Args:
         selection: the selection.
         source: the name of the source, for messages.
-        skip: skips the data of the source that arrived before a time, ns since 1970, and returns
-            whether it did; None if the source cannot seek.
+        skip: a function that skips the data of the source that arrived before a time, ns since
+            1970, and returns whether it did; None if the source cannot seek.
 
     Attributes:
         ended: whether all selected scans have passed.
@@ -263,10 +268,12 @@ class ScanSelector:
         self.slice = TimeSlice(selection.times)
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """Yield the selected parts of selected scans, and each None of the input.
+        """Yield the selected parts of selected scans.
+
+        A None in the input, which means that no scan has arrived in time, is yielded as well.
 
         Raises:
-            UsageError: if there were scans but none was selected.
+            UsageError: if there were scans, but none was selected.
         """
         for scan in scans:
             selected = None
@@ -308,13 +315,13 @@ class ScanSelector:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there were scans but none was selected."""
+        """Whether there were scans, but none was selected."""
         return self._seen > 0 and not self._selected
 
     def missing(self) -> UsageError:
         """Return the error to raise if no scan was selected.
 
-        It states the scans that the source has.
+        The error states the number or the times of the scans of the source.
         """
         if self._seen == 1:
             number = "1 scan"
@@ -325,7 +332,8 @@ class ScanSelector:
         if self._selection.is_timed:
             return self.slice.missed_error(self._source, f"{number},")
         return UsageError(
-            f"{self._source} has {number}, from 0 to {self._seen - 1}; the selection lies outside"
+            f"{self._source} has {number}, from 0 to {self._seen - 1}; the selection is outside"
+            " this range"
         )
 
     def _time(self, scan: Scan) -> int:
@@ -380,7 +388,7 @@ class ScanSelector:
 
 
 class _LimitedRanges(CloudColumns):
-    """The columns of a cloud in which points outside some ranges, metres, are invalid."""
+    """The columns of a cloud in which points outside an interval of ranges are invalid."""
 
     def __init__(self, cloud: PointCloud, near: float, far: float) -> None:
         super().__init__(cloud)

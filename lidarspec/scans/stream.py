@@ -1,8 +1,8 @@
-"""Make scans of batches of packets as they arrive.
+"""Make scans from batches of packets as they arrive.
 
-Packets are sorted (`packets.reorder`), marked at a masked sector (`masking`), evaluated to points,
-and cut (`cutter`). A `ScanStream` keeps the points of the scan that has not ended, and packets if
-their points depend on the next packets.
+Packets are sorted (`packets.reorder`). At a masked sector they are marked (`masking`). Their points
+are calculated and divided into scans (`cutter`). A `ScanStream` keeps the points of the scan that
+has not ended, and packets with points that depend on the next packets.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class ScanStart(NamedTuple):
     """The start of a scan.
 
     Attributes:
-        time_ns: the time of its first point, ns.
-        host_ns: the arrival time of the packet with that point, ns; 0 if unknown.
+        time_ns: the time of the first point of the scan, ns.
+        host_ns: the arrival time of the packet with the first point, ns; 0 if unknown.
     """
 
     time_ns: int
@@ -43,12 +43,12 @@ class ScanStart(NamedTuple):
 
 
 class ScanStream:
-    """The scans of one stream.
+    """Makes scans from the packets of one stream.
 
     Args:
         sensor: the sensor that sends the packets.
-        mount: the mount of the sensor; the scans are in the axes of its carrier.
-        imu: the samples of its IMU; they are added before the packets that arrived with them.
+        mount: the mount of the sensor; the scans are then in the axes of its carrier.
+        imu: the buffer of its IMU samples. Add samples before the packets that arrived with them.
     """
 
     def __init__(
@@ -86,13 +86,13 @@ class ScanStream:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle, without the points of the scan that has not ended.
 
-        The unpickled stream continues after that scan.
+        The unpickled stream omits this scan.
         """
         is_foreign = self._is_foreign or bool(self._runs)
         return {**vars(self), "_runs": [], "_is_foreign": is_foreign}
 
     def add(self, packets: Packets) -> list[Scan]:
-        """Return the scans that these packets complete."""
+        """Add packets, and return the scans that they complete."""
         if not len(packets):
             return []
         ordered = [packets]
@@ -101,7 +101,7 @@ class ScanStream:
         return self._add_ordered(ordered)
 
     def finish(self) -> list[Scan]:
-        """Return the scans that waited for more packets, and the last, partial scan."""
+        """Return the remaining scans; the last of them is incomplete."""
         scans = list[Scan]()
         if self._reorder is not None:
             scans += self._add_ordered(self._reorder.finish())
@@ -141,7 +141,7 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return the packets with points: these packets, or their parts.
+        """Return the packets that have points: these packets, or their parts.
 
         A frame without parts leaves no gap in the index.
         """
@@ -160,9 +160,10 @@ class ScanStream:
         return parts
 
     def _evaluate(self, packets: Packets, *, final: bool) -> list[Scan]:
-        """Return the scans that the points of some packets complete.
+        """Calculate the points of packets, and return the scans that they complete.
 
         Args:
+            packets: the packets, sorted and marked.
             final: whether no packets follow.
         """
         self._waiting = None
@@ -205,11 +206,12 @@ class ScanStream:
     def _close(
         self, following: ScanStart | None, *, whole: bool = False, complete: bool = False
     ) -> list[Scan]:
-        """Return the scan of the points so far; an empty list if there are no points.
+        """End the current scan, and return it in a list; the list is empty without points.
 
         Args:
-            following: the start of the next scan; None if it is unknown.
-            whole, complete: as in `Scan`.
+            following: the start of the next scan; None if unknown.
+            whole: the attribute of the scan.
+            complete: the attribute of the scan.
         """
         runs = self._runs
         start = self._start
@@ -254,7 +256,11 @@ class ScanStream:
 def _read_starts(
     packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
-    """Return the starts of scans at some points, in order; None past the end."""
+    """Return the starts of the scans that begin with some points; None past the end.
+
+    Args:
+        indices: the indices of the first points of scans in `points`, ascending.
+    """
     source = points.source
     known = [index for index in indices if index < source.size]
     starts: list[ScanStart | None] = [None] * len(indices)
@@ -270,7 +276,7 @@ def _read_starts(
 def iter_scans(
     sensor: SensorDescription, batches: Iterable[Packets], imu: WaitingSamples | None = None
 ) -> Iterator[Scan]:
-    """Yield every scan of the batches of one stream.
+    """Yield all scans of one stream.
 
     Args:
         imu: the IMU samples of the stream.
@@ -282,7 +288,7 @@ def iter_scans(
 
 
 def iter_released(scans: list[Scan]) -> Iterator[Scan]:
-    """Yield scans, and release each with its columns once it was yielded."""
+    """Yield scans, and keep no reference to a scan after it was yielded."""
     scans.reverse()
     while scans:
         yield scans.pop()

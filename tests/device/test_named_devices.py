@@ -419,4 +419,4 @@ def test_no_return_stays_none_and_keeps_its_direction() -> None:
 
 def test_the_text_of_a_mount() -> None:
     assert str(Mount(x=0.2, yaw_deg=90, inverted=True)) == "x=0.2, yaw_deg=90, inverted"
-    assert str(Mount()) == "as the sensor stands"
+    assert str(Mount()) == "no rotation or translation"

@@ -98,7 +98,7 @@ def test_missing_elements_are_named() -> None:
     for points, named in (
         (lambda f: Polar(range=f.columns[4].time, azimuth=0), r"columns\[4\]"),
         (lambda f: Polar(range=f.columns[0:2].time, azimuth=0), "index"),
-        (lambda f: Polar(range=(f.columns.time * 2)[0], azimuth=0), "fields"),
+        (lambda f: Polar(range=(f.columns.time * 2)[0], azimuth=0), "only a field"),
     ):
         with pytest.raises(SpecError, match=named):
             cloud_of(points, frame(1), engine="auto")

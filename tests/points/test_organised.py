@@ -116,12 +116,15 @@ def test_points_without_a_grid_are_refused() -> None:
             lambda: cloud_of(frame(0), frame(0)).organise(TURN),
             "column 0 occurs 2 times",
         ),
-        (lambda: cloud.organise(20), "column 20 exceeds the 20"),
-        (lambda: cloud[cloud.valid].organise(TURN), r"Polar\(..., column=...\)"),
-        (lambda: cloud.destagger([1, 2]), "expected shifts for 32 rows, got 2"),
+        (lambda: cloud.organise(20), "column 20 does not fit into 20 columns"),
+        (
+            lambda: cloud[cloud.valid].organise(TURN),
+            "requires organised points with column numbers",
+        ),
+        (lambda: cloud.destagger([1, 2]), "expected one shift for each of 32 rows, got 2"),
         (
             lambda: cloud[3:].destagger([1, 2]),
-            "expected shifts for points that are not organised, got 2",
+            "the points are not organised in rows and columns",
         ),
     ):
         with pytest.raises(UsageError, match=said):

@@ -494,11 +494,11 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
     [
         (
             lambda f: Polar(range=f.near, azimuth=f.first * ANGLES),
-            r"3 values matches near as well as with other\[\]: .*along\('other\[\]', ",
+            r"3 values has the length of several .*, near and other\[\]: .*along\('other\[\]', ",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=np.zeros(7)),
-            r"7 values matches no array of the frame: near 3, other 4, other\[\] 3",
+            r"7 values has the length of no array of the frame \(near 3, other 4, other\[\] 3\)",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
@@ -516,7 +516,7 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
             lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),
             r"along 'other(\[\])?', but none of their fields does",
         ),
-        (lambda f: Polar(range=f.first, azimuth=f.first.index), r"values inside an array"),
+        (lambda f: Polar(range=f.first, azimuth=f.first.index), r"a field inside an array"),
     ],
 )
 def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(

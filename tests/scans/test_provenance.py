@@ -103,7 +103,7 @@ def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None
 def test_points_that_a_scan_has_not_have_no_frame() -> None:
     scans, _ = scans_of(segments.SENSOR, frames_of(segments.SENSOR), FRAMES)
     for index in (-1, len(scans[0])):
-        with pytest.raises(IndexError, match=f"point {index} of"):
+        with pytest.raises(IndexError, match=f"point {index} does not exist"):
             scans[0].provenance(index)
 
 

@@ -78,12 +78,12 @@ def test_the_same_is_selected_wherever_scans_come_from(
     async def collected() -> list[Scan]:
         async with ls.open_async(recordings["pcap"], ID) as device:
             found = [scan async for scan in device.scans(select=select)]
-            with pytest.raises(UsageError, match="the selection lies outside"):
+            with pytest.raises(UsageError, match="the selection is outside this range"):
                 _ = [scan async for scan in device.scans(select=Selection(scans=(10_000, None)))]
             return found
 
     assert_same(asyncio.run(collected()), wanted)
-    with pytest.raises(UsageError, match=r"the data has .* the selection lies outside"):
+    with pytest.raises(UsageError, match=r"the data has .* the selection is outside this range"):
         list(ls.sensor(ID).scans(bytes(frames[0]) * 30, select=Selection(scans=(10, 12))))
 
 

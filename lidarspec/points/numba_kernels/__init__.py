@@ -1,16 +1,15 @@
 """Compute points and checksums by compiled code: an optional back end, which needs Numba.
 
-In: a `points.plan.Plan`. Out: an object that fills its columns, returned by `compile`; and
-the function that computes the checksums of a decoder, returned by `compile_sums`. Only
-``backend="jit"`` requires this package. Numba is imported with the first kernel that runs. Modules
-in reading order:
+`compile` returns an object that computes columns of a `points.plan.Plan`. `compile_sums` returns
+the function that computes the checksums for a decoder. Only ``backend="jit"`` requires this
+package. Numba is imported with the first kernel that runs. Modules in reading order:
 
-* `arithmetic`: the functions that kernels call; the only module that imports Numba on import.
-* `writer`: the source text of fields, tables and indices.
-* `source`: the source text of expressions and of a whole kernel.
-* `cache`: compiled code on disk.
+* `arithmetic`: the functions that kernels call. No other module imports Numba at its import.
+* `writer`: writes the source of fields, tables and indices.
+* `source`: writes the source of expressions and of a whole kernel.
+* `cache`: stores compiled code on disk.
 * `kernels`: compiles kernels, and calls them in one or more threads.
-* `checksums`: kernels for checksums that are an XOR of the contributions of bytes.
+* `checksums`: kernels for checksums that are an XOR of one value for each byte.
 """
 
 from __future__ import annotations

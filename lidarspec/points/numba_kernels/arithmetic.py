@@ -1,9 +1,9 @@
 """Functions that generated kernels call.
 
-They read bytes without bounds checks, compute sine and cosine in float32, and follow NumPy in
-special cases.
+The functions read bytes without bounds checks, compute sine and cosine in float32, and return the
+same results as NumPy for nan and infinity.
 
-This is the only module that imports Numba at import time; only generated kernels import it.
+This is the only module that imports Numba at its import. Only generated kernels import this module.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ INTEGERS = types.Array(types.int64, 1, "C", readonly=True)
 WORDS = types.Array(types.uint16, 1, "C", readonly=True)
 SINGLE_COLUMN = types.Array(types.float32, 1, "C")
 INTEGER_COLUMN = types.Array(types.int64, 1, "C")
-#: types of integer columns, by the name of their dtype.
+#: The types of integer columns, by the name of their dtype.
 INTEGER_COLUMNS = {
     f"{sign}int{bits}": types.Array(getattr(types, f"{sign}int{bits}"), 1, "C")
     for sign in ("", "u")
@@ -35,17 +35,18 @@ INTEGER_COLUMNS = {
 }
 INTEGER = types.int64
 
-#: added to and subtracted from a float64, it rounds to an integer; the sum has its lowest bit.
+#: Adding and subtracting this number rounds a float64 to an integer. The lowest bit of the sum is
+#: the lowest bit of the integer.
 _ROUNDING_CONSTANT = 6755399441055744.0
 _PI = math.pi
-#: largest float32 below pi.
+#: The largest float32 below pi.
 _BELOW_PI = np.nextafter(np.float32(_PI), np.float32(0))
 _MAX_SUBTRACTED_RAD = 1e6
 _IS_BIG = sys.byteorder == "big"
 
 
 def compile_kernel(stored, signature, **options):
-    """Return the decorator of a kernel, which compiles it or loads its stored code.
+    """Return a decorator that compiles a kernel, or loads its stored code.
 
     Args:
         stored: loads and saves the compiled code.
@@ -128,7 +129,7 @@ def assume_no_alias(context):
 
 @intrinsic
 def multiply_add(context, factor, other, added):
-    """Return a product plus a sum of float32, rounded once."""
+    """Return factor * other + added in float32, rounded once."""
 
     def make(target, builder, signature, args):
         return builder.fma(*args)
@@ -137,9 +138,10 @@ def multiply_add(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """Return intrinsics that load a float as float64: little-endian, big-endian.
+    """Return two intrinsics that load a float from bytes and convert it to float64.
 
-    They load from an index of bytes.
+    The first one loads little-endian floats, the second one big-endian floats. Their index is the
+    offset of the first byte.
 
     Args:
         bits: the size of the float.
@@ -227,7 +229,7 @@ def cos_sin(angle):
 
 @njit(forceinline=True, error_model="numpy")
 def modulo(a, b):
-    """Return np.mod; within one period no division is needed."""
+    """Return `np.mod`; if a is between -b and b, no division is needed."""
     if 0.0 <= a < b:
         return a
     if -b <= a < 0.0:
@@ -237,7 +239,7 @@ def modulo(a, b):
 
 @njit(forceinline=True)
 def minimum(a, b):
-    """Return np.minimum."""
+    """Return the same as `np.minimum`."""
     if a <= b or a != a:
         return a
     return b
@@ -245,7 +247,7 @@ def minimum(a, b):
 
 @njit(forceinline=True)
 def maximum(a, b):
-    """Return np.maximum."""
+    """Return the same as `np.maximum`."""
     if a >= b or a != a:
         return a
     return b
@@ -253,7 +255,7 @@ def maximum(a, b):
 
 @njit(forceinline=True)
 def replace_nan(a):
-    """Return np.nan_to_num."""
+    """Return the same as `np.nan_to_num`."""
     if a != a:
         return 0.0
     return min(max(a, -1.7976931348623157e308), 1.7976931348623157e308)
@@ -261,7 +263,7 @@ def replace_nan(a):
 
 @njit(forceinline=True)
 def mark_no_return(a):
-    """Return `conventions.returned_range`."""
+    """Return the same as `conventions.returned_range`."""
     if 0.0 < a < np.inf:
         return a
     return np.nan
@@ -269,7 +271,7 @@ def mark_no_return(a):
 
 @njit(forceinline=True)
 def look_up(table, index):
-    """Return an entry of a table; nan if the index is outside."""
+    """Return an entry of a table; nan if the index is out of range."""
     if 0 <= index < len(table):
         return at(table, np.int64(index))
     return np.nan
@@ -277,9 +279,9 @@ def look_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """Return the table row for an index.
+    """Return the number of the table row for an index.
 
-    Returns the last row, which is nan, if the index is outside.
+    If the index is out of range, this is the last row, which contains nan.
     """
     if 0 <= index < rows - 1:
         return np.int64(index)

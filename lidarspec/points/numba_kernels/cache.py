@@ -1,11 +1,11 @@
 """Store compiled kernels on disk between runs.
 
-The files are executed, so they are in a folder that only the user can access.
+The compiled code is executed, so the files are in a folder that only the user can access.
 
-A kernel is one file: a keyed digest (HMAC), followed by the pickle of the compiled code, which is
-loaded only if the digest is valid. The key is in a file that only the user can read; file names are
-derived from it too. So files that were left by another user, a full disk or a crash are never
-executed. If any check fails, the kernel is compiled again.
+The file of a kernel is a keyed digest (HMAC), followed by the pickle of the compiled code. The
+pickle is loaded only if the digest is valid. The key is in a file that only the user can read, and
+the names of the kernel files depend on the key. A file from another user, or a file that was not
+written completely, is therefore never executed. If a check fails, the kernel is compiled again.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from lidarspec.trusted_files import describe_sharing
 
 CACHE = "LIDARSPEC_CACHE"
 
-#: the size of the key and of a digest, bytes.
+#: The size of the key and of a digest, bytes.
 DIGEST_BYTES = 32
-#: permissions that a private file or folder must not have.
+#: The permissions that a private file or folder must not have.
 _SHARED_PERMISSIONS = stat.S_IRWXG | stat.S_IRWXO
-#: flags to open a file without following links or waiting for a pipe, if the system has them.
+#: The flags to open a file without following links or waiting for a pipe, if the system has them.
 _SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
@@ -42,7 +42,7 @@ class StoredKernel:
     """The stored code of one kernel, in the form that a Numba dispatcher expects.
 
     Args:
-        name: the name of the kernel, derived from all that its code depends on, except for the
+        name: the name of the kernel, a hash of everything that its code depends on, except for the
             processor.
     """
 
@@ -72,7 +72,7 @@ class StoredKernel:
         return None
 
     def save_overload(self, signature: object, result: Any) -> None:
-        """Store the compiled code; if that fails, warn once."""
+        """Store the compiled code; warn once if this fails."""
         from numba.core.serialize import dumps
 
         try:
@@ -86,7 +86,7 @@ class StoredKernel:
 
 
 def is_stored(name: str) -> bool:
-    """Return whether there is a file of this kernel, for any processor."""
+    """Return whether a file of this kernel exists, for any processor."""
     try:
         folder = _check_private(cache_folder())
         key = _read_key(folder)
@@ -96,7 +96,7 @@ def is_stored(name: str) -> bool:
 
 
 def cache_folder() -> Path:
-    """Return the folder of kernels: LIDARSPEC_CACHE, or the user's cache folder."""
+    """Return the folder of kernels: LIDARSPEC_CACHE, or a folder in the user's cache."""
     named = os.environ.get(CACHE)
     if named:
         return Path(named)
@@ -113,7 +113,7 @@ def _make_folder(folder: Path) -> Path:
     """Create the folder if it is missing, and return it.
 
     Raises:
-        OSError: if it cannot be created, or if other users can access it.
+        OSError: if the folder cannot be created, or if other users can access it.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=stat.S_IRWXU)
     return _check_private(folder)
@@ -123,7 +123,7 @@ def _check_private(folder: Path) -> Path:
     """Return a folder after checking that only the user can access it.
 
     Raises:
-        OSError: if it is missing, or if other users can access it.
+        OSError: if the folder is missing, or if other users can access it.
     """
     if reason := describe_sharing(folder.stat(), _SHARED_PERMISSIONS):
         raise PermissionError(f"{folder} {reason}")
@@ -153,7 +153,7 @@ def _compute_digest(key: bytes, name: str, data: bytes = b"") -> bytes:
 
 
 def _find_path(folder: Path, key: bytes, name: str, target: Any) -> Path:
-    """Return the file of a kernel, for the present processor."""
+    """Return the path of the file of a kernel for the processor of this computer."""
     processor = _compute_digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
     return folder / f"{_compute_digest(key, name).hex()}-{processor}"
 
@@ -174,7 +174,10 @@ def _read(path: Path) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a private file, which appears at its path only once it is complete."""
+    """Write a file that only the user can read.
+
+    The file appears at its path when it is complete.
+    """
     number, unfinished = tempfile.mkstemp(dir=path.parent)
     try:
         with open(number, "wb") as file:
@@ -187,5 +190,5 @@ def _write(path: Path, data: bytes) -> None:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Warn once in a run."""
+    """Warn of a text once in a run of the program."""
     warnings.warn(text, stacklevel=2)

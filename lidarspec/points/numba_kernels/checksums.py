@@ -1,13 +1,14 @@
 """Compute checksums of many frames by compiled code.
 
 A CRC is linear with respect to XOR, and so is every XOR of bytes or words. The checksum of a frame
-is the checksum of zeros, XORed with the share of each byte: the change that this byte alone makes.
-Each offset has a table of 256 shares, which is made by running the algorithm. If shares are equal
-to the bytes, words of eight bytes are XORed instead.
+is therefore the checksum of a frame of zeros, XORed with the share of each byte. The share of a
+byte is the change of the checksum that this byte alone causes. Each offset has a table of 256
+shares, which is made by running the algorithm. If shares are equal to the bytes, words of eight
+bytes are XORed instead.
 
-Long CRCs, and CRCs of more than 16 bits, are computed along the row, eight bytes at a time, by
-eight tables of 256 ("slicing by eight"). Four rows are computed side by side, because each step of
-a row depends on the step before.
+Long CRCs, and CRCs of more than 16 bits, are computed eight bytes at a time by eight tables of 256
+entries ("slicing by eight"). Four rows are computed side by side, because each step of a row
+depends on its previous step.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from lidarspec.points.numba_kernels.kernels import compile_source, import_numba
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 
-#: the number of frames of a layout from which its tables are made, and the smallest batch.
+#: The tables of a layout are made from this number of frames on; smaller batches are left to NumPy.
 MIN_FRAMES_SEEN = 4096
 MIN_BATCH_FRAMES = 64
-#: the largest number of covered bytes with tables that stay in the fastest caches.
+#: The tables of more covered bytes than this do not fit in the fastest caches.
 MAX_TABLE_BYTES = 128
-#: the size of a batch, bytes, from which a kernel along the rows is faster.
+#: The size of a batch in bytes, from which "slicing by eight" is faster.
 MIN_ROW_BATCH_BYTES = 1 << 14
 
 _SHARES_SOURCE = (
@@ -66,15 +67,15 @@ def kernel(rows, size, places, lows, highs, start, found):
 )
 
 
-#: names of the registers of the rows that are computed side by side.
+#: The names of the registers of the rows that are computed side by side.
 _REGISTERS = "abcd"
 
 
 def _write_slice(name: str) -> str:
-    """Return the text of a register after eight more bytes.
+    """Return the source text of the CRC register after eight more bytes.
 
     Args:
-        name: the register, already XORed with these bytes.
+        name: the name of the register, which was already XORed with the bytes.
     """
     return " ^ ".join(
         f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
@@ -82,7 +83,7 @@ def _write_slice(name: str) -> str:
 
 
 def _write_single(name: str) -> str:
-    """Return the text of a register after one more byte."""
+    """Return the source text of the CRC register after one more byte."""
     return (
         f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
         f" {(1 << 56) - 1})"
@@ -117,7 +118,7 @@ def _compute_along_rows(
     """Return the CRCs of some bytes of each row, (n,).
 
     Args:
-        spans: the first byte and the byte after the last, of each span.
+        spans: the covered bytes, as pairs of the first offset and the offset after the last.
     """
     table, _, _ = make_place_tables(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found = np.empty(len(rows), np.int64)
@@ -135,14 +136,16 @@ class _ByteShares:
     Attributes:
         seen: the number of frames so far.
         is_suited: whether the checksum can be computed by shares.
-        start: the checksum of zeros.
-        words: the offsets at which eight bytes are loaded at a time.
-        tables: for each of these bytes, its share by its value; 0 for bytes that are not covered or
-            that an earlier word has counted.
-        is_plain: whether all shares are equal to the bytes, in the low or the high byte of the
+        start: the checksum of a frame of zeros.
+        words: the offsets at which words of eight bytes are loaded.
+        tables: the share of each byte of these words, by its value. It is 0 for bytes that the
+            checksum does not cover, and for bytes that an earlier word contains.
+        is_plain: whether each share is the byte itself, in the low or the high byte of the
             checksum.
-        lows, highs: masks of the bytes in each word that are XORed into the low and the high byte
-            of the checksum, if `is_plain`.
+        lows: a mask for each word of the bytes that are XORed into the low byte of the checksum, if
+            `is_plain`.
+        highs: a mask for each word of the bytes that are XORed into the high byte of the checksum,
+            if `is_plain`.
     """
 
     def __init__(self, seal: Seal) -> None:

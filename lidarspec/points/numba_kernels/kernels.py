@@ -1,7 +1,7 @@
 """Compile or load kernels, and call them in one or more threads.
 
-Numba is not imported before a kernel is needed. The name of a kernel is a hash of all that its code
-depends on, except for the processor.
+Numba is imported when the first kernel is needed. The name of a kernel is a hash of everything that
+its code depends on, except for the processor.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction, Values
 
 THREADS = "LIDARSPEC_THREADS"
 
-#: the number of points for each thread: with fewer, another thread is not faster.
+#: A further thread is used only if each thread has at least this number of points.
 MIN_THREAD_POINTS = 1 << 16
 
-#: the size of the frames with their own kernel, by `points` function.
+#: The size of the frames that have their own kernel, for each `points` function.
 _OWN_KERNEL_BYTES: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
 
 
 class Kernel(ColumnMaker):
-    """The columns that a kernel computes, for frames of one layout.
+    """Computes columns of frames of one layout by a compiled kernel.
 
     Args:
         text: the source of the kernel and its arguments.
@@ -60,11 +60,11 @@ class Kernel(ColumnMaker):
 
     @functools.cached_property
     def is_compiled(self) -> bool:
-        """Whether the compiled code was loaded or on disk at the first access."""
+        """Whether the compiled code was loaded or on disk when this was first read."""
         return self.is_ready or is_code_available(self._text.source)
 
     def compile(self) -> None:
-        """Load or compile the code, unless it is loaded."""
+        """Load or compile the code, if this was not done before."""
         self._function = self._function or compile_source(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
@@ -92,7 +92,12 @@ class Kernel(ColumnMaker):
         )
 
     def _call_in_threads(self, count: int, run: Callable[[int, int], Any]) -> None:
-        """Call the kernel for all frames, in several threads if that is faster."""
+        """Call the kernel for all frames, in several threads if this is faster.
+
+        Args:
+            count: the number of frames.
+            run: calls the kernel for a number of frames from a first frame on.
+        """
         number = min(count_threads(), max(count * self._width // MIN_THREAD_POINTS, 1), count)
         if number < 2:
             if count:
@@ -109,9 +114,9 @@ class Kernel(ColumnMaker):
 
 
 def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
-    """Return an array, (n or 1, *shape), flat, and its length for one packet.
+    """Return a flattened array (n or 1, *shape), and the number of its values per packet.
 
-    The length is 0 if all packets share the numbers.
+    This number is 0 if all packets share the values.
     """
     full = (len(array), *shape)
     if array.shape != full:
@@ -122,10 +127,10 @@ def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.fl
 
 
 def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """Return the kernel for these columns; the plan keeps it.
+    """Return the kernel that computes columns of a plan; the plan keeps it.
 
     The first layout of a `points` function has its own kernel. All other layouts share kernels that
-    accept any length.
+    accept arrays of any length.
     """
     kernel = plan.kernels.get(names)
     if not isinstance(kernel, Kernel):
@@ -143,7 +148,7 @@ def count_threads() -> int:
     """Return the number of threads of a kernel: LIDARSPEC_THREADS, by default 1.
 
     Raises:
-        UsageError: if it is not an integer of at least 1.
+        UsageError: if LIDARSPEC_THREADS is not an integer of at least 1.
     """
     text = os.environ.get(THREADS, "1")
     if not text.isdecimal() or not int(text):
@@ -168,16 +173,16 @@ def import_numba() -> None:
     """Import Numba.
 
     Raises:
-        LibraryError: if it is missing, too old, or does not work here.
+        LibraryError: if Numba is missing, too old, or does not work here.
     """
     import_library("numba", "jit")
 
 
 @functools.cache
 def _make_module_name(source: str) -> str:
-    """Return a name that is derived from everything the compiled code depends on.
+    """Return a hash of everything that the compiled code depends on, as a module name.
 
-    The processor is not included, because the name of the file in the cache includes it.
+    The processor is not included, because the name of the file in the cache depends on it.
     """
     from importlib.metadata import version
 
@@ -195,9 +200,11 @@ def is_code_available(source: str) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def compile_source(source: str) -> Any:
-    """Return the compiled function of a kernel's source.
+    """Return the compiled function of a kernel.
 
-    If it cannot be stored on disk, it is compiled for this run only.
+    Args:
+        source: the source of the kernel. If the compiled code cannot be stored on disk, it is
+            compiled in each run.
     """
     name = _make_module_name(source)
     module = types.ModuleType(name)

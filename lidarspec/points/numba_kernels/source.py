@@ -1,14 +1,15 @@
 """Write the source of a kernel, which computes columns of a plan from the bytes of frames.
 
-The columns become one loop over packets, blocks and points. Each value is computed in the outermost
+A kernel is a nested loop over packets, blocks and points. Each value is computed in the outermost
 loop in which it is constant (`writer.KernelWriter`). `Expressions` writes traced expressions in
-float64 or float32. Expressions that a kernel cannot compute are computed by NumPy before, and
-passed to the kernel.
+float64 or float32. If a kernel cannot compute an expression, NumPy computes its values before the
+kernel is called, and they are passed as an argument.
 
-If each point needs the sine or cosine of its own angle, the points of a few packets go through
-scratch arrays to a second, flat loop, which the compiler vectorizes (`DeferredFloat`,
-`KernelAssembly`). Lengths and offsets that are the same in all frames are numbers in the text.
-Others are arguments, so that one kernel serves all lengths.
+If each point needs the sine or cosine of its own angle, intermediate values of the points of a few
+packets are stored in scratch arrays. A second, flat loop computes the columns from these arrays, so
+that the compiler can vectorize it (`DeferredFloat`, `KernelAssembly`). Lengths and offsets that are
+the same in all frames are numbers in the source. All others are arguments, so that one kernel can
+be used for arrays of any length.
 """
 
 from __future__ import annotations
@@ -48,24 +49,25 @@ from lidarspec.points.numba_kernels.writer import (
 from lidarspec.points.plan import Plan
 from lidarspec.spec.vocabulary import TableLookup, side_by_side
 
-#: the number of points in scratch arrays, which then stay in the fastest cache.
+#: The number of points in scratch arrays, so that the arrays fit in the fastest cache.
 SCRATCH_POINTS = 2048
-#: tables of angles up to this size, in half turns, are float32.
+#: A table of angles is float32 if no angle is larger than this, in half turns.
 MAX_SINGLE_HALF_TURNS = 0.125
-#: the largest number of bits of a distance for which float32 resolves its steps.
+#: The largest number of bits of a distance for which float32 can represent all values.
 MAX_DISTANCE_BITS = 21
 
 
 class Beam(NamedTuple):
     """A coordinate of points along beams.
 
-    It is a measured distance times an entry of a table for the direction, plus an entry of a table
-    for the start.
+    The coordinate is a measured distance multiplied by an entry of a table of directions, plus an
+    entry of a table of starting points.
 
     Attributes:
-        distance: the raw distance as sent, or nan.
-        direction, start: the table rows.
-        step: metres in one step of the raw distance.
+        distance: the raw distance; nan without a return.
+        direction: the row of the table of directions.
+        start: the row of the table of starting points.
+        step: the distance of a raw value of 1, metres.
     """
 
     distance: Node
@@ -75,9 +77,10 @@ class Beam(NamedTuple):
 
 
 def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """Return the beam that a sum describes.
+    """Return a sum as a `Beam`.
 
-    Returns None for other sums, and if float32 does not resolve the steps of the distance.
+    Returns None if the sum does not have this form, or if the raw distance has too many bits for
+    float32.
     """
     if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
         return None
@@ -110,7 +113,7 @@ def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
 class DeferredFloat:
     """A product or sum of float32 values that is computed in the flat loop.
 
-    At least one of the values depends on the sine or cosine of a point's own angle.
+    At least one operand depends on the sine or cosine of an angle of each point.
 
     Attributes:
         sign: the operator, "*", "+" or "-".
@@ -127,7 +130,7 @@ class Trig:
 
     Attributes:
         name: "cos" or "sin".
-        angle: the number of the angle.
+        angle: the index of the angle in `KernelWriter.angles`.
     """
 
     name: str
@@ -135,7 +138,7 @@ class Trig:
 
 
 class Expressions(KernelWriter):
-    """A writer of traced expressions into the loops."""
+    """Writes traced expressions into the loops."""
 
     def double(self, value: Any, depth: int = 0) -> KernelValue:
         """Return an expression in float64, or a condition."""
@@ -190,7 +193,7 @@ class Expressions(KernelWriter):
     def is_shared(self, node: Node) -> bool:
         """Return whether an expression depends only on frames of other types.
 
-        NumPy computes it then, usually once for all packets.
+        NumPy computes such an expression, usually once for all packets.
         """
         return self.once(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
 
@@ -280,8 +283,10 @@ class Expressions(KernelWriter):
         """Return an expression in float32: a `KernelValue`, or a `DeferredFloat`.
 
         Args:
-            exact: whether it is rounded once, as in the reference evaluator.
-            root: whether it is a coordinate, whose sums may be computed in float32.
+            exact: whether the value is computed in float64 and rounded once, as in the reference
+                evaluator.
+            root: whether the expression is a coordinate. Sums of coordinates may be computed in
+                float32.
         """
         if not isinstance(value, Node):
             return self.constant(value, len(self.shape), "float32")
@@ -316,8 +321,8 @@ class Expressions(KernelWriter):
     def _write_along_beam(self, beam: Beam) -> KernelValue | None:
         """Return a coordinate along a beam, rounded once.
 
-        It is the raw distance times a direction in two parts, plus the start of the beam. Returns
-        None if only NumPy can read these.
+        The direction is split into two float32 numbers for more precision. Returns None if only
+        NumPy can read the distance or the rows.
         """
         sent = self._write_distance(beam.distance, raw=True)
         table = beam.direction.args[1]
@@ -340,11 +345,11 @@ class Expressions(KernelWriter):
     def _write_distance(self, node: Node, *, raw: bool = False) -> KernelValue | None:
         """Return a distance in float32.
 
-        It is nan without a return, or if a condition marks the point as invalid. Returns None for
-        other expressions, and if float64 is required.
+        The distance is nan without a return, or if a condition marks the point as invalid. Returns
+        None if the expression is not a distance, or if it requires float64.
 
         Args:
-            raw: whether the distance is not scaled to metres.
+            raw: whether to return the raw value, not metres.
         """
         if not is_full(node, self.width):
             return None
@@ -384,7 +389,7 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """Return a product or sum; deferred to the flat loop if an operand is."""
+        """Return a product or sum; a `DeferredFloat` if an operand is one."""
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
@@ -412,7 +417,7 @@ class Expressions(KernelWriter):
         return self.look_up(node, source, np.float32, 1.0)
 
     def angle_of(self, node: Node) -> int:
-        """Return the number of an angle; the flat loop computes its cosine or sine."""
+        """Return the index of an angle in `angles`; add the angle on first use."""
 
         def make() -> int:
             self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
@@ -421,7 +426,11 @@ class Expressions(KernelWriter):
         return int(self.once(("angle", node), make))
 
     def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
-        """Return an angle times a factor that converts it to half turns, in float64."""
+        """Return an angle in half turns, in float64.
+
+        Args:
+            factor: converts the angle to half turns.
+        """
         if not isinstance(value, Node):
             return self.constant(np.asarray(value) * factor, depth)
         if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
@@ -464,7 +473,10 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return an angle of one field from a table, in float32 if that is precise enough."""
+        """Return an angle of one field from a lookup table; None without a table.
+
+        The table is float32 if this is precise enough.
+        """
         values = list_possible_values(node, self.layout.leaves)
         if values is None:
             return None
@@ -477,7 +489,7 @@ class Expressions(KernelWriter):
 
 
 def _split_halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return numbers as the sum of two float32 arrays, for more precision."""
+    """Return numbers as two float32 arrays; their sum has more precision than one."""
     high = values.astype(np.float32)
     return high, (values - high).astype(np.float32)
 
@@ -517,7 +529,7 @@ class KernelText:
 
 
 class KernelAssembly:
-    """The lines of a kernel that store columns, in its loops or in the flat loop."""
+    """Writes the lines of a kernel that store columns, in the nested or the flat loop."""
 
     def __init__(self, writer: Expressions) -> None:
         self.writer = writer
@@ -533,7 +545,7 @@ class KernelAssembly:
             self.flat.append(f"put(out_{name}, o, {self.text(value)})")
 
     def together(self, values: Mapping[str, Any]) -> None:
-        """Add the lines that store coordinates, where one nan makes all coordinates nan."""
+        """Add the lines that store x, y and z; if one of them is nan, all become nan."""
         if all(isinstance(value, KernelValue) for value in values.values()):
             lines = self.writer.lines[-1]
             texts = {name: value.text for name, value in values.items()}
@@ -557,7 +569,7 @@ class KernelAssembly:
         return self._store(value, "float32")
 
     def _store(self, value: KernelValue, kind: str) -> str:
-        """Store a value of the loops in a scratch array; return its text in the flat loop."""
+        """Add a scratch array for a value; return the text that reads it in the flat loop."""
         if value.text not in self._kept:
             name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")
@@ -607,7 +619,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
 
 
 def _find_cos_sin_angles(expressions: Iterable[Any]) -> set[Node]:
-    """Return the angles with both their cosine and their sine in the expressions."""
+    """Return the angles of which both cosine and sine are in the expressions."""
     nodes = list(traverse(*expressions))
     cosines, sines = (
         {node.args[0] for node in nodes if node.function is function}
@@ -639,7 +651,7 @@ def _write_function(
     turns: list[str],
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
-    """Return the text of the function: its signature and its loops."""
+    """Return the source of the function with its signature and its loops."""
     width = writer.number(writer.width)
     if turns:
         held = writer.number(max(SCRATCH_POINTS // writer.width, 1))
@@ -687,7 +699,7 @@ def _write_function(
 
 
 def _write_loops(writer: KernelWriter, width: str) -> list[str]:
-    """Return the lines for a packet: its own values, then the loops over its arrays."""
+    """Return the lines inside the loop over packets."""
     lines = [*writer.lines[1]]
     depth = 0
     for level in range(2, writer.inner + 1):

@@ -1,12 +1,12 @@
-"""Write fields, tables, constants and indices as text in the loops of a kernel.
+"""Write fields, tables, constants and indices into the source of a kernel.
 
 Each value is computed in the outermost loop in which it is constant.
 
-A `KernelValue` is the text of an expression, and the loop in which it varies. `KernelWriter` keeps
-the lines of each loop, the arguments of the kernel, and the values written before, so that no value
-is computed twice. A field is an expression of its bytes (`write_integer`). A function of one field
-is looked up in a table, or computed if the table is linear (`LinearTable`). `TEMPLATES` are NumPy's
-functions of numbers.
+A `KernelValue` is the text of an expression, with the loop in which its value varies.
+`KernelWriter` keeps the lines of each loop, the arguments of the kernel, and the values that it has
+written, so that no value is computed twice. A field is an expression of its bytes
+(`write_integer`). A function of one field is looked up in a table, or computed if the table is
+linear (`LinearTable`). `TEMPLATES` has the text of NumPy's functions.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SIGNS = {
 }
 _SIGNS |= {np.less: "<", np.less_equal: "<=", np.greater: ">", np.greater_equal: ">="}
 
-#: the text of NumPy's functions of numbers in a kernel; NumPy itself computes all other functions.
+#: The text of NumPy's functions in a kernel. NumPy itself computes all other functions.
 TEMPLATES: dict[Any, str] = {
     **{function: f"({{}} {sign} {{}})" for function, sign in _SIGNS.items()},
     **{
@@ -66,7 +66,7 @@ TEMPLATES: dict[Any, str] = {
     **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
 
-#: the largest number of operations of an expression that is computed instead of looked up.
+#: An expression with more operations than this is looked up in a table.
 MAX_COMPUTED_OPERATIONS = 8
 
 
@@ -82,10 +82,11 @@ def write_integer(leaf: Leaf, byte: Any) -> str | None:
     """Return the raw value of a field as an expression of its bytes.
 
     Args:
-        byte: returns the expression of the byte at an offset.
+        leaf: the field.
+        byte: a function that returns the expression of the byte at an offset.
 
     Returns:
-        None if there is no simple expression.
+        The text of the expression; None if there is no simple expression.
     """
     if len(leaf.shape) > len(leaf.strides) or (leaf.wire is not None and leaf.wire.kind == "f"):
         return None
@@ -114,11 +115,11 @@ def write_integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class LinearTable:
-    """A table with values that are linear in the raw value, from `low` to `high`.
+    """A table with values that are a linear function of the raw value.
 
     Attributes:
-        slope, start: the value is ``slope * raw + start``.
-        low, high: the limits of the raw value; None without a limit.
+        slope, start: the coefficients; the value is ``slope * raw + start``.
+        low, high: the lowest and the highest raw value of the linear part; None without a limit.
         other: the value for all other raw values, nan or inf.
         exact: whether the arithmetic has to be float64.
     """
@@ -160,8 +161,8 @@ def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable |
 
     Args:
         values: the values of the table.
-        exact: whether all values have to be equal; else they may differ by a unit in the last
-            place.
+        exact: whether the values of the function have to be the same as in the table. If not, they
+            may differ by a unit in the last place.
     """
     field_window = find_window(leaf)
     assert field_window is not None
@@ -201,10 +202,10 @@ def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable |
 
 @dataclass(frozen=True)
 class KernelValue:
-    """The text of an expression in a kernel, and the loop in which it varies.
+    """The text of an expression in a kernel, and the loop in which its value varies.
 
-    The level is 0 for a constant, 1 for the loop over packets, 2 for the loop over the first array,
-    and so on.
+    The level is 0 for a constant, 1 for the loop over packets, 2 for the loop over the outermost
+    array, and so on.
     """
 
     text: str
@@ -213,12 +214,12 @@ class KernelValue:
 
 @dataclass
 class KernelArguments:
-    """The arguments of a kernel, apart from the bytes.
+    """The arguments of a kernel in addition to the bytes of the frames.
 
     Attributes:
         arrays: arrays that do not depend on data.
         numbers: lengths and offsets that differ from layout to layout.
-        nodes: nodes with values that NumPy computes before.
+        nodes: the nodes whose values NumPy computes before the kernel is called.
     """
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
@@ -227,10 +228,11 @@ class KernelArguments:
 
 
 def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
-    """Return the position of a field of unsigned contiguous bits in up to four bytes.
+    """Return the position of an unsigned field in at most four bytes.
 
-    The position is byte order, first byte, number of bytes and lowest bit. Returns None for other
-    fields.
+    Returns:
+        The byte order, the first byte, the number of bytes and the lowest bit. None if the bits of
+        the field are not contiguous, or not in at most four bytes.
     """
     if len(leaf.shape) > len(leaf.strides):
         return None
@@ -251,8 +253,9 @@ def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
 def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
     """Return the aligned 4-byte little-endian word that contains a field.
 
-    The word is given as its offset, and the shift and mask of the field. Returns None if no such
-    word exists.
+    Returns:
+        The offset of the word, and the shift and mask of the field in it. None if there is no such
+        word.
     """
     run = find_run(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
@@ -277,7 +280,7 @@ def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
 
 
 class KernelWriter:
-    """A writer of values into the loops of a kernel.
+    """Writes values into the loops of a kernel.
 
     Args:
         layout: the layout of the frames.
@@ -307,20 +310,20 @@ class KernelWriter:
         self._made = 0
 
     def number(self, value: int) -> str:
-        """Return the text of a length or offset; an argument if it may vary."""
+        """Return the text of a length or offset; it is an argument if it may vary."""
         if not self.varying or value in (0, 1):
             return str(value)
         self.wanted.numbers.append(value)
         return f"n{len(self.wanted.numbers) - 1}"
 
     def once(self, name: Any, make: Callable[[], Any]) -> Any:
-        """Return the value with a key; make it on first use."""
+        """Return the value that is stored under a key; make it on first use."""
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
 
     def let(self, level: int, text: str) -> KernelValue:
-        """Add a variable to a loop, and return it."""
+        """Add a line that assigns a variable to a loop, and return the variable."""
         self._made += 1
         self.lines[level].append(f"v{self._made} = {text}")
         return KernelValue(f"v{self._made}", level)
@@ -341,7 +344,7 @@ class KernelWriter:
         return " + ".join(parts) or "0"
 
     def array(self, values: NDArray[Any]) -> str:
-        """Add an array that does not depend on data as a flat argument; return its name."""
+        """Add a constant array to the arguments, flattened, and return its name."""
         flat = np.ascontiguousarray(values).reshape(-1)
         return str(self.once(("array", id(values)), lambda: (self._add_array(flat), values))[0])
 
@@ -350,7 +353,7 @@ class KernelWriter:
         return f"c{len(self.wanted.arrays) - 1}"
 
     def constant(self, value: Any, depth: int, kind: str = "float64") -> KernelValue:
-        """Return a number, or an element of an array that all packets share."""
+        """Return the text of a constant number, or of an element of a constant array."""
         array = np.asarray(value)
         if array.size == 1:
             number = (
@@ -368,7 +371,11 @@ class KernelWriter:
         return element
 
     def add_argument(self, node: Node) -> KernelValue:
-        """Add the value of a node, computed by NumPy, as an argument; return its element."""
+        """Add the values of a node, computed by NumPy, to the arguments.
+
+        Returns:
+            The text of the element in the current loop.
+        """
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)
@@ -384,7 +391,7 @@ class KernelWriter:
         return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
 
     def raw(self, leaf: Leaf) -> KernelValue | None:
-        """Return the raw value of a field; None if only NumPy can read it."""
+        """Return the text of a field's raw value; None if only NumPy can read the field."""
         if leaf.info.path not in self._known:
             self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
@@ -412,13 +419,16 @@ class KernelWriter:
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def byte(self, leaf: Leaf, offset: int) -> KernelValue:
-        """Return a byte at an offset of an array's element, or of the frame."""
+        """Return the text of a byte at an offset in an array element, or in the frame."""
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:
-        """Return the value that a function of `arithmetic` reads at an offset.
+        """Return the text of a call that reads a value at an offset.
 
-        The offset is relative to the element of an array, or to the frame.
+        The offset counts from the start of the array element, or of the frame.
+
+        Args:
+            reader: the name of the function in `arithmetic`.
         """
         shape = leaf.shape[: len(leaf.strides)]
         level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
@@ -450,7 +460,8 @@ class KernelWriter:
     def _has_fixed_offset(self, leaf: Leaf) -> bool:
         """Return whether a field has the same offset in all frames.
 
-        It is before all arrays of varying length, or in the first element of the first of them.
+        This is the case before all arrays of varying length, and in the first element of the first
+        of these arrays.
         """
         leaves = self.layout.leaves.values()
         found = [
@@ -463,7 +474,7 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Return an expression of one field from a table; None without a window."""
+        """Return the text of a lookup of an expression of one field; None without a window."""
         leaf = self.layout.leaves.get(source.path)
         field_window = find_window(leaf) if leaf is not None else None
         if leaf is None or field_window is None:
@@ -499,9 +510,9 @@ class KernelWriter:
         return f"({first} | {self.byte(leaf, field_window.offset + 1).text} << 8)"
 
     def look_up_trig(self, node: Node, leaf: Leaf) -> KernelValue:
-        """Return a cosine or sine from a table that has both side by side.
+        """Return the text of a lookup of a cosine or sine.
 
-        Both are then loaded together.
+        The table has cosine and sine side by side, so that both are loaded together.
         """
         name = ("kernel", "both", leaf.info, leaf.size, make_key(node.args[0]))
         if name not in self._tables:

@@ -1,11 +1,10 @@
 """Compute points with NumPy alone.
 
-This back end compiles the columns of a plan to calls on arrays that stay in the cache.
-
-In: a `points.plan.Plan`. Out: an object that fills its columns, returned by `compile`. Modules in
+This back end compiles the columns of a plan to NumPy calls on small arrays that fit in the cache of
+the processor. `compile` returns an object that computes columns of a `points.plan.Plan`. Modules in
 reading order:
 
-* `program`: calls on registers, chunk by chunk.
+* `program`: runs NumPy calls on registers, chunk by chunk.
 * `compiler`: compiles expressions to the steps of a program.
 """
 
@@ -40,7 +39,8 @@ def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]
 def describe(plan: Plan) -> list[str]:
     """Return a description of a plan as lines of text.
 
-    They show the shape, the values computed for each packet, and the calls for each chunk.
+    The lines show the shape of the points, the values that are computed for each packet, and the
+    calls for each chunk.
     """
     names = tuple(
         name

@@ -1,12 +1,12 @@
 """Compile the expressions of a plan to the steps of a program.
 
 Each step is one NumPy call for a chunk of packets. An expression of one field in at most two bytes
-is a lookup table (`points.lookup_tables`). Values that are not full (with one value for a packet or
-block instead of a value for each point) are evaluated by the reference evaluator for the whole
-batch and broadcast. All other expressions are the NumPy calls as written.
+becomes a lookup table (`points.lookup_tables`). Values that are not full, which have one value for
+each packet or block and not for each point, are evaluated by the reference evaluator for the whole
+batch, and then broadcast. All other expressions become the NumPy calls that the plugin wrote.
 
-Columns that are not exact may be computed in another order: products, offsets, cosines and sines
-are float32, and the terms of a sum that are not full are added before they are broadcast.
+Columns that need not be exact may be computed in another order: products, offsets, cosines and
+sines are float32, and the terms of a sum that are not full are added before they are broadcast.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from lidarspec.spec.vocabulary import row_numbers
 
 TURN_RAD = 2 * np.pi
 
-#: functions that are faster than a lookup in a table of 65,536 float64 numbers.
+#: Functions that are faster than a lookup in a table of 65,536 float64 numbers.
 _FASTER_THAN_TABLE = {function for function in CHEAP if isinstance(function, np.ufunc)}
 
 
 class Compiler:
-    """A compiler of expressions, which appends steps to a program.
+    """Compiles expressions by appending steps to a program.
 
     Each method that compiles an expression returns the register of its result.
 
     Attributes:
-        program: the program, with an output for each column added.
+        program: the program, with an output for each column that was added.
         low: the nodes that are not full and that the program reads.
     """
 
@@ -64,8 +64,8 @@ class Compiler:
 
         Args:
             kind: "single" or "double".
-            exact: whether each operation is computed in float64 as it is written; else products may
-                be float32, and sums in another order.
+            exact: whether operations are computed in float64 in the written order. If not, products
+                may be float32, and sums may have another order.
         """
         self._is_exact = exact
         if kind == "single":
@@ -80,7 +80,7 @@ class Compiler:
         self.program.outputs[name] = self._load_raw(leaf, kind)
 
     def _make_once(self, name: Any, make: Callable[[], int]) -> int:
-        """Return the register with a name; make it on first use."""
+        """Return the register that is stored under a key; make it on first use."""
         if name not in self._registers:
             self._registers[name] = make()
         return self._registers[name]
@@ -111,7 +111,10 @@ class Compiler:
         )
 
     def _compile_product(self, node: Node) -> int | None:
-        """Compile a product, an offset, a cosine or a sine to float32; None otherwise."""
+        """Compile a product, an offset, a cosine or a sine to float32.
+
+        Returns None for all other expressions.
+        """
         if node.kind != "call":
             return None
         name = node.function.__name__
@@ -124,7 +127,7 @@ class Compiler:
         return None
 
     def _compile_factor(self, value: Any) -> Callable[[ProgramRun], Any]:
-        """Return a factor of a float32 product: a number or a register."""
+        """Return a function that reads a factor of a float32 product."""
         if not isinstance(value, Node) and np.size(value) == 1:
             return _make_constant(np.float32(np.asarray(value).reshape(())))
         if is_full(value, self._width):
@@ -145,7 +148,7 @@ class Compiler:
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
         """Compile the cosine or sine of a sum of angles that are not full.
 
-        The angle addition theorem avoids a trigonometric function for each point.
+        The angle addition theorem needs no trigonometric function for each point.
         """
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
@@ -170,7 +173,7 @@ class Compiler:
         return self.program.step(f"{function.__name__} by addition", "single", run)
 
     def _compile_full_angle(self, value: Node) -> int:
-        """Compile an angle to float32, folded to half a turn before it loses precision."""
+        """Compile an angle to float32, after reducing it to at most half a turn."""
         angle = RegisterRead(self._compile_double(value))
         scratch = RegisterRead(self.program.register("double"))
 
@@ -207,7 +210,10 @@ class Compiler:
         return register
 
     def _compile_lookup(self, node: Node, kind: str) -> int | None:
-        """Compile table rows or an expression of one field; return None otherwise."""
+        """Compile a lookup of table rows or of one field.
+
+        Returns None for all other expressions.
+        """
         if node.kind == "rows":
             return self._look_up_rows(node, kind)
         return self._compile_field(node, kind)
@@ -247,7 +253,7 @@ class Compiler:
     def _make_table(
         self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str
     ) -> NDArray[Any]:
-        """Return the values of an expression for each value of its window."""
+        """Return the value of an expression for each value of its window."""
         name = (
             kind,
             field_window.offset - leaf.offset,
@@ -262,7 +268,7 @@ class Compiler:
         return self._tables[name]
 
     def _load_whole(self, leaf: Leaf, kind: str) -> int | None:
-        """Load a field in its unit; return None if that requires float64 first."""
+        """Load a field in its unit; return None if this requires float64."""
         info = leaf.info
         assert info.dtype is not None
         if kind == "single" and (info.dtype.itemsize > 4 or (info.scaled and self._is_exact)):
@@ -326,9 +332,9 @@ class Compiler:
         return self.program.step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
-        """Compile a sum: the terms that are not full first, then the full terms.
+        """Compile a sum, with the terms that are not full first.
 
-        Returns None if all terms are full, or if an array is the factor of a full term.
+        Returns None if all terms are full, or if a full term has an array as its factor.
         """
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
@@ -404,7 +410,7 @@ class Compiler:
         return lambda run: add_axes(run.part(run.values(value)), depth)
 
     def _broadcast(self, value: Any, kind: str) -> int:
-        """Broadcast a constant or a value that is not full to all points."""
+        """Broadcast a constant, or a value that is not full, to all points."""
         shape = self._shape
         if not isinstance(value, Node):
             return self.program.tile(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)

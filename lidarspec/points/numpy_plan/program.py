@@ -1,11 +1,11 @@
-"""Run a program: NumPy calls on registers, for one chunk of packets at a time.
+"""Run a program of NumPy calls on registers, for one chunk of packets at a time.
 
 A program computes flat columns from frames of one layout. It does not depend on fields or
 expressions: `numpy_plan.compiler` appends the steps. A step computes one register from other
 registers, from the frames, or from values of the batch. A register is an array of one kind for
-a chunk: float32 ("single"), float64 ("double"), indices, flags or integers. Registers of output
-columns are the memory of the columns. All others use scratch memory: registers that are not needed
-at the same time share a slot, so that a chunk stays in the cache.
+a chunk: float32 ("single"), float64 ("double"), indices, flags or integers. The registers of output
+columns are parts of the columns. All other registers are in scratch memory. Registers that are not
+needed at the same time share a slot of this memory, so that a chunk fits in the cache.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Bytes2D
 from lidarspec.points.plan import ColumnMaker, Values
 
-#: the number of points of a chunk: its scratch arrays stay in the cache.
+#: The number of points of a chunk, so that its scratch arrays fit in the cache.
 CHUNK_POINTS = 1 << 16
 
 _CODES = {
@@ -31,7 +31,7 @@ _CODES = {
     "flag": "?",
     **{f"{sign}{size}": f"{sign}{size}" for sign in "iu" for size in (1, 2, 4)},
 }
-#: the dtype of each kind of register.
+#: The dtype of each kind of register.
 TYPES: dict[str, np.dtype[Any]] = {kind: np.dtype(code) for kind, code in _CODES.items()}
 
 
@@ -46,7 +46,8 @@ class ProgramRun:
         rows: the frames, (n, size).
         values: returns the value of a node for the batch, (n or 1, ...).
         views: the array of each register for the current chunk.
-        start, stop: the packets of the current chunk.
+        start: the first packet of the current chunk.
+        stop: the packet after the current chunk.
     """
 
     rows: Bytes2D
@@ -56,7 +57,7 @@ class ProgramRun:
     stop: int = 0
 
     def part(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Return the rows of the current chunk; a single row is shared by all packets."""
+        """Return the rows of the current chunk; an array with a single row is returned whole."""
         if len(array) > 1:
             return array[self.start : self.stop]
         return array
@@ -90,12 +91,13 @@ class RegisterRead:
 
 
 class Program(ColumnMaker):
-    """The calls that compute some flat columns.
+    """The calls that compute flat columns of points.
 
     Args:
         width: the number of points of a packet.
-        safe: returns whether a nan in one coordinate of a point is a nan in all of them, given the
-            values of nodes. If not, the program sets the other coordinates to nan.
+        safe: a function that returns whether the coordinates of each point are either all nan or
+            all finite, given the values of nodes. If not, the program sets all coordinates of a
+            point to nan if one is nan.
 
     Attributes:
         chunk: the number of packets of a chunk.
@@ -125,14 +127,14 @@ class Program(ColumnMaker):
         run: Callable[[ProgramRun, NDArray[Any]], Any],
         *reads: Callable[[ProgramRun], Any],
     ) -> int:
-        """Add a step, and return its register."""
+        """Add a step, and return the register that it fills."""
         output = self.register(kind)
         registers = tuple(read.register for read in reads if isinstance(read, RegisterRead))
         self.steps.append(ProgramStep(text, run, output, registers))
         return output
 
     def call(self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]) -> int:
-        """Add a call of a function that accepts `out`, and return its register."""
+        """Add a call of a function that accepts `out`, and return the register that it fills."""
         return self.step(
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
         )
@@ -186,7 +188,7 @@ class Program(ColumnMaker):
 
     @cached_property
     def _slots(self) -> list[int]:
-        """The slot of each register, computed once; all steps must have been added before."""
+        """The slot of each register; computed once, after all steps were added."""
         uses = [(step.output, *step.reads) for step in self.steps]
         return assign_slots(uses, self.kinds, {*self.outputs.values(), *self._tiles})
 
@@ -199,12 +201,12 @@ def assign_slots(
     Registers of one kind that are not needed at the same time share a slot.
 
     Args:
-        uses: the registers that each step fills or reads, in the order of the steps.
+        uses: for each step, in order, the registers that it fills or reads.
         kinds: the kind of each register.
         own: registers that have their own memory.
 
     Returns:
-        The number of each register's slot, -1 for a register without a slot.
+        The number of the slot of each register; -1 for a register without a slot.
     """
     last = {register: index for index, used in enumerate(uses) for register in used}
     slots = [-1] * len(kinds)
