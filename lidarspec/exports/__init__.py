@@ -1,8 +1,9 @@
 """Exports of a spec to the formats of other tools, by name.
 
-In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) of
-`messages`. It raises `ExportError`, with the reason, if they contain Python code or the target
-cannot express the spec. Modules in reading order:
+`export` returns the text of an export of a sensor. The modules below get the frame types from
+`messages` and walk their frame trees (`lidarspec.spec.tree`). `ExportError` is raised, with the
+reason, if a tree contains Python code or if the target format cannot express the spec. Modules in
+reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
@@ -55,7 +56,7 @@ class UnknownExport(UnknownName):
 def select_frame(sensor: Sensor, frame: str) -> Sensor:
     """Return a copy of the sensor with only one frame type, and no commands.
 
-    Exports of a single message are made from it.
+    An export of the copy describes this frame type alone.
 
     Raises:
         UnknownFrame: if it has no frame type of this name.
@@ -110,7 +111,8 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """The checksums, by the path of each field that stores all or part of one."""
+        """Path of each field that stores a checksum, or a part of one -> the node of the
+        checksum."""
         return {
             path: node
             for node in tree.nodes(self.root)
@@ -120,15 +122,16 @@ class ExportedFrame:
 
 
 def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
-    """Return the frame types of a sensor, in their order.
+    """Return the frame types of a sensor that can be exported, in declared order.
 
     Args:
-        on_wire: whether the export describes the bytes as they are sent, not only the fields. Then
-            frame types with a wire form are left out, because other languages cannot decode them.
+        on_wire: whether the export describes the bytes as they are sent, not only the fields. If
+            so, frame types with a wire form (text or escaped bytes) are omitted, because other
+            languages cannot decode them.
 
     Raises:
-        ExportError: if the sensor has no frames yet, if a frame contains Python code, or if all
-            frame types have a wire form.
+        ExportError: if the sensor has no frames until it is configured, if a frame contains Python
+            code, or if all frame types have a wire form.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id} has no frames until it is configured")
@@ -167,10 +170,9 @@ def _join_forms(forms: Mapping[str, str]) -> str:
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:
-    """Return the fields that a node depends on.
+    """Return the fields that a node and its descendants depend on.
 
-    These are the fields in formulas of the node and its descendants, and the fields that lengths
-    and conditions are compared with.
+    Sizes, counts and conditions depend on fields, and so do the values that other fields must have.
     """
     formulas = [
         value
@@ -182,7 +184,7 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
 
 
 def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """Return the formulas that the fields of a node must equal, by their paths."""
+    """Return {path: formula} of the fields of a node that must equal a formula."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)

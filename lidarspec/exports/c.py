@@ -3,11 +3,11 @@
 The header has functions that take the bytes of a frame: accessors, lengths, checksums and scaling.
 It does not depend on struct packing. `header` joins:
 
-* the helpers of all headers (``c_bytes.h``, in the folder of this module),
+* helper functions, which are the same for all sensors (``c_bytes.h`` in this folder),
 * a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
   argument, so that all frame types share it,
-* for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions of the whole
-  frame: its length by its header, whether it is valid, and its stored and computed checksums.
+* for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions that read a
+whole frame: they return its length, its validity, and its stored and computed checksums.
 
 `frame_length` checks that a byte exists before it reads the byte.
 """
@@ -221,7 +221,7 @@ def _format_literal(value: int, size: int) -> str:
 
 
 _LENGTH = """\
-/* Bytes of the frame that begins at p, by its header; 0 where the n bytes do not hold the header, or no frame can be so long. */
+/* Return the size of the frame at p in bytes, which its header gives; 0 if the n bytes do not contain the header, or if the size is impossible. */
 static inline size_t {name}(const uint8_t *p, size_t n)
 {{
 {unused}{checks}    const int64_t size = {size};
@@ -229,7 +229,7 @@ static inline size_t {name}(const uint8_t *p, size_t n)
 }}
 """
 _CHECKSUM = """\
-/* What the checksum has to be, what it is, and whether that is right. */
+/* The computed checksum, the stored checksum, and whether both are equal. */
 static inline uint64_t {name}_computed({parameters})
 {{
     const int64_t spans[][2] = {{{spans}}};
@@ -246,7 +246,7 @@ static inline int {name}_ok({parameters})
 }}
 """
 _IS_FRAME = """\
-/* Whether a whole frame begins at p: length, constants and checksums are right. */
+/* Return 1 if a whole frame with valid length, constants and checksums begins at p, else 0. */
 static inline int {name}(const uint8_t *p, size_t n)
 {{
     const size_t size = {length}(p, n);
@@ -299,7 +299,8 @@ def _join_statements(statements: Iterable[str]) -> str:
 def _iter_length_checks(layout: CLayout) -> Iterator[str]:
     """Yield C checks of the fields that determine the length, in wire order.
 
-    Each checks that the field exists and that its value is possible.
+    Each check returns 0 from the C function if the bytes end before the field, or if its value is
+    impossible.
     """
     longest = layout.message.frame.max_length
     for entry in layout.entries:
@@ -350,8 +351,7 @@ def _iter_covered_spans(
 ) -> Iterator[tuple[SizeFormula, SizeFormula]]:
     """Yield the byte ranges that a checksum covers.
 
-    This is the range that the seal declares, or the whole struct without the fields that store
-    the checksum.
+    These are the declared range, or the whole struct without the fields that store the checksum.
     """
     if seal.over is not None:
         first, last = (layout.whole(path) for path in seal.over)
@@ -452,20 +452,20 @@ def _format_check(entry: CEntry, wrong: str) -> str:
 
 
 _HEAD = """\
-/* {title}: its frames as functions of bytes, made by lidarspec {version}.
+/* {title}: functions that read its frames. Made by lidarspec {version}.
  * Source: {source}
  *
  * For every frame type F:
- *   {prefix}_F_frame_length(p, n)  bytes of the frame that begins at p, of which n are there; 0 where the header does not tell
- *   {prefix}_F_is_frame(p, n)      whether a whole, sound frame begins at p
- *   {prefix}_F_checksum_ok(p)      whether its checksum is right; ..._computed(p), ..._stored(p)
- *   {prefix}_F_FIELD(p, i, ...)    the raw number of a field, with an index for each array that it is in
- *   {prefix}_F_FIELD_present(p)    whether a field that not every header has is there; without, it reads as 0
- *   {prefix}_F_ARRAY_count(p)      elements of an array
+ *   {prefix}_F_frame_length(p, n)  size in bytes of the frame at p; 0 if the n bytes at p do not contain its header
+ *   {prefix}_F_is_frame(p, n)      1 if a whole valid frame begins at p, else 0
+ *   {prefix}_F_checksum_ok(p)      1 if its checksum is valid, else 0; also ..._computed(p) and ..._stored(p)
+ *   {prefix}_F_FIELD(p, i, ...)    the raw value of a field; one index for each array around it
+ *   {prefix}_F_FIELD_present(p)    1 if the frame has an optional field, else 0; the value of a missing field is 0
+ *   {prefix}_F_ARRAY_count(p)      number of elements of an array
  *   {prefix}_F_FIELD_to_UNIT(raw)  the physical value
  *
- * All but frame_length and is_frame take a whole frame: ask is_frame first. What only Python decides (whether values are plausible, which
- * frames wait for others) is not asked. C99 and C++11; nothing is allocated.
+ * Call is_frame first: all functions except frame_length and is_frame require a whole frame. is_frame does not check whether values
+ * are plausible, nor whether the frame may follow the frames before it. C99 and C++11; no function allocates memory.
  */
 #ifndef {guard}
 #define {guard}
@@ -538,7 +538,7 @@ def _iter_definitions(
     """Yield all definitions of a frame type.
 
     Args:
-        taken: C name -> the (frame type, path, ending) it belongs to; new names are added.
+        taken: C name in use -> its (frame type, path, ending); new names are added.
         algorithms: the name of the C function of each checksum algorithm.
     """
     name = functools.partial(_make_name, taken, prefix, message.name)

@@ -1,11 +1,13 @@
 """The offsets of fields as C expressions, and C functions that read the fields.
 
-`CLayout` walks a frame tree once and makes a `CEntry` for each node: its first byte as a C
-expression of the frame's bytes and of array indices, its size, the conditions under which it is
-present and the counts of the arrays around it. A length or count from a header is a call of the
-function that reads it, so that expressions stay short. The entries give an accessor for each field,
-which tries its alternatives one after another, the counts of arrays, the presence of optional
-fields, and the scaling to the field's unit and to the SI unit.
+`CLayout` walks a frame tree once and makes a `CEntry` for each node. An entry has the offset of the
+node as a C expression, its size, the conditions under which it is present, and the counts of the
+arrays around it. If an expression needs a length or count from the header, it calls the C function
+that reads it, so that expressions stay short.
+
+`fields` makes the C functions from the entries: accessors of fields, counts of arrays, tests for
+optional fields, and conversions to the field's unit and the SI unit. If alternative layouts contain
+a field, its accessor uses the first alternative that is present.
 """
 
 from __future__ import annotations
@@ -86,7 +88,12 @@ def quote_bytes(data: bytes) -> str:
 
 
 class CCondition(NamedTuple):
-    """A C expression, and whether it is independent of array elements."""
+    """A C expression that is a condition.
+
+    Attributes:
+        text: the expression.
+        is_fixed: whether its value is the same for all elements of the arrays around it.
+    """
 
     text: str
     is_fixed: bool
@@ -94,7 +101,7 @@ class CCondition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CEntry:
-    """A node at one of its positions in the frame.
+    """A node of a frame tree, at one position in the frame.
 
     Attributes:
         path: path of the node, without indices; for an array, the path of its axis.
@@ -118,7 +125,7 @@ class CEntry:
 
     @property
     def where(self) -> str:
-        """The C expression that all conditions are true; "" if there is no condition."""
+        """All conditions, joined to one C expression; "" if there is no condition."""
         return " && ".join(condition.text for condition in self.conditions)
 
     @property
@@ -130,21 +137,21 @@ class CEntry:
 
     @property
     def info(self) -> tree.FieldInfo:
-        """The field."""
+        """The facts about the field, such as its path, scale and unit."""
         if self.part is not None:
             return self.part.info
         return tree.infos(self.node)[0]
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """The indices of a part in the arrays inside its bit block."""
+        """The array indices of a part of a bit block, for arrays inside the block."""
         if self.part is not None:
             return self.part.indices
         return ()
 
     @property
     def expression(self) -> str:
-        """The C expression of its raw value."""
+        """The C expression of the field's raw value."""
         node = self.node
         if self.part is not None:
             return _bits(self.part, self.start)
@@ -161,7 +168,7 @@ class CEntry:
 
     @property
     def span(self) -> tuple[int, SizeFormula]:
-        """The offsets of the word's first byte and of its end, inside the entry."""
+        """(start, end) of the bytes that hold the field, as byte offsets in the entry."""
         if self.part is None:
             return 0, self.size
         offsets = [segment.byte for segment in self.part.bits.segments]
@@ -169,9 +176,9 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The C condition under which it is present; "" if it is always present.
+        """The C condition under which the field is present; "" if it is always present.
 
-        For a part of a bit block, it compares the indices with the indices of the part.
+        For a part of a bit block inside an array, the array indices must be those of the part.
         """
         inside = [
             f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
@@ -180,9 +187,9 @@ class CEntry:
 
 
 def format_size_arguments(node: tree.Node, depth: int) -> str:
-    """Return the arguments of a call of a size function inside `depth` arrays.
+    """Return the arguments that a size function inside `depth` arrays is called with.
 
-    If all elements have the same size, the indices are 0.
+    If all elements have the same size, every index is 0.
     """
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
@@ -199,7 +206,7 @@ class CLayout:
         size: size of a frame, in bytes.
 
     Raises:
-        ExportError: if the offset of an entry depends on all elements before it.
+        ExportError: if an offset depends on the sizes of the array elements before it.
     """
 
     def __init__(self, message: ExportedFrame, name: Callable[[str, str], str]) -> None:
@@ -213,7 +220,7 @@ class CLayout:
     def find_entries(self, path: str) -> list[CEntry]:
         """Return the entries of the numbers, bytes or bits at a path.
 
-        There are several if alternatives contain the field.
+        There are several entries if several alternative layouts contain the field.
         """
         return [
             entry
@@ -294,7 +301,8 @@ class CLayout:
     def extent_name(self, entry: CEntry) -> str:
         """Return the name of the size function of a part with alternatives.
 
-        Alternatives may contain alternatives, so that several of these parts can have one path.
+        Parts with alternatives can be nested and have the same path. A number makes their names
+        unique.
         """
         choices = [
             node
@@ -438,7 +446,7 @@ def accesses(layout: CLayout, path: str) -> list[CEntry]:
 def fields(layout: CLayout) -> Iterator[str]:
     """Yield the functions of all fields in wire order.
 
-    The functions of a field in several alternatives follow the last alternative.
+    If several alternatives contain a field, its functions come at the place of the last one.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))

@@ -62,7 +62,7 @@ class BoxGroup:
     Attributes:
         label: the count or the condition.
         items: the boxes and groups in it.
-        optional: True if some frames do not have it.
+        optional: whether some frames do not contain the group.
     """
 
     label: str
@@ -94,7 +94,7 @@ class _ItemBuilder:
 
     Attributes:
         seals: path of a field that holds a checksum -> its seal.
-        mixed: True shows the byte order of each number, because they differ.
+        mixed: whether to show the byte order of each number, because the frame has both orders.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -310,19 +310,19 @@ def svg(sensor: Sensor) -> str:
     return sheet.document(f"{sensor.id}: packet diagrams")
 
 
-#: The piece of a box in one row: left edge, upper edge, bits.
+#: The piece of a box in one row: left edge and upper edge in pixels, width in bits.
 Piece = tuple[float, float, int]
 
 
 @dataclass
 class _Sheet:
-    """A drawing, which grows downwards.
+    """A drawing that is made from top to bottom.
 
     Attributes:
         parts: the SVG elements.
         top: the upper edge of the current row, in pixels.
         used: the bits of the current row that are already drawn.
-        deepest: the number of levels of brackets.
+        deepest: the maximum number of nested brackets so far.
     """
 
     parts: list[str] = field(default_factory=list)
@@ -470,7 +470,7 @@ class _Sheet:
         """Draw the offset of the current row at its left; a long formula takes two lines.
 
         Args:
-            more: number of bytes of the field in the rows before.
+            more: number of bytes of the field that are drawn in the rows above.
         """
         text = str(cell.offset + SizeFormula(more))
         middle = text.find(" + ", len(text) // 2 - 4)
@@ -487,7 +487,7 @@ class _Sheet:
 
 
 def _find_nesting_depth(group: BoxGroup) -> int:
-    """Return the number of levels of groups inside a group; 0 for only boxes."""
+    """Return the number of levels of groups inside a group; 0 if it contains only boxes."""
     return max(
         (1 + _find_nesting_depth(item) for item in group.items if isinstance(item, BoxGroup)),
         default=0,
@@ -536,10 +536,10 @@ def _right_edge(piece: Piece | None) -> float:
     return piece[0] + piece[2] * BIT_WIDTH_PX
 
 
-def _touches(one: Piece, other: Piece) -> bool:
+def _touches(piece: Piece, other: Piece) -> bool:
     """Return whether two pieces touch, one above the other."""
-    return abs(one[1] - other[1]) == ROW_HEIGHT_PX and max(one[0], other[0]) < min(
-        _right_edge(one), _right_edge(other)
+    return abs(piece[1] - other[1]) == ROW_HEIGHT_PX and max(piece[0], other[0]) < min(
+        _right_edge(piece), _right_edge(other)
     )
 
 

@@ -2,7 +2,7 @@
 
 docs/reference/spec-json.md describes every key. Wire types, bit positions, formulas and checksums
 are complete, so that a decoder can be written from them. Python code (`points`, `plausible`,
-`sweep`) is not included; only the presence of `plausible` is.
+`sweep`) is not included. The output shows only whether a frame type has a `plausible` function.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, Split
 from lidarspec.spec.wire_forms import WireForm
 
-#: Version of the format; it increases if a key changes its meaning or is removed.
+#: Version of the format. A version that removes a key, or changes its meaning, has a new number.
 VERSION = 1
 
 
@@ -95,7 +95,7 @@ def _to_json(fact: Any) -> Any:
 
 
 def link_data(link: Link) -> dict[str, Any]:
-    """Return a link as JSON data: its kind, then the attributes of its class."""
+    """Return a link as JSON data: "kind" is its class, the other keys are its attributes."""
     data = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
@@ -245,9 +245,9 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts(node: tree.PartSequence) -> dict[str, Any]:
-    """Return the rules for the end of a sequence of parts, and each kind of part.
+    """Return the rules that end a sequence of parts, and the kinds of parts, as JSON data.
 
-    The key `following` is the size in bytes of the next part.
+    For each kind, the key "following" has the size of the next part in bytes.
     """
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}

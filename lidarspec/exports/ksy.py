@@ -1,12 +1,14 @@
 """Export a spec as a Kaitai Struct format for Kaitai's compiler, web IDE and visualizer.
 
-A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in wire
-order (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml` writes the
-document. Formulas refer to a field by its path from the current type (`format_reference`), since
-Kaitai has no absolute paths. A bit block becomes bit-sized integers if one of Kaitai's two bit
-orders yields its parts in a row; otherwise it becomes bytes and calculated instances. A field with
-a scale gets an instance with the physical value. Kaitai cannot express checksums, plausibility
-tests and points: checksums are named in the documentation of their fields.
+Each frame type, and each struct in a frame type, becomes a Kaitai type. A type has attributes in
+wire order (`seq`), calculated `instances` and inner `types`. Types are plain data until `yaml`
+writes the document. Kaitai has no absolute paths, so formulas refer to a field by its path from the
+current type (`format_reference`).
+
+A bit block becomes bit-sized integers if its parts are consecutive in one of Kaitai's two bit
+orders. Otherwise it becomes bytes, and an instance calculates each part. A field with a scale gets
+an instance with the physical value. Kaitai cannot express checksums, plausibility tests and points.
+The documentation of a checksum's field names the algorithm.
 """
 
 from __future__ import annotations
@@ -90,13 +92,13 @@ def identifier(name: str) -> str:
     return re.sub(r"[^a-z0-9_]", "_", name.lower())
 
 
-#: The types around an expression, outermost first, by the path of their struct; None for a type
-#: that holds a single part.
+#: The Kaitai types around an expression, outermost first. Each is given by the path of its struct,
+#: or None for a type that has no struct and holds a single part.
 Scope = tuple[str | None, ...]
 
 
 def format_reference(scope: Scope, ref: tree.Ref) -> str:
-    """Return an integer expression of a field, by its path from a type.
+    """Return the integer expression that reads a field from inside the innermost type of `scope`.
 
     Raises:
         ExportError: if no type around the expression contains the field.
@@ -107,7 +109,7 @@ def format_reference(scope: Scope, ref: tree.Ref) -> str:
             return (
                 "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
             )
-    raise ExportError(f"{ref.path} cannot be referred to in Kaitai")
+    raise ExportError(f"a formula in Kaitai cannot refer to {ref.path}")
 
 
 _OPERATIONS = {
@@ -138,8 +140,8 @@ def to_condition(formula: tree.Formula, scope: Scope) -> str:
 
 Attribute = dict[str, Any]
 
-#: Maximum bits that Kaitai reads at once, and sizes in bytes of its other integers and of its
-#: floats.
+#: Maximum width of Kaitai's bit-sized integers. The next two constants are the sizes of its other
+#: integers and of its floats, in bytes.
 MAX_BITS = 64
 INTEGER_SIZES = (1, 2, 4, 8)
 FLOAT_SIZES = (4, 8)
@@ -187,7 +189,7 @@ def block_type(
 def inline(
     block: tree.Block, more: Mapping[str, Any]
 ) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """Return the attribute and the instances of a block that is one plain integer.
+    """Return the attribute and the instances of a bit block that is a single integer.
 
     Returns None for any other block.
 
@@ -244,17 +246,18 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the condition of an attribute, for the instances that depend on it."""
+    """Return the "if" entry of an attribute, for the instances that use the attribute; else {}."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
 
 
 def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """Return the parts of a block in a bit order of Kaitai, and the order's suffix.
+    """Return the parts of a block in the order in which Kaitai reads them, and "be" or "le".
 
-    Returns None if the parts do not fill the block in either order. "be" reads each byte from its
-    highest bit on and fills integers from the top, "le" does both from the lowest bit on.
+    With "be", Kaitai reads each byte from its highest bit and fills integers from the highest bit.
+    With "le", it reads and fills from the lowest bit. Returns None if neither order reads every
+    part as consecutive bits that fill the block.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
@@ -268,9 +271,9 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the bit positions at which Kaitai would begin to read a field's segments.
+    """Return the bit position of the field's start in the block, calculated from each segment.
 
-    There is only one position if the bits are consecutive.
+    All segments give the same position if Kaitai can read the field as consecutive bits.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -280,7 +283,7 @@ def _find_starts(bits: BitField, suffix: str) -> set[int]:
 
 
 def _assemble_part(part: tree.Part, raw: str) -> str:
-    """Return a part as an expression of the block's bytes."""
+    """Return the expression that assembles a part from the bytes of its block."""
     terms = []
     for segment in part.bits.segments:
         if segment.mask == 0xFF:
@@ -300,7 +303,8 @@ def _assemble_part(part: tree.Part, raw: str) -> str:
 def ksy(sensor: Sensor) -> str:
     """Return the sensor's frame types as a .ksy document.
 
-    It parses a sequence of data frames, or of the only frame type.
+    The format parses a sequence of data frames. If the sensor has only one frame type, the format
+    parses a sequence of these frames.
 
     Raises:
         ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names
@@ -429,7 +433,7 @@ class _KaitaiWriter:
     def _parts(
         self, kaitai: _KaitaiType, node: tree.PartSequence, scope: Scope, **more: Any
     ) -> None:
-        """Add parts of one kind; Kaitai must know the type before it reads the parts."""
+        """Add the attribute of a sequence of parts, which must all have the same type."""
         if len(node.kinds) > 1:
             raise ExportError(f"{node.axis}: Kaitai cannot distinguish parts by their constants")
         (kind,), name = node.kinds, identifier(node.name)
@@ -541,7 +545,7 @@ class _KaitaiWriter:
         else:
             sealed = f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
         if info.held:
-            unchecked = "a length, which is not checked here"
+            unchecked = "a length; not checked here"
         else:
             unchecked = ""
         text = "; ".join(filter(None, (unit_text(info), describe_field(info), unchecked, sealed)))
@@ -569,7 +573,7 @@ def _size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _value(node: tree.Node) -> tree.Node:
-    """Return an element of an array or a choice as the only member of a type."""
+    """Return an element of an array, or an alternative, as a member with the name `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

@@ -1,8 +1,8 @@
 """The start of a sensor's reference page: commands to copy, a program, and installation notes.
 
-The commands follow from the links of the sensor. Notes are Markdown files that a plugin ships as
-`notes/ID.md` in the folder of its modules: wiring, connectors, addresses and settings from the
-manual.
+The SOURCE in the commands is typical for the links of the sensor. The notes of a sensor are the
+file `notes/ID.md` in the package of its plugin. They describe wiring, connectors, addresses and
+settings from the manual.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """A sensor's reference page in Markdown.
 
-It has commands to copy, notes, links, commands, the wire table of every frame, checksums, clock and
-geometry. Each section is a table or a few sentences from the spec alone, except the notes, which
-the plugin ships. Only geometry uses bytes: the points of an
-example frame give the columns and the directions of the channels.
+The page has commands to copy, notes, links, the sensor's commands, a table of the fields of each
+frame, checksums, the clock and geometry. The notes come from the plugin; all other sections are
+made from the spec. The section on geometry decodes an example frame to get the columns of the
+points and the elevations of the channels.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import EPOCHS, Clock, Every, OnFlag, Split
 
+#: Status of a sensor -> its description.
 STATUSES = {
     "manual": "written from the manual",
     "vectors": "agrees with published example frames",
@@ -128,7 +129,7 @@ def _describe_clock(clock: Clock) -> str:
         again = ""
     parts = [fields + again]
     if clock.reference:
-        parts.append(f"completed by {clock.reference[0]} frames")
+        parts.append(f"with the date from `{clock.reference[0]}` frames")
     if clock.epoch:
         parts.append(f"counts {EPOCHS[clock.epoch]}")
     return ", ".join(parts)
@@ -153,7 +154,7 @@ def _describe_clock_status(clock: Clock) -> str:
 
 def _iter_commands(sensor: Sensor) -> Iterator[str]:
     rows = [
-        (f"`{name}`", _find_request(sensor, name), _describe_answer(command), effect(sensor, name))
+        (f"`{name}`", _find_request(sensor, name), _describe_reply(command), effect(sensor, name))
         for name, command in sensor.commands.items()
     ]
     return _iter_table(["command", "bytes or arguments", "reply", ""], rows)
@@ -173,7 +174,7 @@ def _find_request(sensor: Sensor, name: str) -> str:
     return ", ".join(parts)
 
 
-def _describe_answer(command: Command) -> str:
+def _describe_reply(command: Command) -> str:
     if command.replies:
         return " or ".join(f"`{name}`" for name in command.replies)
     return "none documented"

@@ -1,7 +1,7 @@
 """Export a spec as a type stub for editors and type checkers.
 
-It has a class for each struct of each frame, and the sensor's own methods. The result of `parse`
-has the fields as attributes, so a frame can be typed by the class of its type:
+The stub has a class for each struct in a frame, and a class for the sensor, with its methods. The
+result of `parse` has the fields as attributes, so the class of a frame type describes it:
 
     if TYPE_CHECKING:
         from acme_x1 import Data, AcmeX1
@@ -128,7 +128,8 @@ class _StubClasses:
         """Return the lines of a member.
 
         Args:
-            node: a node, or the parts of a bit block that begin with this name.
+            node: the node of the member, or the fields of a bit block that form a nested struct of
+                this name.
         """
         if isinstance(node, list):
             kind = "int" if len(node) == 1 else "Any"
@@ -217,10 +218,7 @@ class {to_class_name(sensor.id)}(Sensor):
 
 
 def _build(message: ExportedFrame) -> str:
-    """Return the signature that builds a frame, with its fields by name.
-
-    Numbers are raw, or with `units` physical; constants and checksums are filled in.
-    """
+    """Return the signature of `build` for one frame type; its fields are keyword arguments."""
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in message.root.struct.members

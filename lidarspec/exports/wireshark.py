@@ -1,13 +1,15 @@
 """Write a Wireshark dissector in Lua for a sensor.
 
-A dissector has two parts. ``wireshark.lua``, in the same folder, is equal for all sensors: it
-finds frames, measures and checks them, and fills Wireshark's tree. This module writes the part
-that depends on the sensor: a Lua table for each node of a frame tree (`_TableWriter`). A table has the
-kind of the node, the Wireshark field that shows it, a `keep` entry if later formulas use its value,
-and a `skip` entry with the number of bytes to skip when a frame is only measured.
+A dissector has two parts. ``wireshark.lua``, in the same folder, is the same for all sensors. It
+finds frames, computes their lengths, checks them, and fills Wireshark's tree. This module writes
+the part that depends on the sensor: a Lua table for each node of a frame tree (`_TableWriter`). A
+table has the kind of the node and the Wireshark field that shows it. The entry `keep` is set if
+later formulas use the value of the node. The entry `skip` is the number of bytes to skip while the
+length of a frame is computed.
 
-A formula becomes a Lua function of the values kept so far. Numbers are floats in Wireshark's Lua,
-so integer operations are calls of functions in ``wireshark.lua`` (`int.div`, `int.band`).
+A formula becomes a Lua function. Its argument is a table of the values of the fields with a `keep`
+entry. Numbers are floats in Wireshark's Lua, so integer operations are calls of functions in
+``wireshark.lua`` (`int.div`, `int.band`).
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ _OPERATIONS = {
 
 
 def formula(value: tree.Formula) -> LuaCode:
-    """Return a formula as a number, or as a Lua function of the values of fields."""
+    """Return a formula as Lua code: a number, or a function of the field values."""
     if isinstance(value, int):
         return LuaCode(str(value))
     return _format_function(value)
@@ -130,7 +132,8 @@ def quote_lua(text: str | bytes) -> str:
     )
 
 
-#: An array element with at most this many fields shows their values in its own line.
+#: Maximum number of fields of an array element for which Wireshark shows their values in the line
+#: of the element.
 MAX_SUMMED_FIELDS = 4
 Table = dict[str, Any]
 
@@ -139,10 +142,10 @@ class _TableWriter:
     """Writes the tables of one frame type.
 
     Attributes:
-        prefix: prefix of the names of its fields in Wireshark's filters.
+        prefix: text before the path of a field in Wireshark's filters.
         kept: paths of the fields that formulas or checksums use.
         marked: paths of the first and the last part that each checksum covers.
-        types: type family of each Wireshark field, by its filter name.
+        types: name of a Wireshark field in filters -> its type family.
     """
 
     def __init__(self, message: ExportedFrame, prefix: str) -> None:
@@ -158,8 +161,8 @@ class _TableWriter:
     def node(self, node: tree.Node, path: str = "") -> Table:
         """Return the table of a node.
 
-        Its entry `skip` is the size of the node in bytes; None if the length of the frame depends
-        on a value in the node.
+        Its entry `skip` is the size of the node in bytes. It is None if the node cannot be skipped,
+        because its bytes must match a constant or a later formula uses them.
         """
         match node:
             case tree.Number():
@@ -287,7 +290,8 @@ class _TableWriter:
             "signed": part.bits.signed or None,
             "masked": is_masked or None,
             "segments": [
-                [one.byte, one.low, one.mask.bit_count(), one.target] for one in part.bits.segments
+                [bits.byte, bits.low, bits.mask.bit_count(), bits.target]
+                for bits in part.bits.segments
             ],
             **self._number_entries(part.info, kind, mask),
         }
@@ -524,10 +528,10 @@ def _width(bits: int) -> int:
 
 
 def _word_order(block: tree.Block) -> str | None:
-    """Return the byte order in which Wireshark can draw the parts of a block as masks.
+    """Return the byte order in which Wireshark can show each part of a block as a bit mask.
 
     In this order, the bits of each part are contiguous in one word. Returns None if no byte order
-    fits.
+    fits or if the block has more than 4 bytes.
     """
     orders = (
         order
@@ -553,20 +557,19 @@ def _find_lowest_bit(bits: BitField, size: int, order: str) -> int | None:
     return None
 
 
-#: The link types USER0 to USER15, which captures reserve for private use, by their numbers in
-#: Wireshark's wtap.
+#: Wireshark's numbers (wtap) of the link types USER0 to USER15, which are reserved for private use.
 USER_LINKS = tuple(range(45, 61))
 
 _HEAD = """\
--- {title}: a dissector for Wireshark and tshark, made by lidarspec {version}.
+-- {title}: a dissector for Wireshark and tshark, written by lidarspec {version}.
 -- Source: {source}
 {left_out}--
 --     wireshark -X lua_script:THIS_FILE CAPTURE
 --
 -- or put it into the personal Lua plugins folder (Help, About Wireshark, Folders).
--- It takes UDP and TCP by port, UDP on other ports by its constants, and captures of link type USER0 to USER15, which hold what came
--- over a serial line ("lidarspec record SOURCE -s SENSOR -o FILE.pcap" writes them).
--- A field is the raw number of the wire; where it has a unit, FIELD.physical can be filtered by as well.
+-- The dissector is used for UDP and TCP on the sensor's ports, for UDP on other ports if the constants match, and for captures of
+-- link type USER0 to USER15. "lidarspec record SOURCE -s SENSOR -o FILE.pcap" writes such a capture of a serial line.
+-- A field has its raw value. If it has a unit, FIELD.physical has the physical value; both can be used in filters.
 
 local proto = Proto({name}, {title_quoted})
 local int = {{}}
@@ -583,11 +586,11 @@ local verdicts = {{[0] = "Bad", [1] = "Good", [2] = "Not filled"}}
 local status = new({name} .. ".checksum.status", "checksum status", ftypes.UINT8, base.NONE, verdicts)
 local marks = {{
   checksum = ProtoExpert.new({name} .. ".checksum.bad", "checksum wrong", expert.group.CHECKSUM, expert.severity.ERROR),
-  constant = ProtoExpert.new({name} .. ".constant.bad", "not the constant that stands here", expert.group.MALFORMED, expert.severity.ERROR),
-  length = ProtoExpert.new({name} .. ".length.bad", "not the length of its part", expert.group.MALFORMED, expert.severity.ERROR),
+  constant = ProtoExpert.new({name} .. ".constant.bad", "not the expected constant", expert.group.MALFORMED, expert.severity.ERROR),
+  length = ProtoExpert.new({name} .. ".length.bad", "not equal to the length of the part", expert.group.MALFORMED, expert.severity.ERROR),
   short = ProtoExpert.new({name} .. ".cut_off", "the frame ends before its last field", expert.group.MALFORMED, expert.severity.ERROR),
-  skipped = ProtoExpert.new({name} .. ".skipped", "bytes of no frame", expert.group.UNDECODED, expert.severity.WARN),
-  unsure = ProtoExpert.new({name} .. ".frame.unsure", "it may be of another type", expert.group.ASSUMPTION, expert.severity.NOTE),
+  skipped = ProtoExpert.new({name} .. ".skipped", "bytes outside frames", expert.group.UNDECODED, expert.severity.WARN),
+  unsure = ProtoExpert.new({name} .. ".frame.unsure", "the frame may be of another type", expert.group.ASSUMPTION, expert.severity.NOTE),
 }}
 """
 
@@ -595,7 +598,7 @@ local marks = {{
 def dissector(sensor: Sensor) -> str:
     """Return a Lua dissector for Wireshark.
 
-    It is used for the sensor's UDP and TCP ports, and for captures of a serial line.
+    Wireshark uses it for the sensor's UDP and TCP ports, and for captures of a serial line.
 
     Raises:
         ExportError: if Python code decides the contents of a frame.
@@ -650,7 +653,7 @@ def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
 
 
 def _list_patterns(sensor: Sensor) -> dict[str, list[int]]:
-    """Return the ports or link types of the sensor, by the name of Wireshark's table."""
+    """Return {name of Wireshark's table: ports or link types of the sensor}."""
     links = sensor.links.values()
     patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],
