@@ -1,9 +1,8 @@
 """Exports of a spec to the formats of other tools, by name.
 
-`export` returns the text of an export of a sensor. The modules below get the frame types from
-`messages` and walk their frame trees (`lidarspec.spec.tree`). `ExportError` is raised, with the
-reason, if a tree contains Python code or if the target format cannot express the spec. Modules in
-reading order:
+In: a sensor. Out: the text that `export` returns. The modules below get the frame types from
+`messages` and walk their frame trees (`lidarspec.spec.tree`). They raise `ExportError` if a tree
+contains Python code, or if the target format cannot express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
@@ -111,8 +110,7 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """Path of each field that stores a checksum, or a part of one -> the node of the
-        checksum."""
+        """Path of each field that stores (a part of) a checksum -> the checksum's node."""
         return {
             path: node
             for node in tree.nodes(self.root)

@@ -271,8 +271,8 @@ def _iter_geometry(sensor: Sensor) -> Iterator[str]:
                 ""
                 if not cloud.nominal
                 else (
-                    "\nThe directions below are nominal; a calibration file gives those of the"
-                    " device."
+                    "\nThe directions below are nominal. A calibration file contains the"
+                    " directions of the device."
                 )
             )
             yield from _iter_table(["channel", "elevation"], rows)
