@@ -1,7 +1,7 @@
 """Parse field=value of a frame, and argument=value of a command.
 
-A number with a unit is converted. A number without a unit is the raw value of a field of a frame;
-for an argument, it is in the unit of the field.
+In field=value, a number with a unit is converted to a raw value, and a number without a unit is the
+raw value. In argument=value, a number without a unit is in the unit of the argument's field.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ def parse_values(table: Schema, assignments: Sequence[str], place: str) -> dict[
 
     Args:
         table: the fields of the frame.
-        assignments: the texts.
-        place: the sensor and the frame, for messages.
+        assignments: texts of the form "field=value".
+        place: the names of the sensor and of the frame, for error messages.
 
     Raises:
-        UsageError: for an invalid assignment, an unknown field, or a value that its field cannot
-            have.
+        UsageError: for an invalid assignment, an unknown field, or a value outside the limits of
+            its field.
     """
     parsed = [_parse_assignment(table, text, place) for text in assignments]
     raw_values: dict[str, Any] = {}
-    # Elements of arrays come last, because count fields may determine the lengths.
+    # Count fields give the lengths of arrays, so elements of arrays are assigned last.
     for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
         put_value(
             raw_values, names, value, lambda path: _find_length(table, raw_values, path, place)
@@ -53,7 +53,7 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
     """Return the path and the raw value of an assignment."""
     path, equals, value = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
-        raise UsageError(f"{place}: {text!r} is not field=value")
+        raise UsageError(f"{place}: expected field=value, got {text!r}")
     names = split_path(path)
     plain = ".".join(str(step) for step in names if not is_index(step))
     info = table.all_fields.get(plain)
@@ -63,16 +63,17 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
     indices = sum(map(is_index, names))
     if indices != arrays:
         raise UsageError(
-            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, but {path!r} has"
-            f" {indices} ind{'ex' if indices == 1 else 'ices'}"
+            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, so {path!r} needs"
+            f" {arrays} ind{'ex' if arrays == 1 else 'ices'}, not {indices}"
         )
     return names, _parse_raw(info, value.strip(), path, place)
 
 
 def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """Return the raw value for a text.
+    """Return the raw value of a field that a text gives.
 
-    The text is hexadecimal for bytes; otherwise it is a label, or a number with or without a unit.
+    For a field of bytes, the text is hexadecimal. For a number, it is a label of the field, or a
+    number with or without a unit.
     """
     if info.kind == "bytes":
         return _parse_bytes(text, f"{place}: {path}")
@@ -100,11 +101,12 @@ def _parse_bytes(text: str, place: str) -> bytes:
 
 
 def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Fraction, str]:
-    """Return a number, and the unit in its text; "" if it has no unit.
+    """Return the number in a text, and the unit that the text has; "" for no unit.
 
     Args:
-        unit: if the text has a unit, the number is converted to this unit.
-        expected: the expected content in words, for the message.
+        text: a number, which may have a unit. unit: the unit to convert to; used only if the text
+            has a unit.
+        expected: description of a valid text, for the error message.
     """
     digits, unit_text = split_unit(text)
     if unit_text:
@@ -138,9 +140,10 @@ def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | f
 
 
 def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """Return the length of an array: declared, or from the given count fields.
+    """Return the length of an array that is declared or follows from given count fields.
 
-    Returns 0 if single elements of the array are given, which determine the length.
+    If neither gives the length, but elements of the array are given, returns 0: the caller then
+    makes the array as long as its elements require.
     """
     declared = table.arrays.get(path)
     if isinstance(declared, int):
@@ -157,7 +160,7 @@ def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str)
         if isinstance(target, list) and target:
             return 0
         raise UsageError(
-            f"{place}: the number of elements of {path}[*] is not known: give the count field, or"
+            f"{place}: the number of elements of {path}[*] is unknown: give the count field, or"
             f" {path}[0]=..."
         ) from None
 

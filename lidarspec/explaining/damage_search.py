@@ -1,9 +1,10 @@
 """Find the single change of a frame that explains its damage.
 
-This tries to flip each bit back, to remove each byte, and to insert every byte value at every
-offset. The engine decides which of these candidates are one valid frame of the type, so that this
-module needs no knowledge of checksums and lengths. If the checksum is short, several candidates may
-be valid by chance. If there are many, only the kind of change is reported.
+`find_changes` flips each bit, removes each byte, and inserts each byte value at each offset. Each
+result is a candidate. The parser of the frame type decides which candidates are valid frames, so
+this module does not know about checksums and lengths. If the checksum is short, several candidates
+may be valid by chance. If more than `MAX_DESCRIBED_CHANGES` are valid, only the kind of change is
+reported.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: Number of bytes of candidates that are tried at once.
+#: Total size of the candidates that are checked together.
 BATCH_BYTES = 1 << 20
-#: Longest frame that is searched if plain construct parses it.
+#: Longest frame that is searched if its type is not compiled, so that construct parses each
+#: candidate.
 MAX_PLAIN_FRAME_BYTES = 128
 #: Longest frame that is searched for lost bytes, with 256 candidates for each offset.
 MAX_LOST_BYTE_FRAME_BYTES = 512
@@ -34,8 +36,8 @@ MAX_LOST_BYTE_FRAME_BYTES = 512
 MAX_LAYOUT_FIELDS = 4
 #: Maximum number of changes that are described separately.
 MAX_DESCRIBED_CHANGES = 3
-#: Kinds of damage, the likeliest first -> number of bytes that the damage adds to the frame, and
-#: number of candidates for each offset.
+#: Kind of damage, the likeliest first -> (number of bytes that the damage adds to the frame, number
+#: of candidates for each offset).
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
@@ -44,9 +46,9 @@ class FrameChange(NamedTuple):
 
     Attributes:
         kind: "flipped bit", "inserted byte" or "lost byte".
-        offset: offset in the damaged frame: of the changed or inserted byte, or of the byte after
-            the lost byte.
-        value: the index of the flipped bit, 0 for the lowest; or the inserted or lost byte.
+        offset: offset of the changed or inserted byte in the damaged frame. For a lost byte, the
+            offset of the byte after it.
+        value: the inserted or lost byte; for a flipped bit, its index, 0 for the lowest bit.
     """
 
     kind: str
@@ -67,9 +69,10 @@ class FrameChange(NamedTuple):
 def find_changes(
     frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
 ) -> list[FrameChange]:
-    """Return all single changes that explain the damage, of the likeliest kind only.
+    """Return the single changes that explain the damage to a frame.
 
-    If the change is undone, the bytes are one valid and plausible frame of the type.
+    A change explains the damage if undoing it gives one valid and plausible frame of the type. The
+    kinds are tried in turn; the result has only changes of the first kind with a match.
 
     Args:
         frame: the frame type.
@@ -183,22 +186,22 @@ def describe_damage(
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
-    If there are many, one sentence gives their kind and number.
+    If there are more than `MAX_DESCRIBED_CHANGES`, yields one sentence with their kind and number.
 
     Args:
         frame: the frame type.
         data: the damaged frame.
-        values: returns the values of a frame by path.
+        values: returns {path: value} of the fields of a frame.
     """
     matching = find_changes(frame, data)
     if len(matching) > MAX_DESCRIBED_CHANGES:
-        yield (f"one {matching[0].kind} would explain it, at any of {len(matching)} places")
+        yield f"a single {matching[0].kind} explains the damage, at one of {len(matching)} offsets"
         return
     before = values(data) if matching else {}
     for change in matching:
         explains = (
             f"{'one' if len(matching) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
-            f" {change.kind} would explain it"
+            f" {change.kind} explains the damage"
         )
         yield f"{explains}: {_describe_change(change, before, values(change.repair(data)))}"
 

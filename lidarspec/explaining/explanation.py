@@ -1,8 +1,8 @@
 """Explain one frame byte by byte: fields and values, the first fault, differences to another frame.
 
-`FrameRows` reads the fields of the frame by its layout, up to the end of the bytes. The explanation
-of a damaged frame contains the single change that explains the damage, if there is one. The
-explanation of a valid data frame contains the points.
+`FrameRows` reads the fields of the frame up to the end of the bytes, so a truncated frame can be
+explained too. The explanation of a damaged frame names the single changes that explain the damage.
+The explanation of a valid data frame contains its points.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.scan_ends import first_points
 from lidarspec.spec import Sensor
 
-#: Maximum number of points in the notes of a frame without arrays.
+#: Maximum number of points to list in the notes. Points are in the notes if the frame has no
+#: arrays.
 MAX_LISTED_POINTS = 4
 
 
@@ -51,7 +52,7 @@ class Explanation:
         sensor: the id of the sensor.
         frame: the frame type; "" for bytes that are not in a frame.
         data: the bytes.
-        rows: the rows, for each field, bit block or array element.
+        rows: a row for each field, bit block or array element.
         fault: the first fault of the frame; None if the frame is valid.
         notes: remarks on the whole frame.
     """
@@ -76,7 +77,7 @@ class Explanation:
 
     @property
     def fields(self) -> dict[str, FieldValue]:
-        """All values in wire order, by path with array indices ("points[1].intensity")."""
+        """Path with array indices ("points[1].intensity") -> value, in wire order."""
         return {value.path: value for row in self.rows for value in row.values}
 
     @property
@@ -88,15 +89,15 @@ class Explanation:
 
     @property
     def is_filler(self) -> bool:
-        """Whether the bytes are only fillers, which the sensor sends between frames."""
+        """Whether the bytes are only fillers that the sensor sends between frames."""
         return not self.frame and all(row.right for row in self.rows)
 
     def path_of(self, number: int, part: int = 0) -> str | None:
         """Return the path of the row that contains a point; None if no row does.
 
         Args:
-            number: index of the point in its part.
-            part: index of the part of the frame; 0 if the points are not in parts.
+            number: index of the point in the frame, or in the part if the points are in parts.
+                part: index of the part that contains the point; 0 if the points are not in parts.
         """
         return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
@@ -104,7 +105,7 @@ class Explanation:
         """Return the lines of the listing, as text with roles.
 
         Args:
-            every: whether to draw the bits of all elements of an array, not only of the first.
+            every: whether to draw the bits of all elements of an array, instead of only the first.
         """
         return [
             *Listing(self.rows, every=every).lines(),
@@ -186,14 +187,14 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
 
 
 def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
-    """Return all values of a frame in wire order, by path with array indices."""
+    """Return {path with array indices: value} of a frame, in wire order."""
     return FrameRows(sensor.frames[frame], data).values()
 
 
 def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
-    """Return the result of a command in one sentence, and the fields of the reply.
+    """Return a sentence on the result of a command, and the fields of the reply.
 
-    Each field is a tuple (path, value, documentation).
+    Each field is a tuple (path, value as text, documentation).
     """
     if not reply.confirmed or reply.frame is None:
         return "sent; no reply is documented, so the result is unknown", []
@@ -223,10 +224,12 @@ def is_valid_frame(sensor: Sensor, data: bytes, name: str) -> bool:
 def _add_points(
     sensor: Sensor, name: str, data: bytes, rows: tuple[ExplainedRow, ...]
 ) -> tuple[tuple[ExplainedRow, ...], tuple[str, ...]]:
-    """Return the rows with their points, and notes on the frame."""
+    """Return the rows with the points that each contains, and notes on the frame."""
     frame = sensor.frames[name]
     survey = get_codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    notes = ["not plausible: decoders skip this frame"] * bool(survey.status[0] == IMPLAUSIBLE)
+    notes = ["the values are not plausible, so decoders skip this frame"] * bool(
+        survey.status[0] == IMPLAUSIBLE
+    )
     if not (frame.data or frame.points):
         return rows, tuple(notes)
     try:
@@ -239,10 +242,10 @@ def _add_points(
             return rows, tuple(notes)
         evaluated = evaluate_plainly(packets)
     except LidarSpecError as error:
-        return rows, (*notes, f"no points: {error}")
-    notes += ["default values are used in place of those from a frame of another type"] * bool(
-        evaluated.cloud.nominal
-    )
+        return rows, (*notes, f"the frame could not be decoded to points: {error}")
+    notes += [
+        "default values are used, because a frame of another type with the values is missing"
+    ] * bool(evaluated.cloud.nominal)
     points = [ExplainedPoint.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain
     parts = _find_parts_with_points(sensor, name, data)
@@ -274,9 +277,9 @@ def _add_points(
 
 
 def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]:
-    """Return the paths of the parts that contain the points, e.g. "segments[0]".
+    """Return the paths of the parts with points, e.g. "segments[0]".
 
-    Empty if the points are not in parts.
+    The list is empty if the points are not in parts.
     """
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
@@ -296,13 +299,14 @@ def _find_point_numbers(
 ) -> list[int]:
     """Return the indices of the points in a row.
 
-    Only rows of the innermost array with points have points.
+    Only the elements of the innermost array of `chain` have points.
 
     Args:
         path: the path of the row.
         chain: the axes of the nested arrays with the points, outermost first.
-        axes: the axes of `numbers`; None for an axis that is not an array of the frame.
-        numbers: the index of each point; -1 for elements without a point.
+        axes: the array along each dimension of `numbers`; None if the dimension is not an array of
+            the frame. numbers: index of the point of each array element; -1 for an element without
+            a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

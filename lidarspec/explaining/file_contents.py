@@ -1,7 +1,7 @@
-"""Describe the contents of a file: kind, senders, sensors, times, and losses.
+"""Describe the contents of a file: its kind, senders, sensors, times, and losses.
 
-If a file is long, only its beginning is read, and all counts refer to this part. The last time is
-read as well, if the file can seek to its end.
+Only the beginning of a long file is read, and all counts refer to this part. The time of the last
+packet is also read if the transport of the file can skip to its end.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
 
-#: Maximum number of bytes and of packets to read from the beginning of a file.
+#: Maximum number of bytes to read from the beginning of a file. The next constant is the maximum
+#: number of packets.
 MAX_BEGINNING_BYTES = 1 << 26
 MAX_BEGINNING_PACKETS = 1 << 18
 #: Maximum number of bytes to decode.
@@ -48,6 +49,7 @@ MAX_DECODED_BYTES = 1 << 24
 MAX_LISTED_FLOWS = 6
 #: A time after all arrivals, ns since 1970.
 _END_NS = (1 << 63) - 1
+#: Transport of a file -> the kind of the file in words.
 KINDS: Mapping[type[Transport], str] = {
     RecordingTransport: "a recording",
     CaptureTransport: "a capture",
@@ -81,10 +83,10 @@ class SensorContent:
     Attributes:
         source: the SOURCE that selects this data.
         sensors: ids of the sensors that match.
-        share: share of the bytes that are in frames, from 0 to 1; None if the file names the
+        share: share of the bytes that are in valid frames, from 0 to 1; None if the file names the
             sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
-        reading: statistics of the part that was decoded; None if there are none.
+        reading: statistics of the part that was decoded; None if the data cannot be decoded.
         verb: the verb of the command line that shows the data.
     """
 
@@ -110,11 +112,11 @@ class FileContents:
         kind: the kind of the file in words.
         size: the size of the file, in bytes.
         header: the header of a recording; None for other files.
-        flows: senders and receivers, most bytes first; a byte stream has one flow.
+        flows: the packets by sender and receiver, most bytes first; a byte stream has one flow.
         first_ns: arrival time of the first packet, ns since 1970; None if unknown.
         last_ns: arrival time of the last packet, ns since 1970; None if unknown.
         last_read_ns: arrival time of the last packet that was read; None if unknown.
-        whole: whether the whole file was read; otherwise all counts refer to its beginning.
+        whole: whether the whole file was read; if not, all counts refer to its beginning.
         contents: the data of each sensor.
         warnings: warnings about the file.
     """
@@ -231,9 +233,9 @@ def read_contents(path: str | Path) -> FileContents:
 
 
 def measure_duration(path: str | Path) -> float | None:
-    """Return the seconds from the first packet of a file to the last.
+    """Return the time from the first to the last packet of a file, in seconds.
 
-    None if times are unknown, or if a long file would have to be read to its end.
+    Returns None if times are unknown, or if a long file would have to be read to its end.
 
     Raises:
         SourceError: if the file cannot be opened.
@@ -317,7 +319,7 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 def _measure_rates(source: str, sensor: Sensor) -> MeterReading | None:
     """Return the statistics of a sensor at the beginning of a file.
 
-    None if the frames cannot be read.
+    Returns None if the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:
@@ -350,7 +352,7 @@ def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
     if any(flow.sender for flow in contents.flows):
         unit = "packets"
     else:
-        unit = "pieces"
+        unit = "chunks"
     lines.append(("holds", f"{contents.packets} {unit}, {contents.bytes} bytes{rate}"))
     for flow in contents.flows[:MAX_LISTED_FLOWS]:
         if flow.sender is not None:
@@ -369,8 +371,8 @@ def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
         lines.append(
             (
                 "part",
-                "the file is long: only its beginning is counted"
-                + ", and its end is unknown" * (contents.last_ns is None),
+                "only the beginning of this long file is counted"
+                + "; the time of its end is unknown" * (contents.last_ns is None),
             )
         )
     for content in contents.contents:
@@ -380,12 +382,12 @@ def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
 
 def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
     if not content.sensors:
-        yield "sensor", f"not identified among the installed ones ({content.source})"
+        yield "sensor", f"no installed sensor matches ({content.source})"
         return
     if content.share is None:
         sure = "named in the file"
     else:
-        sure = f"{content.share:.1%} of the bytes are in its frames"
+        sure = f"{content.share:.1%} of the bytes are in valid frames"
     yield "sensor", f"{' or '.join(content.sensors)}: {sure}"
     if (reading := content.reading) is not None:
         if reading.speed_hz is not None:
@@ -393,7 +395,7 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
                 "scans",
                 (
                     f"{reading.speed_hz:.2f} Hz, {reading.points or 0:.0f} points each,"
-                    f" {reading.valid or 0:.0f} of them valid"
+                    f" of which {reading.valid or 0:.0f} are valid"
                 ),
             )
         if reading.loss_rate is None:

@@ -22,7 +22,7 @@ DEGREES_PER_TURN = 360
 
 
 class TextSpan(NamedTuple):
-    """A piece of a line with its role, which decides its colour.
+    """A part of a line, with a role that decides its colour.
 
     The roles are "", "offset", "hex", "name", "bits", "docs", "good", "bad", "point", "note" and
     "title".
@@ -35,7 +35,7 @@ class TextSpan(NamedTuple):
 class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
-    A point without a valid return has x, y and z nan, and the range inf (no return) or nan.
+    Without a valid return, x, y and z are nan. The range is then inf (no return) or nan.
     """
 
     x: float
@@ -85,12 +85,12 @@ class FieldValue:
         raw: the raw value, a number or bytes.
         physical: the value in `unit`; None if the value is not a number.
         unit: the unit; "" if the field has none.
-        digits: number of decimals that show every step of the value; None for a float field.
+        digits: number of decimals to print; None for a float field.
         label: the label of the raw value; "" if it has none.
-        bits: the bits of the row's bytes that belong to the field, as text; "" for whole bytes.
+        bits: text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
         docs: the documentation of the field.
         start: offset of the first byte in the frame.
-        masks: a mask for each byte, in which the bits of the field are set.
+        masks: one byte for each byte of the field, in which the bits of the field are 1.
     """
 
     path: str
@@ -142,10 +142,9 @@ class FieldValue:
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the value as a dict for JSON.
+        """Return the value as a dict for JSON, without empty attributes.
 
-        Bytes and masks are hexadecimal text, nan and infinity are None. Empty attributes are
-        omitted.
+        Bytes and masks become hexadecimal text, and nan and infinity become None.
         """
         if isinstance(self.raw, bytes | bytearray):
             raw = self.raw.hex(" ")
@@ -155,14 +154,14 @@ class FieldValue:
             physical = {}
         else:
             physical = {"value": number(self.physical)}
-        place = {"start": self.start, "masks": self.masks.hex(" ")}
+        position = {"start": self.start, "masks": self.masks.hex(" ")}
         more = {
             name: text
             for name in ("unit", "label", "bits", "docs")
             if (text := getattr(self, name))
         }
         more |= {"text": text} if (text := str(self)) else {}
-        return {"path": self.path, "raw": raw, **physical, **more, **place}
+        return {"path": self.path, "raw": raw, **physical, **more, **position}
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,7 @@ class ExplainedRow:
         remarks: remarks on constants, checksums and missing bytes.
         right: False if the bytes do not match the spec.
         points: the points in this element.
-        numbers: for each point: index of the part of the frame, and index of the point in the part.
+        numbers: (index of the part of the frame, index of the point in the part) of each point.
     """
 
     offset: int
@@ -191,7 +190,7 @@ class ExplainedRow:
 
     @property
     def meaning(self) -> str:
-        """Values with units, remarks, documentation and points, in one line."""
+        """One line with the values and their units, remarks, documentation and points."""
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[TextSpan]:
@@ -223,15 +222,15 @@ class ExplainedRow:
     def first(self) -> bool:
         """Whether the row is in the first element of each array that contains it.
 
-        Texts that are equal in all elements are shown only there.
+        Texts that are the same in all elements are shown only in the first.
         """
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
         """Return each value as text.
 
-        The name of a field is omitted if no other value of the row has its unit. The first element
-        of an array also shows the bits of each value.
+        A text contains the name of the field only if another value of the row has the same unit. In
+        the first element of an array, it also contains the bits.
         """
         if alone and self.remarks:
             return []
@@ -291,7 +290,7 @@ class FieldDifference:
 
     @property
     def missing(self) -> str:
-        """The only frame that has the field, "first" or "second"; "" if both have it."""
+        """ "first" or "second" if only this frame has the field; "" if both have it."""
         if self.before is None:
             return "second"
         if self.after is None:
@@ -300,7 +299,7 @@ class FieldDifference:
 
     @property
     def masks(self) -> bytes:
-        """The bits of the field that differ: a mask for each byte that both frames have."""
+        """A mask for each byte that both frames have; the bits that differ are 1."""
         own = self.before.masks if self.before else b""
         return bytes(
             (a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False)
@@ -308,7 +307,7 @@ class FieldDifference:
 
     @property
     def change(self) -> str:
-        """The signed change of the physical value as text; "" if there is no number."""
+        """The signed change of the physical value as text; "" if the value is not a number."""
         if (
             not self.before
             or not self.after
@@ -341,7 +340,8 @@ class FieldDifference:
 def bit_picture(data: bytes, masks: bytes) -> str:
     """Return the bits of one value as text, e.g. ".. 000001.. 00011000".
 
-    The highest bit of each byte is first. Dots are bits of other values.
+    The highest bit of each byte comes first. Dots stand for bits of other values; ".." is a byte
+    without bits of this value.
     """
     parts = []
     for byte, mask in zip(data, masks, strict=True):
@@ -351,7 +351,7 @@ def bit_picture(data: bytes, masks: bytes) -> str:
 
 
 def number(value: Any) -> Any:
-    """Return a value for JSON: None for nan and infinity."""
+    """Return a value for JSON: None for nan and infinity, any other value unchanged."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -372,14 +372,14 @@ def format_fixed(value: float, digits: int | None) -> str:
 
 
 def limits(low: float, high: float, between: str = "..") -> str:
-    """Format a range of numbers, e.g. "0..4294967295"; integers with all digits."""
+    """Format a range of numbers, e.g. "0..4294967295"; integers have all their digits."""
     return between.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Format the type of a command argument: the range of a number, or a name."""
+    """Return the range of a command argument that is a number, else the name of its type."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)
@@ -399,7 +399,7 @@ def ascii_text(data: bytes | bytearray) -> str:
 def hexdump(error: WireError) -> str:
     """Return a hexdump of the bytes around an error; "" if the error has no bytes.
 
-    The last line marks the invalid bytes and names their field.
+    The last line of the text marks the invalid bytes and names their field.
     """
     size = _count_marked_bytes(error)
     first = min(error.offset, len(error.data)) // HEXDUMP_LINE_BYTES * HEXDUMP_LINE_BYTES
@@ -437,4 +437,4 @@ def describe_losses(sensor: Sensor) -> str:
         return f"counted by `{sensor.sequence.field}`"
     if sensor.counts_losses:
         return "counted by the clock"
-    return "not counted: the packets have no counter, and no clock with a declared pace"
+    return "not counted, because the packets have no counter and no clock with a declared pace"

@@ -20,20 +20,19 @@ from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
 
-#: Maximum number of decimals that are used to distinguish all values of a field.
+#: Maximum number of decimals to print so that all values of a field differ.
 MAX_DIGITS = 12
-#: Maximum number of decimals that are added to show each step exactly.
+#: Maximum number of further decimals to print so that each value is exact.
 MAX_EXTRA_DIGITS = 2
 
 
 class FrameRows:
-    """The rows of one frame, up to the end of its bytes.
+    """The rows of one frame, which may be truncated.
 
     Args:
         frame: the frame type.
         data: the bytes.
-        fault: the fault of the frame, which is reported in the row of its field; None if the frame
-            is valid.
+        fault: the fault of the frame; the row of its field reports it. None if the frame is valid.
 
     Attributes:
         after: the offset after the frame.
@@ -62,7 +61,7 @@ class FrameRows:
         self.after = len(data) if self._is_whole_text else self._end
 
     def _find_array_axes(self) -> list[str]:
-        """Return the axes of all arrays except byte strings."""
+        """Return the paths of all arrays, without byte strings."""
         axes: list[str] = []
         for info in self._schema.all_fields.values():
             axes += info.axes[:-1] if info.kind == "bytes" else info.axes
@@ -71,7 +70,7 @@ class FrameRows:
     def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
         """Return the fields of the frame; the last field may be truncated.
 
-        None if the end of the frame is unknown.
+        Returns None if the frame cannot be read, so that its end is unknown.
         """
         if isinstance(frame_layouts(frame), NotCompilableError):
             return plain_fields(frame, struct)
@@ -93,9 +92,10 @@ class FrameRows:
         )
 
     def iter_rows(self) -> Iterator[ExplainedRow]:
-        """Yield a row for each field or bit block, and for start and end of a wire form.
+        """Yield a row for each field, bit block or array element.
 
-        All fields of an array element are one row if the element contains no further array.
+        An array element is one row if it contains no further array. A frame with a wire form has
+        rows for the bytes before and after its struct as well.
         """
         if self._first:
             yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), right=True)
@@ -110,9 +110,9 @@ class FrameRows:
         return {value.path: value for row in self.iter_rows() for value in row.values}
 
     def iter_rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
-        """Yield the row of the bytes after the last field, if there are any.
+        """Yield a row of the bytes after the last field, or nothing if no bytes follow it.
 
-        They are the bytes of a truncated field, or bytes after the frame.
+        These bytes belong to a truncated field, or they follow the end of the frame.
         """
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
@@ -125,10 +125,10 @@ class FrameRows:
             )
 
     def _find_row_path(self, path: str) -> str:
-        """Return the path of the row of a field.
+        """Return the path of the row that shows a field.
 
-        It is the innermost array element that contains the field, or the field itself if it is not
-        in an array, or if the element contains further arrays.
+        This is the path of the innermost array element around the field. It is the path of the
+        field itself if the field is in no array, or if the element contains further arrays.
         """
         head, bracket, _ = path.rpartition("]")
         array = without_indices(head + bracket)[0]
@@ -168,7 +168,7 @@ class FrameRows:
         return info
 
     def _find_fault(self, field: WireField, info: FieldInfo) -> str:
-        """Return a text if the value of a field is wrong, else ""."""
+        """Return a text that describes the fault of a field's value, "" for a valid value."""
         if info.const is not None and field.raw != info.const:
             shown = format_hex(field.raw, info.bits)
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
@@ -198,9 +198,9 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
 
 @functools.lru_cache
 def _count_digits(scale: float, offset: float) -> int:
-    """Return the number of decimals that distinguish all values of a field.
+    """Return the number of decimals that make all values of a field differ.
 
-    Up to `MAX_EXTRA_DIGITS` more are added if they show each step exactly.
+    Up to `MAX_EXTRA_DIGITS` more decimals are used if each value is then exact.
     """
     steps = (to_exact(scale), to_exact(offset))
     distinguishing = next(
@@ -217,7 +217,7 @@ def _count_digits(scale: float, offset: float) -> int:
 
 
 def _describe_checksum(seal: PlacedSeal) -> tuple[str, bool]:
-    """Return a text about a checksum, and whether the checksum is right."""
+    """Return a text about a stored checksum, and whether the checksum is valid."""
     algorithm = seal.seal.algorithm
     count = sum(end - start for start, end in seal.seal.spans)
     plural = "s" if count != 1 else ""
@@ -226,7 +226,7 @@ def _describe_checksum(seal: PlacedSeal) -> tuple[str, bool]:
     if seal.stored == seal.computed:
         verdict = "ok"
     elif seal.is_right:
-        verdict = "means not filled"
+        verdict = "means no checksum"
     else:
         verdict = f"wrong, expected {computed}"
     how = f"({algorithm.describe()} over {count} byte{plural})"

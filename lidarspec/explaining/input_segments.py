@@ -1,9 +1,8 @@
 """Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
 The decoder finds the valid frames, and `iter_pieces` yields each frame as soon as it is found.
-`explain_piece` searches the bytes between them for damaged frames. A damaged frame begins with the
-constants at the start of a frame type. It ends after the size of the frame, or one byte before or
-after if another frame begins there, or at the start of the next frame.
+`explain_piece` searches the bytes between valid frames for damaged frames. A damaged frame begins
+with the constants at the start of a frame type. `_find_end` describes where it ends.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
-#: Frame types that begin with fewer constant bytes are not searched for.
+#: Minimum number of constant bytes at the start of a frame type to search for its damaged frames.
 MIN_SYNC_BYTES = 2
-#: If more bytes without a frame have arrived, they are yielded as a piece.
+#: Maximum number of bytes outside frames that are kept; more are yielded as a piece.
 MAX_HELD_BYTES = 1 << 16
-#: Placeholder for the frame type of a whole input that may be one damaged frame.
+#: Used as the frame type of a whole input that may be one damaged frame of unknown type.
 NEAREST = "?"
 
 
@@ -41,7 +40,7 @@ class InputPiece:
         offset: offset of the first byte in the input.
         data: the bytes.
         frame: the frame type; "" for bytes that are not in a frame; or `NEAREST`.
-        datagram: whether the bytes are a datagram, or a part of one, that is not in a frame.
+        datagram: whether the bytes are a datagram, or a part of a datagram, and not in a frame.
     """
 
     offset: int
@@ -67,17 +66,17 @@ class InputPiece:
 def iter_pieces(
     sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
 ) -> Iterator[InputPiece]:
-    """Yield the frames of the input and the bytes between them, in order, when found.
+    """Yield the frames of the input and the bytes between them, in order.
 
-    If a datagram is not a frame, it is a separate piece. If a whole input is not longer than a
-    frame, and contains no valid frame, it is one piece of the type `NEAREST`.
+    A datagram that is not a frame is a piece of its own. An input that is not longer than the
+    longest frame, and contains no valid frame, is one piece of the type `NEAREST`.
 
     Args:
         sensor: the sensor.
         chunks: the input.
         datagrams: whether each chunk is a datagram, not a piece of a stream.
-        frame: the preferred frame type if several types match the same bytes. It is also found
-            without the frame that it has to follow. Frames of other types are yielded as well.
+        frame: the frame type that is preferred if several types match the same bytes. Its `after`
+            is ignored. Frames of other types are yielded as well.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -156,9 +155,9 @@ def _split_input(
 def explain_piece(
     sensor: Sensor, piece: InputPiece, frame: str | None = None
 ) -> Iterator[tuple[InputPiece, Explanation]]:
-    """Yield a piece with its explanation.
+    """Yield (piece, explanation) of a piece, or of each part of it.
 
-    If the piece is not a frame, it is split into damaged frames and the bytes between them.
+    A piece outside frames is split into damaged frames and the bytes between them.
 
     Args:
         sensor: the sensor.
@@ -214,9 +213,9 @@ def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
 def find_likely_starts(sensor: Sensor, data: bytes) -> list[int]:
     """Return the offsets at which a frame may begin, in ascending order.
 
-    At these offsets, the bytes match the constants at the start of an incoming frame type, and at
-    least one more byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constants are not
-    searched for.
+    At such an offset, the bytes match the constants at the start of an incoming frame type, and at
+    least one more byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constant bytes
+    are ignored.
     """
     starts: set[int] = set()
     for frame in sensor.incoming.values():
@@ -243,7 +242,7 @@ def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
 def _find_headless_type(sensor: Sensor, data: bytes) -> str:
     """Return the type of a frame that is damaged at its start.
 
-    Returns "" if no single change explains the damage.
+    Returns "" if no single change to a frame of any type explains the damage.
     """
     return next((name for name, frame in sensor.incoming.items() if find_changes(frame, data)), "")
 
@@ -251,8 +250,8 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    If another frame begins at the expected end, or one byte before or after it, the frame ends
-    there. Otherwise it ends at the expected end or the next start, whichever comes first.
+    The frame has the size of its type, or one byte less or more if another frame begins after it.
+    If another frame begins earlier, the damaged frame ends where that frame begins.
 
     Args:
         data: the bytes.

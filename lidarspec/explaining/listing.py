@@ -1,8 +1,8 @@
-"""List an explained frame, and differences between frames, as lines.
+"""List an explained frame, and the differences between two frames, as lines.
 
-A frame has a line for each row, indented by the nesting of the struct, with the bits of bit fields
-below. Lines consist of spans with roles, which a terminal can colour. Differences have a line for
-each field, with the bits that differ.
+A frame has a line for each row. The line is indented by the nesting of the structs, and lines with
+the bits of bit fields follow. A difference has a line for its field, followed by lines with the
+bits that differ. A line consists of spans with roles, from which a terminal chooses colours.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ MAX_BITS_WIDTH = 35
 MAX_NAME_WIDTH = 36
 #: Number of bytes of a field in a line of its differences.
 DIFFERENCE_LINE_BYTES = 4
-#: Number of spans at the start of a line that are columns.
+#: Number of columns of a line: its first spans. The text after the columns can be folded.
 COLUMN_COUNT = 3
-#: Minimum width beside the columns; lines are not folded if there is less.
+#: Minimum width of the text after the columns; if less is left, lines are not folded.
 MIN_FOLDED_WIDTH = 24
 
 Line = tuple[TextSpan, ...]
@@ -45,7 +45,7 @@ def join_text(line: Line) -> str:
 
 
 def fold(line: Line, width: int) -> Line:
-    """Return a line with line breaks if it is wider than `width`.
+    """Insert line breaks into a line that is wider than `width` characters.
 
     Continuation lines are indented to the end of the columns.
     """
@@ -69,18 +69,18 @@ def fold(line: Line, width: int) -> Line:
 def parents(path: str) -> list[str]:
     """Return the paths of the structs that contain a field, outermost first.
 
-    "a[0].b.c" is in "a[0]" and "a[0].b".
+    For example, "a[0].b.c" gives ["a[0]", "a[0].b"].
     """
     parts = path.split(".")
     return [".".join(parts[:depth]) for depth in range(1, len(parts))]
 
 
 class Listing:
-    """The lines of the rows of a frame, in columns.
+    """Formats the rows of a frame as lines with aligned columns.
 
     Args:
         rows: the rows.
-        every: whether to draw the bits of all elements of an array, not only of the first.
+        every: whether to draw the bits of all elements of an array, instead of only the first.
     """
 
     def __init__(self, rows: Sequence[ExplainedRow], *, every: bool) -> None:
@@ -185,7 +185,7 @@ def _indent_path(path: str, depth: int) -> str:
 
 
 def list_differences(differences: list[FieldDifference], sizes: tuple[int, int]) -> Iterator[Line]:
-    """Yield lines with the differences of two frames, and a summary.
+    """Yield lines with the differences of two frames, and a last line with a summary.
 
     Args:
         differences: the fields that differ.
@@ -203,7 +203,7 @@ def list_differences(differences: list[FieldDifference], sizes: tuple[int, int])
     differing = (
         f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
     )
-    yield (TextSpan(differing if fields else f"{length}, all identical", "note"),)
+    yield (TextSpan(differing if fields else f"{length}; the frames are identical", "note"),)
 
 
 def _iter_difference_lines(difference: FieldDifference) -> Iterator[Line]:
