@@ -140,7 +140,7 @@ def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | f
 
 
 def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """Return the length of an array that is declared or follows from given count fields.
+    """Return the length of an array, which is declared or follows from count fields.
 
     If neither gives the length, but elements of the array are given, returns 0: the caller then
     makes the array as long as its elements require.

@@ -307,7 +307,7 @@ class FieldDifference:
 
     @property
     def change(self) -> str:
-        """The signed change of the physical value as text; "" if the value is not a number."""
+        """The signed change of the physical value as text; "" if it is not a number."""
         if (
             not self.before
             or not self.after
@@ -379,7 +379,7 @@ def limits(low: float, high: float, between: str = "..") -> str:
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Return the range of a command argument that is a number, else the name of its type."""
+    """Return the range of a numeric command argument, else the name of its type."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)

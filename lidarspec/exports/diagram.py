@@ -487,7 +487,7 @@ class _Sheet:
 
 
 def _find_nesting_depth(group: BoxGroup) -> int:
-    """Return the number of levels of groups inside a group; 0 if it contains only boxes."""
+    """Return the number of levels of groups inside a group; 0 for only boxes inside."""
     return max(
         (1 + _find_nesting_depth(item) for item in group.items if isinstance(item, BoxGroup)),
         default=0,

@@ -95,7 +95,10 @@ def _to_json(fact: Any) -> Any:
 
 
 def link_data(link: Link) -> dict[str, Any]:
-    """Return a link as JSON data: "kind" is its class, the other keys are its attributes."""
+    """Return a link as JSON data.
+
+    The key "kind" is its class; the other keys are its attributes.
+    """
     data = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
@@ -245,7 +248,9 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts(node: tree.PartSequence) -> dict[str, Any]:
-    """Return the rules that end a sequence of parts, and the kinds of parts, as JSON data.
+    """Return the rules and the kinds of a sequence of parts as JSON data.
+
+    The rules determine where the sequence ends.
 
     For each kind, the key "following" has the size of the next part in bytes.
     """

@@ -98,7 +98,7 @@ Scope = tuple[str | None, ...]
 
 
 def format_reference(scope: Scope, ref: tree.Ref) -> str:
-    """Return the integer expression that reads a field from inside the innermost type of `scope`.
+    """Return the integer expression of a field, for use in the innermost type.
 
     Raises:
         ExportError: if no type around the expression contains the field.
@@ -246,14 +246,14 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the "if" entry of an attribute, for the instances that use the attribute; else {}."""
+    """Return the entry "if" of an attribute for instances that use it; {} if it has none."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
 
 
 def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """Return the parts of a block in the order in which Kaitai reads them, and "be" or "le".
+    """Return the parts of a block in Kaitai's order, and the order: "be" or "le".
 
     With "be", Kaitai reads each byte from its highest bit and fills integers from the highest bit.
     With "le", it reads and fills from the lowest bit. Returns None if neither order reads every
@@ -271,7 +271,7 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the bit position of the field's start in the block, calculated from each segment.
+    """Return the bit position of a field's start, calculated from each segment.
 
     All segments give the same position if Kaitai can read the field as consecutive bits.
     """
@@ -573,7 +573,7 @@ def _size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _value(node: tree.Node) -> tree.Node:
-    """Return an element of an array, or an alternative, as a member with the name `value`."""
+    """Return an element of an array, or an alternative, as a member named `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

@@ -218,7 +218,7 @@ class {to_class_name(sensor.id)}(Sensor):
 
 
 def _build(message: ExportedFrame) -> str:
-    """Return the signature of `build` for one frame type; its fields are keyword arguments."""
+    """Return the signature of `build` with the fields of one frame type."""
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
         for member in message.root.struct.members

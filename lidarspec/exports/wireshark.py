@@ -528,7 +528,7 @@ def _width(bits: int) -> int:
 
 
 def _word_order(block: tree.Block) -> str | None:
-    """Return the byte order in which Wireshark can show each part of a block as a bit mask.
+    """Return the byte order in which Wireshark can show the parts of a block as masks.
 
     In this order, the bits of each part are contiguous in one word. Returns None if no byte order
     fits or if the block has more than 4 bytes.

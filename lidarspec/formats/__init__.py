@@ -1,7 +1,8 @@
 """File formats of scans, by the suffix of the file.
 
-In: scans. Out: a file, which gets its name only when it is complete. Callers use `write`.
-`formats` includes the formats of plugins. Modules in reading order:
+In: scans. Out: a file with the points, written by `write`. The file has a temporary name until it
+    is complete. `formats` returns all formats, including those of plugins. Modules in reading
+    order:
 
 * `common`: functions shared by the formats.
 * `text`: .csv, .csv.gz and .xyz, one row per point.
@@ -15,7 +16,7 @@ In: scans. Out: a file, which gets its name only when it is complete. Callers us
 * `messages`: ROS messages of scans, packets and IMU samples.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan.
 * `foxglove`: .foxglove.mcap, with Foxglove messages.
-* `frame_tables`: frames of any type, one row each, to .csv, .parquet, .arrow, .feather or .mcap.
+* `frame_tables`: .csv, .parquet, .arrow, .feather and .mcap, one row per frame of any type.
 * `rerun`: .rrd, for the Rerun viewer.
 """
 
@@ -54,37 +55,37 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: placeholder of a path for a part of a scan's stamp -> the part of the ISO text of the stamp.
+#: placeholder in a path -> the characters of a scan's stamp, as ISO text, that replace it.
 TIME_PLACEHOLDERS = {
     "%F": slice(10),
     "%H": slice(11, 13),
     "%M": slice(14, 16),
     "%S": slice(17, 19),
 }
-#: all placeholders of a path: for the time or the number of a scan.
+#: matches a placeholder in a path, for the time or the number of a scan.
 PLACEHOLDER = re.compile(rf"%0?\d?d|{'|'.join(TIME_PLACEHOLDERS)}")
 ARRAYS = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR)
 TABLES = (PARQUET, ARROW, FEATHER)
 CLOUDS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57)
 BAGS = (MCAP, FOXGLOVE, BAG, ROSBAG2, DB3, RERUN)
-BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
+BUILT_IN = {format.suffix: format for format in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 
 def formats() -> dict[str, Format]:
     """Return every format by suffix, including the formats of plugins.
 
-    The built-in formats have priority.
+    If a plugin has a format with the suffix of a built-in format, the built-in format is returned.
 
     Raises:
         SpecError: if a plugin's hook fails.
     """
     try:
-        added = [found for plugin in registry().call("lidarspec_formats") for found in plugin]
+        added = [format for formats in registry().call("lidarspec_formats") for format in formats]
     except LidarSpecError:
         raise
     except Exception as error:
         raise SpecError(f"{type(error).__name__}: {error}", path="lidarspec_formats") from error
-    return {**{found.suffix: found for found in added}, **BUILT_IN}
+    return {**{format.suffix: format for format in added}, **BUILT_IN}
 
 
 def format_of(path: str | Path) -> Format:
@@ -140,7 +141,7 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 def find_existing(path: str | Path) -> list[str]:
     """Return the existing files that `write` may replace.
 
-    For a path without placeholders, the path is returned even if it does not exist.
+    If the path has no placeholders, it is returned even if the file does not exist.
     """
     path = Path(path)
     if not PLACEHOLDER.search(str(path)):
@@ -163,22 +164,22 @@ def write(
 
     Args:
         path: the file. An existing file is replaced when the new file is complete, and kept if
-            writing fails. The path may have placeholders: consecutive scans with the same path
-            share a file, and missing folders are made. In "scans/%05d.pcd", %05d is the number of
-            the scan, from 0, so each scan has a file. In "drive/date=%F/hour=%H/%M.parquet", %F,
-            %H and %M are the date, hour and minute of the scan's stamp in UTC, so each minute has a
-            file; %S is the second.
+            writing fails. The path may have placeholders, which are filled for each scan.
+            Consecutive scans with the same path share a file. Missing folders are made. In
+            "scans/%05d.pcd", %05d is the number of the scan, from 0, so each scan has a file. In
+            "drive/date=%F/hour=%H/%M.parquet", %F, %H and %M are the date, hour and minute of the
+            scan's stamp in UTC, so each minute has a file. %S is the second.
         scans: the scans.
         every_point: whether to write points without a valid return as well.
         organized: whether to write every point of a scan in rows and columns, with nan for missing
             points. A file then contains one scan, unless the format stores scans separately.
-        packets: the raw packets, to write to a ROS log in addition to the points; None for no
-            packets.
+        packets: raw packets to write to a ROS log in addition to the points; None for no packets.
 
     Raises:
         UnknownFormat: for an unknown suffix.
-        UsageError: if the time in a path repeats, so that a file would be overwritten; or if the
-            format, the sensor or the number of scans does not support `organized` or `packets`.
+        UsageError: if times repeat, so that a file would be overwritten. Also if `organized` is not
+            possible for the format, the sensor or the number of scans, or if the format cannot
+            store `packets`.
         SourceError: if the file cannot be written.
     """
     path = Path(path)
@@ -188,7 +189,7 @@ def write(
         check_holds(path, "packets")
         if PLACEHOLDER.search(str(path)):
             raise UsageError(
-                f"{path}: packets can be written beside the points to a single file only"
+                f"{path}: packets require a single output file, so omit placeholders such as %05d"
             )
     if organized:
         check_holds(path, "organized")
@@ -215,7 +216,9 @@ def check_holds(path: str | Path, feature: str) -> None:
         UsageError: with the formats that have the feature.
     """
     if feature not in format_of(path).holds:
-        having = ", ".join(suffix for suffix, known in formats().items() if feature in known.holds)
+        having = ", ".join(
+            suffix for suffix, format in formats().items() if feature in format.holds
+        )
         raise UsageError(
             f"{path}: {format_of(path).suffix} does not support --{feature}; formats that do:"
             f" {having}"
@@ -231,7 +234,7 @@ def _iter_organized(path: Path, scans: Iterable[Scan], *, is_single: bool) -> It
     for number, scan in enumerate(scans):
         if scan.points.shape is None:
             raise UsageError(
-                f"points of {scan.sensor.id} have no rows and columns: omit --organized"
+                f"the points of {scan.sensor.id} are not in rows and columns: omit --organized"
             )
         if number and is_single:
             error = UsageError(

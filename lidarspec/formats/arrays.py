@@ -1,8 +1,8 @@
 """Write NumPy arrays (.npz, .npy) and Zarr folders.
 
-The size of an array precedes its data in .npz, but is known only at the end. Each column is
-therefore first written to an unnamed file in the same folder. The arrays of Zarr, which xarray and
-Dask open, grow by whole chunks.
+In an .npz file, the size of an array comes before its data, but it is known only at the end. Each
+column is therefore first written to an unnamed file in the same folder. In a Zarr folder, which
+xarray and Dask can open, the arrays grow by whole chunks.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def write_array(
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write an .npz file with the columns of points and of scans.
+    """Write an .npz file: an array for each column of the points, arrays about scans.
 
-    Columns of points are written if all scans have them. The column `scan` has the number of each
-    point's scan; `stamp_ns`, `rate_hz` and `complete` have one value per scan. The unit of an
-    additional column is in NAME.unit. With `organized`, the columns of the single scan have the
+    A column is written if all scans have it. The column `scan` has the number of each point's scan.
+    `stamp_ns`, `rate_hz` and `complete` have one value per scan. The unit of an additional column
+    NAME is in NAME.unit. With `organized`, the file has a single scan, and its arrays have the
     shape (rows, columns), with several returns side by side.
     """
     height: int | None = None
@@ -106,11 +106,11 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
 def write_npy(
     path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
 ) -> None:
-    """Write one structured array with PCL's layout, as `PointCloud.to_structured`.
+    """Write one structured array with PCL's layout, like `PointCloud.to_structured`.
 
     Missing columns are 0. If there are several scans, the column `scan` has the number of each
-    point's scan. With `organized`, the array has the shape (rows, columns) of the single scan. The
-    file can be memory-mapped: ``np.load(path, mmap_mode="r")``.
+    point's scan. With `organized`, the file has a single scan, and the array has its shape, (rows,
+    columns). ``np.load(path, mmap_mode="r")`` maps the file into memory.
     """
     write_rows(
         path,
@@ -126,7 +126,7 @@ def _make_structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
 
 
 def _make_npy_header(rows: PointRows) -> bytes:
-    """Return the header; NumPy pads it, so its length does not depend on the shape."""
+    """Return the header. NumPy pads it, so its length does not depend on the shape."""
     header = io.BytesIO()
     shape = {
         "descr": np.lib.format.dtype_to_descr(rows.dtype),
@@ -138,7 +138,10 @@ def _make_npy_header(rows: PointRows) -> bytes:
 
 
 class _ZarrColumn:
-    """An array that grows by whole chunks, so that no chunk is compressed twice."""
+    """A Zarr array that grows by whole chunks.
+
+    No chunk is compressed twice.
+    """
 
     def __init__(
         self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
@@ -156,7 +159,10 @@ class _ZarrColumn:
         self._length = 0
 
     def add(self, values: NDArray[Any] | None, length: int) -> None:
-        """Append values; if they are None, append nan or 0 `length` times."""
+        """Append values.
+
+        If `values` is None, appends `length` times nan, or 0 for integers.
+        """
         dtype = self._array.dtype
         self._waiting.append(
             np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values
@@ -178,7 +184,7 @@ class _ZarrColumn:
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a folder with the columns of the first scan, and the columns of scans.
+    """Write a folder with the columns of the first scan, and arrays about the scans.
 
     The dimension of point columns is "points"; the column `scan` has the number of each point's
     scan. The dimension of `stamp_ns`, `rate_hz` and `complete` is "scans". Arrays have the

@@ -1,7 +1,7 @@
 """Write tables with pyarrow, one row per point: Parquet, Arrow and Feather.
 
-Arrow and Feather files can be memory-mapped. Scans are joined to row groups or record batches of at
-least `MIN_GROUP_ROWS` points. Columns are not copied.
+Arrow and Feather files can be memory-mapped. A row group or record batch contains several scans,
+with at least `MIN_GROUP_ROWS` points. Columns are written without a copy.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lidarspec.transports.protocol import Format
 
 #: minimum number of points in a row group or record batch; the last may have fewer.
 MIN_GROUP_ROWS = 1 << 17
-#: maximum number of record batches in a table that are not copied together.
+#: maximum number of record batches in a table. More are copied to a single batch.
 MAX_UNJOINED_BATCHES = 8
 
 
@@ -32,12 +32,14 @@ def _write(
 ) -> None:
     """Write the columns of the first scan, and columns about the scan of each point.
 
-    `scan` is the number of the scan. `stamp` is its stamp as a timestamp in ns without a time zone,
-    which pandas and DuckDB keep exactly; `time` counts from it. `complete` is `Scan.complete`. If a
-    later scan lacks a column, its values are nan, or null for integers. With `every_point`, x, y
-    and z of a point without a return are nan. The metadata of a field has its unit. The metadata of
-    the schema has `sensor`, `source` (the source of the format's facts), `frame` (the directions of
-    x, y and z), `units` as JSON, and `calibration`: "nominal" or "own".
+    The column `scan` is the number of the scan. `stamp` is the stamp of the scan, as a timestamp in
+    ns without a time zone, which pandas and DuckDB read exactly. `time` is in seconds since this
+    stamp. `complete` is `Scan.complete`. If a later scan lacks a column, its values are nan, or
+    null for integers. With `every_point`, x, y and z of a point without a return are nan.
+
+    The metadata of a field has its unit. The metadata of the schema has `sensor`, `source` (the
+    document that describes the wire format), `frame` (the directions of x, y and z), `units` as
+    JSON, and `calibration`: "nominal" or "own".
     """
     tables = iter_tables(scans, path, every_point=every_point)
     first = next(tables)
@@ -55,8 +57,8 @@ def iter_tables(
 
     Args:
         scans: the scans.
-        path: the path of the file. If a folder in it gives a column, for example scan=7, the column
-            is omitted, as in Hive.
+        path: the path of the file. If the name of a folder in the path gives a column, for example
+            scan=7, the column is omitted, as in Hive.
         every_point: whether to include points without a valid return.
     """
     arrow = import_library("pyarrow", "arrow")
@@ -79,7 +81,7 @@ def iter_tables(
 
 
 def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
-    """Return the rows of record batches as a table; join many small batches."""
+    """Return the rows of record batches as a table."""
     table = arrow.Table.from_batches(batches, schema)
     if len(batches) > MAX_UNJOINED_BATCHES:
         return table.combine_chunks()
@@ -87,7 +89,7 @@ def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 
 def _make_scan_fields(path: Path | None) -> list[Any]:
-    """Return the fields about the scan of a point, without fields that a folder gives."""
+    """Return the fields about the scan of a point, except those that the path gives."""
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
     named = {part.partition("=")[0] for part in folders if "=" in part}
@@ -127,8 +129,8 @@ def _make_batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: S
 def _make_array(arrow: Any, values: Any, kind: Any) -> Any:
     """Return values as an Arrow array.
 
-    If the values have the right type, the array is made from their buffer: otherwise pyarrow would
-    load pandas, which takes 0.2 s.
+    If the values have the required type, the array is made from their buffer, because pyarrow's own
+    conversion loads pandas, which takes 0.2 s.
     """
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
@@ -140,10 +142,10 @@ def _make_array(arrow: Any, values: Any, kind: Any) -> Any:
 
 
 def open_parquet(path: Path, schema: Any) -> Any:
-    """Return a Parquet writer, without compression.
+    """Return a writer of a Parquet file without compression.
 
-    Compression would take longer than everything else. Columns of integers, which have few distinct
-    values, use a dictionary.
+    Compression would take longer than all other steps together. Columns of integers use a
+    dictionary, because they have few distinct values.
     """
     dictionary_columns = [
         field.name for field in schema if str(field.type) not in ("float", "double", "bool")

@@ -1,10 +1,10 @@
 """Write robotics logs: ROS messages in an MCAP file, ROS 1 bag or ROS 2 bag.
 
 The topic /points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has each scan
-as sensor_msgs/LaserScan (see `messages`). The frame is "laser", and the log time of both is the
-stamp of the scan. Messages have no field for the units of additional columns; they are in the
-metadata of the log, except in ROS 1 bags, which have no metadata. On request, /packets has the raw
-packets with their arrival times, so that the log can be read again as a source.
+as sensor_msgs/LaserScan (see `messages`). The frame is "laser". The log time of both messages is
+the stamp of the scan. The units of additional columns are in the metadata of the log; ROS 1 bags
+have no metadata, so they do not contain the units. On request, /packets has the raw packets with
+their arrival times, so that the log can be read again as a source.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lidarspec.transports.robotics_logs import RAW
 
 #: message type -> topic.
 TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
-#: size of a chunk of an MCAP file, which readers load at once: about one scan.
+#: size of a chunk of an MCAP file. Readers load a whole chunk, so it contains about one scan.
 CHUNK_BYTES = 1 << 20
 
 
@@ -34,11 +34,12 @@ class BagWriter:
     """Makes the messages of one log.
 
     Args:
-        release: the release with the message definitions, by its name in rosbags: "ROS1_NOETIC".
+        release: the ROS release of the message definitions, as rosbags names it, e.g.
+            "ROS1_NOETIC".
 
     Attributes:
-        types: the definitions.
-        units: the units of additional columns so far, by name.
+        types: the message definitions.
+        units: column -> unit, for the additional columns of the scans so far.
     """
 
     def __init__(self, release: str) -> None:
@@ -76,7 +77,10 @@ class BagWriter:
 def write_mcap(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write an MCAP file like ROS 2, for Foxglove, `ros2 bag` and PlotJuggler."""
+    """Write an MCAP file with ROS 2 messages.
+
+    Foxglove, `ros2 bag` and PlotJuggler can read it.
+    """
     mcap = import_library("mcap.writer", "ros")
     bag_writer = BagWriter("ROS2_HUMBLE")
     channels = dict[str, int]()
@@ -98,7 +102,7 @@ def write_mcap(
 def write_ros1(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write a ROS 1 bag like `rosbag record`."""
+    """Write a ROS 1 bag, as `rosbag record` does."""
     bag_writer = BagWriter("ROS1_NOETIC")
     _record(
         import_library("rosbags.rosbag1", "ros").Writer(path),
@@ -121,8 +125,8 @@ def write_ros2(
         path: the folder or file.
         scans: the scans.
         packets: the raw packets.
-        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a single
-            database file, which `ros2 bag` can read as well.
+        storage: "mcap" writes a folder with metadata.yaml and an MCAP file. "sqlite3" writes a
+            single database file, which `ros2 bag` can also read.
         every_point: whether to write points without a valid return.
     """
     import sqlite3  # only needed here

@@ -3,9 +3,9 @@
 They select the points of scans, store columns in temporary files, and replace a file when the new
 file is complete.
 
-A format is a function that writes scans to a path while they arrive, so that it needs little
-memory. Many formats begin with their size, which is known only at the end. They write the size last
-at the start of the file, or store their columns in unnamed files until the size is known.
+The writer of a format is a function that writes scans to a path while they arrive, so that it needs
+little memory. Many files begin with their size, which is known only at the end. The writer then
+fills in the size at the end, or it stores the columns in unnamed files until the size is known.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from lidarspec.remote_files import remove
 from lidarspec.scans.scan import Scan
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: suffix of a folder format -> the names of its files. A folder with any other file is not
-#: replaced.
+#: suffix of a format that writes a folder -> pattern of the files in the folder. A folder that
+#: contains any other file is not replaced.
 FOLDER_FILES = {
     ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
     ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
@@ -43,7 +43,7 @@ _Piece = TypeVar("_Piece")
 
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to; it replaces `path` when the block ends.
+    """Yield a temporary path to write to, and rename it to `path` when the block ends.
 
     If the block raises, the new file is removed.
 
@@ -70,10 +70,9 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign_files(folder: Path) -> None:
-    """Raise if replacing a folder would delete files that its format does not write.
+    """Raise UsageError if a folder contains files that its format does not write.
 
-    Raises:
-        UsageError: with the first of these files.
+    Replacing the folder would delete these files.
     """
     if not folder.is_dir():
         return
@@ -82,7 +81,7 @@ def refuse_foreign_files(folder: Path) -> None:
         name = path.relative_to(folder).as_posix()
         if path.is_symlink() or (path.is_file() and not (pattern and pattern.fullmatch(name))):
             error = UsageError(
-                f"{folder} holds other files, such as {name}, which would be deleted"
+                f"{folder} contains other files, such as {name}, which would be deleted"
             )
             raise suggest(error, "choose another output, or move these files away")
 
@@ -117,7 +116,7 @@ def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
 def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
     """Return the indices of the points to write; None for all points.
 
-    Indexing columns by integers is several times as fast as by a mask.
+    Indexing a column by integers is several times as fast as indexing it by a mask.
     """
     if every_point or cloud.valid.all():
         return None
@@ -127,9 +126,10 @@ def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | N
 def select_columns(
     scan: Scan, names: Iterable[str], *, every_point: bool
 ) -> dict[str, NDArray[Any]]:
-    """Return the requested columns that a scan has, for the points to write.
+    """Return the columns of the points to write, by name.
 
-    "valid" and additional columns can be requested as well.
+    Requested columns that the scan does not have are omitted. "valid" and additional columns can be
+    requested as well.
     """
     cloud = scan.points
     existing = tuple(name for name in names if name == "valid" or cloud.has_column(name))
@@ -149,7 +149,7 @@ def select_columns(
 def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
     """Return values of organized points, (n,), as an image, (rows, columns).
 
-    The image has a row for each ring, with several returns side by side.
+    The image has one row for each ring. Several returns of a beam are side by side in the row.
     """
     columns, rows = cloud.shape or (len(cloud), 1)
     returns = len(cloud) // max(columns * rows, 1) or 1

@@ -16,7 +16,7 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: column -> name in the standard.
+#: column -> name of the field in the standard.
 NAMES = {
     **{
         "x": "cartesianX",
@@ -32,7 +32,7 @@ NAMES = {
         "return_index": "returnIndex",
     },
 }
-#: fields with limits in the header: group -> name in the group -> field.
+#: group of limits in the header -> {beginning of a limit's name: field in the standard}.
 LIMITS = {
     "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
     "intensityLimits": {"intensity": "intensity"},
@@ -40,7 +40,7 @@ LIMITS = {
 }
 #: the standard's value for a point without valid coordinates.
 INVALID = 2
-#: prefix and URL of the extension with the additional columns.
+#: prefix and URL of the extension that contains the additional columns.
 PREFIX = "lidarspec"
 EXTENSION = "urn:lidarspec:columns"
 #: types that libE57Format does not support -> their replacements.
@@ -55,11 +55,11 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write each scan with a header.
 
     Points have coordinates, intensity, time, ring (as row), column, return, and the additional
-    columns. `timeStamp` counts from the scan's acquisitionStart, which is its stamp as GPS time
-    with 18 leap seconds. `returnCount` is the maximum of the scan. Additional columns are an
-    extension, lidarspec:NAME, which other readers ignore; their units are in the scan's
-    description. With `every_point`, a point without a return is at 0 with cartesianInvalidState 2.
-    The library keeps headers in memory until the file is closed.
+    columns. `timeStamp` is in seconds since acquisitionStart, which is the stamp of the scan as GPS
+    time with 18 leap seconds. `returnCount` of each point is the maximum of the scan. Additional
+    columns have names of an extension, lidarspec:NAME, which other readers ignore; the description
+    of the scan has their units. With `every_point`, a point without a return has the coordinates 0
+    and cartesianInvalidState 2. The library keeps the headers in memory until the file is closed.
     """
     pye57 = import_library("pye57", "e57")
     libe57 = import_library("pye57.libe57", "e57")
@@ -100,7 +100,7 @@ def _add_scan(
 
 
 def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the columns with the names of the standard, in supported types."""
+    """Return the columns with the names of the standard, converted to supported types."""
     invalid = ~own["valid"]
     columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
     columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
@@ -137,7 +137,7 @@ def _make_header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return minima and maxima of the valid points: group -> name -> value."""
+    """Return the minima and maxima of the valid points, as group -> name -> value."""
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}
@@ -154,7 +154,7 @@ def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _make_node(libe57: Any, image: Any, value: Any) -> Any:
-    """Return a node for a value of a header; a structure for a mapping."""
+    """Return the node of a header value; a mapping becomes a structure."""
     if not isinstance(value, Mapping):
         kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
         return kinds[type(value)](image, value)
@@ -165,7 +165,10 @@ def _make_node(libe57: Any, image: Any, value: Any) -> Any:
 
 
 def _make_column_node(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
-    """Return the node of a column; integers have only the bits that they need."""
+    """Return the node of a column.
+
+    Integers use the number of bits that their range requires.
+    """
     if column.dtype.kind != "f":
         low, high = (int(column.min()), int(column.max())) if len(column) else (0, 0)
         return libe57.IntegerNode(image, low, low, high)

@@ -1,8 +1,8 @@
 """Write logs for Foxglove: scans as Foxglove Protobuf messages in an MCAP file.
 
 The topic /points has each scan as foxglove.PointCloud. For planar sensors, /scan has each scan as
-foxglove.LaserScan. Stamps, frame, layout of the points, and units in the metadata are the same as
-in ROS logs (see `bags`).
+foxglove.LaserScan. The stamps, the frame, the layout of the points, and the units in the metadata
+are the same as in ROS logs (see `bags`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: type -> its number in foxglove.PackedElementField.
+#: NumPy type -> its number in foxglove.PackedElementField.
 FIELD_TYPES = {"u1": 1, "b1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
 
 
@@ -40,7 +40,8 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
         for scan in scans:
             if scan.stamp_ns < 0:
                 raise UsageError(
-                    f"stamp of a scan is {scan.stamp_ns} ns: MCAP files support no time before 1970"
+                    f"the stamp of a scan is {scan.stamp_ns} ns, but MCAP files have no time"
+                    " before 1970"
                 )
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
             messages = {TOPICS[CLOUD]: _make_cloud(scan.points, every_point=every_point)}

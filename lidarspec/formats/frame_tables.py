@@ -1,11 +1,12 @@
-"""Write frames of any type, one row each, with their fields in units.
+"""Write frames of any type, one row per frame, with their fields in units.
 
-A row has `time_ns`, the time of the frame, and each field that is not constant: numbers in their
-units, integers without a unit unchanged, bytes as hexadecimal text, or as text if the frame is
-text. Each element of an array of numbers is a column, for example `gains[2]`; its value is nan if a
-frame does not have the element. A table contains one frame type. An MCAP file has a topic for each
-type, with JSON messages for Foxglove and PlotJuggler; its log times are the arrival times, if they
-are known.
+A row has the time of the frame, `time_ns`, and each field that is not constant. Numbers are in the
+unit of the field; integers without a unit are unchanged. Bytes are hexadecimal text, or plain text
+if the frame is text. Each element of an array of numbers is a column, for example `gains[2]`. Its
+value is nan if a frame does not have the element.
+
+A table contains one frame type. An MCAP file has a topic for each type, with JSON messages for
+Foxglove and PlotJuggler. The log time of a message is the arrival time of the frame if it is known.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def frame_columns(packets: Packets) -> Columns:
 def _read_numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
     """Return a field in its unit, (n, ...) float64.
 
-    If an integer field has no unit, and all frames have it, the integers are returned.
+    If the field is an integer without a unit, and all frames have it, returns the integers.
     """
     values = packets[path]
     if info.kind == "int" and not info.scaled and values.ndim == 1 and not np.isnan(values).any():
@@ -72,10 +73,10 @@ def _split_elements(path: str, values: NDArray[Any]) -> Columns:
 
 
 def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
-    """Return a text for each frame from a field of bytes, (n, ..., bytes).
+    """Return the bytes of a field, (n, ..., bytes), as one text per frame.
 
     Args:
-        is_text: whether the bytes are ASCII; otherwise the texts are hexadecimal.
+        is_text: whether to decode the bytes as ASCII, instead of writing hexadecimal digits.
     """
     rows = [row.tobytes() for row in values]
     if is_text:
@@ -84,11 +85,11 @@ def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
 
 
 def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
-    """Write frames to a file in the format of its suffix; return their number.
+    """Write frames to a file in the format of its suffix, and return their number.
 
     Args:
-        path: the file: .csv, .csv.gz, .parquet, .arrow or .feather for one frame type; .mcap for
-            several.
+        path: the file. For one frame type, its suffix is .csv, .csv.gz, .parquet, .arrow or
+            .feather. An .mcap file can contain several types.
         batches: the frames.
 
     Raises:
@@ -97,11 +98,13 @@ def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
     """
     path = Path(path)
     name = path.name.lower()
-    known = [suffix for suffix in WRITERS if name.endswith(suffix)]
-    if not known:
-        raise UsageError(f"{path}: frames are written to {', '.join(WRITERS)}")
+    suffixes = [suffix for suffix in WRITERS if name.endswith(suffix)]
+    if not suffixes:
+        raise UsageError(
+            f"{path}: frames cannot be written to this format; use {', '.join(WRITERS)}"
+        )
     with replace_file(path) as part:
-        return WRITERS[max(known, key=len)](part, batches)
+        return WRITERS[max(suffixes, key=len)](part, batches)
 
 
 def holds_several_types(path: str | Path) -> bool:
@@ -110,7 +113,10 @@ def holds_several_types(path: str | Path) -> bool:
 
 
 def _iter_tables(batches: Iterable[Batch]) -> Iterator[Columns]:
-    """Yield the columns of each batch, the same columns as in the first batch."""
+    """Yield the columns of the packets of each batch.
+
+    All tables have the columns of the first; missing values are nan.
+    """
     names: list[str] = []
     for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
         columns = frame_columns(packets)
@@ -133,7 +139,7 @@ def _write_csv(path: Path, batches: Iterable[Batch], *, is_zipped: bool = False)
 
 
 def _format_cells(values: Any) -> list[str]:
-    """Return the cells of a column for CSV; texts with special characters are quoted."""
+    """Return the cells of a column for CSV, with quotes around texts that need them."""
     if isinstance(values, list):
         return [_quote(text) for text in values]
     if values.dtype.kind == "f":
@@ -164,9 +170,10 @@ def _write_table(
 
 
 def _with_float_integers(columns: Columns) -> Columns:
-    """Return columns with integers as float64, except `time_ns`.
+    """Return columns with integers converted to float64, except `time_ns`.
 
-    The types then do not depend on the batch: integers become float64 if a frame lacks them.
+    A column of integers is float64 in a batch in which a frame lacks the field. After the
+    conversion, it has the same type in all batches.
     """
     return {
         name: values.astype(np.float64)

@@ -21,7 +21,7 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: columns with a standard field in LAS.
+#: columns that LAS has a standard field for.
 STANDARD_COLUMNS = ("x", "y", "z", "intensity", "time", "return_index", "valid")
 #: columns that become extra dimensions.
 EXTRA_COLUMNS = ("ring", "column")
@@ -29,7 +29,7 @@ EXTRA_COLUMNS = ("ring", "column")
 REPLACED_TYPES = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
 #: size of a coordinate step.
 STEP_M = 1e-4
-#: the offset of coordinates is 0 up to this distance.
+#: maximum coordinate for which the offset of coordinates stays 0.
 MAX_UNSHIFTED_M = 1e5
 #: the origin of adjusted standard GPS time, in ns since 1970.
 ADJUSTED_GPS_EPOCH_NS = GPS_EPOCH_NS + 10**18
@@ -42,19 +42,21 @@ WITHHELD_FLAG = 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
-    """Write coordinates, intensity, return and GPS time, and extra dimensions.
+    """Write the coordinates, intensity, return and GPS time, and extra dimensions.
 
-    Ring, column, the number of the scan and the additional columns are extra dimensions.
+    The ring, the column, the number of the scan and the additional columns are extra dimensions.
+    The description of an additional column is its unit. "_" is appended to a name that LAS already
+    uses. If a later scan lacks a column, its values are nan, or 0 for integers.
+
     `intensity` is the raw value, rounded and limited to 65535. The stamp is interpreted as a time
-    since 1970, and written as adjusted standard GPS time with 18 leap seconds, exact to 0.1
-    microseconds. `number_of_returns` is the maximum of the scan. The unit of an additional column
-    is its description; "_" is appended to a name that LAS already uses. With `every_point`, a point
-    without a return is withheld, and at the offset of the file, because LAS has no nan. If a later
-    scan lacks a column, its values are nan, or 0. Range and angles are omitted, because they follow
-    from the coordinates.
+    since 1970. It is written as adjusted standard GPS time with 18 leap seconds, exact to 0.1
+    microseconds. `number_of_returns` of each point is the maximum of the scan. With `every_point`,
+    a point without a return has the flag "withheld" and the coordinates of the file's offset,
+    because LAS has no nan. Range and angles are omitted, because they follow from the coordinates.
 
     Raises:
-        UsageError: if coordinates are farther from the offset than 32-bit steps reach, 214 km.
+        UsageError: if a coordinate is more than 214 km from the offset, which 32-bit steps cannot
+            represent.
     """
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
@@ -98,7 +100,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
 def _fill_header(
     laspy: Any, header: Any, own: Mapping[str, NDArray[Any]], scan: Scan
 ) -> dict[str, str]:
-    """Add the extra dimensions and the facts of the first scan to a header.
+    """Add extra dimensions, and the facts of the first scan, to a header.
 
     Returns:
         Column -> name of its extra dimension.
@@ -127,9 +129,10 @@ def _fill_header(
 
 
 def _choose_offset(coordinates: NDArray[Any]) -> float:
-    """Return the offset of coordinates along an axis, in metres.
+    """Return the offset of the coordinates along one axis, in metres.
 
-    It is 0 near the origin. Otherwise it is the first finite coordinate, rounded to whole metres.
+    It is the first finite coordinate, rounded to whole metres, if this is farther than
+    `MAX_UNSHIFTED_M` from 0; else 0.
     """
     first = coordinates[np.isfinite(coordinates)][:1].round()
     if len(first) and abs(first[0]) > MAX_UNSHIFTED_M:
@@ -138,9 +141,9 @@ def _choose_offset(coordinates: NDArray[Any]) -> float:
 
 
 def _pack_returns(own: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """Return return number and number of returns in one byte for each point, (n,).
+    """Return the return number and number of returns of each point in a byte, (n,).
 
-    The return number, from 1, is in the low four bits.
+    The low four bits are the return number, from 1. The high four bits are the number of returns.
     """
     if "return_index" in own:
         numbers = np.minimum(own["return_index"], MAX_RETURN_NUMBER - 1) + 1
@@ -171,7 +174,7 @@ def _fill_records(
         if np.abs(steps).max() > MAX_STEPS:
             reason = (
                 f"{axis} is {np.abs(steps).max() * STEP_M / 1000:.0f} km from {offset:.0f} m, which"
-                " exceeds LAS with steps of 0.1 mm"
+                " LAS cannot store in steps of 0.1 mm"
             )
             raise suggest(UsageError(reason), "lidarspec convert IN OUT.parquet")
         rows[axis.upper()] = steps
@@ -184,7 +187,10 @@ def _fill_records(
 
 
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a compressed file, with 1/6 to 1/2 of the size in seven times the time."""
+    """Write a compressed file.
+
+    It has 1/6 to 1/2 of the size of a LAS file. Writing it takes seven times as long.
+    """
     lazrs = import_library("lazrs", "las")
     try:
         _write(path, scans, every_point=every_point, is_compressed=True)

@@ -1,8 +1,9 @@
 """Serialize scans, packets and IMU samples as ROS messages, for logs and topics.
 
-A scan is a sensor_msgs/PointCloud2. For planar sensors it is also a sensor_msgs/LaserScan on an
-even grid of angles. Points have PCL's layout: x y z intensity time as float32, ring as uint16, then
-the additional columns. If the sensor lacks a column, the column is omitted.
+A scan becomes a sensor_msgs/PointCloud2. For planar sensors, it also becomes a
+sensor_msgs/LaserScan with evenly spaced angles. Points have PCL's layout: x y z intensity time as
+float32, ring as uint16, then the additional columns. Columns that the sensor does not have are
+omitted.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.robotics_logs import DATAGRAM, RAW, STAMP, STREAM
 
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
-#: type -> its number in PointField. Other types are written as float64.
+#: NumPy type -> its number in PointField. Values of other types are written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _SECOND = 1_000_000_000
 
@@ -33,7 +34,7 @@ class RosMessage(NamedTuple):
 
     Attributes:
         kind: the message type.
-        at: the time, ns.
+        at: the stamp or arrival time, ns since 1970.
         data: the bytes.
     """
 
@@ -45,13 +46,14 @@ class RosMessage(NamedTuple):
 class RosMessages:
     """Makes ROS messages.
 
-    The methods raise UsageError if a message cannot contain the stamp.
+    The methods raise UsageError if the stamp is outside the range of ROS messages.
 
     Args:
-        release: the release with the message definitions, by its name in rosbags: "ROS1_NOETIC".
+        release: the ROS release of the message definitions, as rosbags names it, e.g.
+            "ROS1_NOETIC".
 
     Attributes:
-        types: the definitions.
+        types: the message definitions.
     """
 
     def __init__(self, release: str) -> None:
@@ -84,14 +86,14 @@ class RosMessages:
     def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> RosMessage:
         """Return a PointCloud2 message with the points of a scan.
 
-        If all points of an organized scan are written, the cloud has the rows of the sensor, with
-        several returns side by side. Otherwise it has one row.
+        If all points of an organized scan are written, the cloud has a row for each ring, with
+        several returns side by side. Otherwise it has a single row.
 
         Args:
             scan: the scan.
             at: the stamp of the message, ns.
             every_point: whether to include points without a valid return.
-            number: the number of the scan, for messages of ROS 1.
+            number: the number of the scan, for the header of ROS 1 messages.
         """
         cloud = scan.points
         points = make_records(cloud, every_point=every_point)
@@ -130,10 +132,10 @@ class RosMessages:
         )
 
     def imu(self, samples: ImuSamples, index: int, at: int, frame_id: str) -> RosMessage:
-        """Return an Imu message with one sample, by REP-145.
+        """Return an Imu message with one sample, as REP-145 specifies.
 
-        The first covariance of a quantity is -1 if it is not measured, and 0 if its error is
-        unknown.
+        The first covariance of a quantity is -1 if the sensor does not measure the quantity. It is
+        0 if the measurement error is unknown.
         """
         vector = self.types.types["geometry_msgs/msg/Vector3"]
         values: dict[str, Any] = {}
@@ -160,7 +162,8 @@ class RosMessages:
     def _make_time(self, at: int) -> Any:
         if not 0 <= at < _SECOND << 31:
             raise UsageError(
-                f"stamp of a scan or packet is {at} ns: ROS supports the years 1970 to 2038"
+                f"the stamp of a scan or packet is {at} ns, outside the years 1970 to 2038 that ROS"
+                " supports"
             )
         return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
 
@@ -172,7 +175,9 @@ def _make_covariance(*, is_known: bool) -> NDArray[np.float64]:
 
 
 def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
-    """Return name, offset and type ("f4") of each field of a cloud's records.
+    """Return (name, offset, type) of each field of a cloud's records.
+
+    The offset is in bytes. The type is, for example, "f4".
 
     Columns that the cloud does not have are omitted.
     """
@@ -182,8 +187,8 @@ def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, 
         if not cloud.has_column(name) or getattr(cloud, name) is None
     }
     return [
-        (name, place[1], place[0].str[1:])
-        for name, place in (points.dtype.fields or {}).items()
+        (name, field[1], field[0].str[1:])
+        for name, field in (points.dtype.fields or {}).items()
         if name not in lacking
     ]
 
@@ -196,8 +201,8 @@ def make_records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
     kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
     if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
         return points
-    known = [
+    supported_types = [
         (name, kind if kind.str[1:] in FIELD_TYPES else np.dtype(np.float64))
         for name, kind in kinds.items()
     ]
-    return points.astype(np.dtype(known, align=True))
+    return points.astype(np.dtype(supported_types, align=True))

@@ -1,8 +1,8 @@
 """Write point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
 
-The formats have no concept of scans: the rows of several scans follow one another, and a field has
-the number of the scan. `time` counts from the stamp of the scan. Comments in the header have the
-stamp of the first scan, the sensor and the units.
+In these formats, a file is one cloud. If several scans are written, their points follow one
+another, and the field `scan` has the number of the scan. `time` is in seconds since the stamp of
+the scan. Comments in the header give the stamp of the first scan, the sensor and the units.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: types that a format, or common readers of the format, do not support -> their replacements.
-#: Integers of 64 bits are exact up to 2**53.
+#: type that a format, or its common readers, do not support -> the type that replaces it. A 64-bit
+#: integer becomes a float, which is exact up to 2**53.
 _PCD_TYPES = {"f2": "f4", "b1": "u1"}
 _PLY_TYPES = {
     **_PCD_TYPES,
@@ -31,7 +31,7 @@ _PLY_TYPES = {
     **dict.fromkeys(("u4", "i8", "u8"), "f8"),
 }
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-#: maximum number of bytes that the header of compressed points can give.
+#: maximum number of bytes that the size field before compressed points can express.
 _MAX_COMPRESSED_BYTES = (1 << 32) - 1
 
 
@@ -40,9 +40,9 @@ def write_pcd(
 ) -> None:
     """Write a binary PCD 0.7 file.
 
-    The fields are x y z intensity ring time, if the sensor has them, and the additional columns. If
-    every point of a single organized scan is written, WIDTH and HEIGHT are the shape of the scan,
-    and missing points are nan. Otherwise HEIGHT is 1.
+    The fields are those of x y z intensity ring time that the sensor has, and the additional
+    columns. If every point of a single organized scan is written, WIDTH and HEIGHT are the shape of
+    the scan, and missing points are nan. Otherwise HEIGHT is 1.
     """
     write_rows(path, _make_pcd_rows(scans, every_point=every_point), _make_pcd_header)
 
@@ -50,10 +50,10 @@ def write_pcd(
 def write_lzf_pcd(
     path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
 ) -> None:
-    """Write the content of `write_pcd` as DATA binary_compressed, with LZF.
+    """Write a PCD file like `write_pcd`, compressed with LZF (DATA binary_compressed).
 
     Raises:
-        UsageError: for 4 GiB of points or more, which the format does not support.
+        UsageError: if the points have 4 GiB or more, which the format does not support.
     """
     compress = import_library("lzf", "pcd").compress
     rows = _make_pcd_rows(scans, every_point=every_point)
@@ -88,9 +88,10 @@ def _compress(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
 
 def _refuse_size(size: int) -> None:
     if size > _MAX_COMPRESSED_BYTES:
-        reason = "a compressed PCD file can hold at most 4 GiB of points"
+        reason = "a compressed PCD file can contain at most 4 GiB of points"
         raise suggest(
-            UsageError(reason), "repeat with a .pcd file, or with one for each scan: %05d.lzf.pcd"
+            UsageError(reason),
+            "repeat with a .pcd file, or with a file for each scan: %05d.lzf.pcd",
         )
 
 
@@ -126,9 +127,9 @@ def _make_pcd_header(rows: PointRows, data: str = "binary") -> bytes:
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a binary little-endian PLY file.
 
-    The properties are x y z intensity ring time, if the sensor has them, and the additional
-    columns. Their types are float, double, uchar or int, because Open3D ignores other types: int
-    for `ring`, double for larger integers.
+    The properties are those of x y z intensity ring time that the sensor has, and the additional
+    columns. Their types are float, double, uchar or int, because Open3D ignores other types. `ring`
+    is an int. Integers that do not fit into an int become double.
     """
     write_rows(
         path,
@@ -156,7 +157,7 @@ def _make_ply_header(rows: PointRows) -> bytes:
 
 
 def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.dtype[Any]:
-    """Return the type of a row without gaps, in types that a format supports."""
+    """Return the type of a row without padding, with the types that a format supports."""
     codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
     return np.dtype([(name, "<" + supported.get(code, code)) for name, code in codes.items()])
 
@@ -164,8 +165,8 @@ def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z intensity as little-endian float32, without a header.
 
-    The intensity is the raw value, not scaled to 1; it is 0 if the sensor has none. In KITTI each
-    file is one scan: ``out/%06d.bin``.
+    The intensity is the raw value; it is not scaled to 0..1 as in KITTI. It is 0 if the sensor
+    measures no intensity. KITTI stores each scan in a file: write to ``out/%06d.bin``.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
     write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")

@@ -21,32 +21,32 @@ from lidarspec.scans.stream import iter_released
 
 #: the first columns of a row; additional columns follow.
 NAMES = STRUCTURED.names or ()
-#: number of digits that are reserved for a number in a header.
+#: number of characters that are reserved for a number in a header.
 RESERVED_DIGITS = 20
-#: number of bytes per write; if they fit into the processor's cache, copying is three times as
-#: fast.
+#: number of bytes per write. They fit into the processor's cache, which makes copying three times
+#: as fast.
 WRITE_BYTES = 1 << 20
 
 
 class PointRows:
-    """The points of scans as structured rows of one type, (n,) per scan.
+    """Iterates over the rows of each scan, structured arrays of one type, (n,).
 
     The possible columns are x y z intensity ring time, the additional columns of the first scan,
-    and the number of the scan (`scan`), if there are several scans. If a later scan lacks a column,
-    its values are 0.
+    and, for several scans, the number of the scan (`scan`). If a later scan lacks a column, its
+    values are 0.
 
     Args:
         scans: the scans.
-        layout: returns the type of a row, given the types of the columns of the first scan.
+        layout: takes {column: type} of the first scan and returns the type of a row.
         every_point: whether to include points without a valid return.
-        is_image: whether the points of a single organized scan are ordered row by row, if every
-            point is written.
+        is_image: whether to order the points of an organized scan row by row. Used only for a
+            single scan of which every point is written.
 
     Attributes:
         dtype: the type of a row.
         length: number of rows so far.
-        shape: (width, height) of a single organized scan, with several returns side by side; None
-            for other scans.
+        shape: (width, height) of the image if the points are ordered row by row, else None. Several
+            returns are side by side in a row.
         facts: lines for a header: the sensor, the stamp of the first scan, and the units.
     """
 
@@ -103,9 +103,9 @@ class PointRows:
     def _select_columns(
         self, scan: Scan, number: int, names: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
-        """Return the requested columns that the scan has, for the points to write.
+        """Return the columns of the points to write, by name.
 
-        The column "scan" has the number of the scan.
+        Requested columns that the scan does not have are omitted. "scan" is the number of the scan.
         """
         columns = select_columns(scan, names, every_point=self._every_point)
         if "scan" in names:
@@ -119,8 +119,8 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
     Args:
         path: the file.
         rows: the rows.
-        header: returns the header. It is called again at the end, when the number of rows is known,
-            so the length of the header must not depend on this number.
+        header: returns the header. It is called before the rows, and again when the number of rows
+            is known, so the length of the header must not depend on this number.
     """
     with path.open("wb") as file:
         file.write(header(rows))
@@ -138,5 +138,5 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
 
 
 def pad_header(*numbers: int) -> str:
-    """Return spaces that make the length of a header independent of some numbers."""
+    """Return spaces that make the length of a header independent of `numbers`."""
     return " " * sum(RESERVED_DIGITS - len(str(number)) for number in numbers)

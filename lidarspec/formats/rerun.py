@@ -1,8 +1,9 @@
 """Write Rerun recordings, .rrd: scans as coloured points, with statistics.
 
-The data is on the timelines of the sensor and of the host. `view --rerun` uses the same
-`RerunRecording` for the Rerun viewer. All entities of a sensor (points, mount, facts, `statistics`)
-are below its id, so that recordings of several sensors can be opened together.
+The data is logged on a timeline of the sensor's clock and on a timeline of the host's clock. `view
+--rerun` also uses `RerunRecording`, to send data to the Rerun viewer. The entity paths of a sensor
+(points, mount, facts, `statistics`) begin with its id, so that recordings of several sensors can be
+opened together.
 """
 
 from __future__ import annotations
@@ -30,24 +31,25 @@ from lidarspec.transports.protocol import Format
 POINT_RADIUS_PX = 1.5
 #: length of a sensor's axes.
 AXIS_LENGTH_M = 0.3
-#: number of points after which the data is flushed, which limits the memory.
+#: number of points after which the data is flushed, to limit the memory use.
 FLUSH_POINTS = 1 << 13
 #: maximum number of bytes per read of a pipe.
 MAX_PIPE_READ_BYTES = 1 << 16
-#: names of the timelines: sensor clock, arrival, number of the scan.
+#: names of the timelines: the time of the sensor's clock, the arrival time, the number of the scan.
 SENSOR = "sensor_time"
 HOST = "host_time"
 NUMBER = "scan"
 
 
 class RerunRecording:
-    """One recording; a context manager.
+    """One Rerun recording, a context manager.
 
-    The data is written to a file (`save`), or to a viewer (`spawn` and `connect_grpc` of `stream`).
+    `save` writes the data to a file. `spawn` and `connect_grpc` of the attribute `stream` send the
+    data to a viewer.
 
     Args:
-        ramp: the column that colours show: "range", "intensity" or an additional column. The first
-            scan determines the scale of colours.
+        ramp: the column that the colours show: "range", "intensity" or an additional column. The
+            first scan determines the scale of the colours.
 
     Raises:
         UsageError: if the Rerun SDK is not installed.
@@ -100,7 +102,7 @@ class RerunRecording:
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
-        """Log a scan; before the first scan, log the facts about the sensor.
+        """Log a scan. The first scan is logged after the facts about its sensor.
 
         Raises:
             OSError: if the recording cannot be written.
@@ -153,7 +155,7 @@ class RerunRecording:
                 )
 
     def flush(self) -> None:
-        """Flush the logged data.
+        """Wait until the logged data is written.
 
         Raises:
             OSError: if the recording cannot be written.
@@ -197,9 +199,9 @@ class RerunRecording:
             self.stream.set_time(HOST, timestamp=np.datetime64(scan.host_ns, "ns"))
 
     def _make_layout(self) -> Any:
-        """Return the layout of the viewer: points, with statistics and facts beside them.
+        """Return the layout of the viewer: points, statistics and facts.
 
-        The sensor's timeline is active.
+        The timeline of the sensor's clock is selected.
         """
         views = import_library("rerun.blueprint", "rerun")
         plots = [
@@ -224,9 +226,9 @@ class _PipeCopy(threading.Thread):
     The SDK does not write the file itself, because it may wait forever if the disk is full.
 
     Attributes:
-        end: the end of the pipe to write to.
-        failure: the error of writing the file; None if there is none. All later data is read and
-            discarded.
+        end: file descriptor of the pipe's end to write to.
+        failure: the error that ended the writing; None if there is no error. Data after an error is
+            read from the pipe and discarded.
 
     Raises:
         OSError: if the file cannot be written.
@@ -239,7 +241,7 @@ class _PipeCopy(threading.Thread):
         self.failure: OSError | None = None
 
     def run(self) -> None:
-        """Copy until the other end is closed."""
+        """Copy data until the other end of the pipe is closed."""
         with open(self._begin, "rb", buffering=0) as pipe:
             try:
                 with self._file:
@@ -261,7 +263,10 @@ def _translate_errors() -> Iterator[None]:
 
 
 class _Colours:
-    """Chooses the colours of points, on the scale of the first cloud."""
+    """Returns the colours of points.
+
+    The first cloud determines the scale of the colours.
+    """
 
     def __init__(self) -> None:
         self._look: CloudAppearance | None = None

@@ -1,4 +1,4 @@
-"""Write text, one row per point: CSV with a header, also compressed, and .xyz.
+"""Write text files with one row per point: .csv, .csv.gz and .xyz.
 
 Memory use does not depend on the number of points.
 """
@@ -21,11 +21,11 @@ from lidarspec.formats.common import find_points, select_points, write_in_thread
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: type -> format of numbers. Seven digits are half a micrometre at a distance of a metre.
+#: NumPy type -> format of its numbers. Seven digits are half a micrometre at a distance of 1 m.
 _NUMBER_FORMATS = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
-#: format of times, with nanoseconds.
+#: format of times in seconds, with nine decimals for nanoseconds.
 _TIME_FORMAT = "%.9f"
-#: number of rows that are formatted together, which is a third faster than single rows.
+#: number of rows that are formatted together; this is a third faster than single rows.
 BLOCK_ROWS = 1 << 10
 #: level of gzip. Level 1 compresses numbers to 34 % of their size; the default level 6 reaches 27 %
 #: in five times the time.
@@ -34,10 +34,10 @@ _GZIP_LEVEL = 1
 
 @contextlib.contextmanager
 def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
-    """Open a text file, compressed or not; yield a function that writes to it.
+    """Open a text file, and yield a function that writes to it.
 
-    The function writes in a thread, while the next text is made. A compressed file contains neither
-    its name nor a time, so that equal content gives equal files.
+    The function writes in a thread, while the caller makes the next text. A compressed file
+    contains neither its name nor a time, so that equal content gives equal files.
     """
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
@@ -66,7 +66,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
 
 
 def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write only x y z in metres; missing points are nan."""
+    """Write x y z of each point in metres; missing points are nan."""
     with open_text_file(path) as put:
         for scan in scans:
             which = find_points(scan.points, every_point=every_point)
@@ -93,7 +93,7 @@ def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArr
     """Write the rows of columns.
 
     Args:
-        put: writes a text.
+        put: writes a text to the file.
         template: the %-format of a row.
         columns: the columns, (n,) each.
     """
