@@ -1,19 +1,20 @@
-"""The command line: a verb calls one public function with its arguments.
+"""The command line. Each verb calls a public function of the package.
 
-In: the arguments of a command. Out: text or JSON and an exit code; on failure one message with
-the next command. Modules in reading order:
+In: the arguments of a command. Out: text or JSON, and an exit code. A failure prints one message,
+which suggests the next command. Modules in reading order:
 
-* `root`: the verbs, each imported when it is used; `main`, the entry point.
+* `root`: the list of verbs, and the entry point `main`. A verb is imported when it is used.
 * `completion`: completion of arguments in the shell.
-* `options`, `inputs`: shared options and types of values; the input of commands.
-* `terminal`, `output`, `failures`: standard output and error; results as text, tables or JSON;
-  failures as one message and an exit code.
+* `options`, `inputs`: options that several verbs share, and the input of verbs that read bytes.
+* `terminal`, `output`, `failures`: print to standard output and error; format results as text,
+tables or JSON; report a failure as one message and an exit code.
 * `listing`: the lines of an explanation, in colours.
-* `sensors`, `frames`, `build`: the installed sensors, the fields of a frame, a frame from values.
-* `read`, `view`: a live sensor as rows, statistics or a picture.
+* `sensors`, `frames`, `build`: list the installed sensors, print the fields of frames, build a
+frame.
+* `read`, `view`: print a live sensor's data as rows or statistics, or draw it.
 * `recordings`: record a source into a file, and replay it.
 * `convert`, `info`, `plot`: convert files, describe their contents, draw them.
-* `sim`: a simulated sensor on a port or in a file.
+* `sim`: simulate a sensor on a port or in a file.
 * `finding`: identify a sensor, diagnose missing data, find a checksum.
 * `authors`: create, check and export a sensor.
 """

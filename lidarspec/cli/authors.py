@@ -36,7 +36,7 @@ from lidarspec.testing.sensor_under_test import EXAMPLES
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
-#: Maximum number of bytes of a capture that are analysed.
+#: Maximum number of bytes of a capture to analyse.
 MAX_CAPTURE_BYTES = 1 << 22
 
 
@@ -51,8 +51,8 @@ MAX_CAPTURE_BYTES = 1 << 22
 @click.option(
     "--distribution",
     metavar="NAME",
-    help="Name of the distribution, such as lidarspec-acme; if it exists, the sensor is added to"
-    " it.",
+    help="Name of the distribution, such as lidarspec-acme. The sensor is added to an existing"
+    " distribution of this name.",
 )
 @click.option("--vendor", metavar="NAME", help="Name of the vendor; default: from the id.")
 @click.option("--model", metavar="NAME", help="Name of the model; default: from the id.")
@@ -76,13 +76,15 @@ def new(
     link: str | None,
     capture: str | None,
 ) -> None:
-    """Create a distribution for your own sensor; it works before you change anything.
+    """Create a distribution for your own sensor, with a working example.
 
-    It contains an invented sensor with frames, checksum, points, commands and simulation, its
-    tests, and an entry point, so that lidarspec finds it after installation. --distribution adds a
-    module and its tests to an existing distribution. --from-capture drafts the frames from the
-    bytes of a capture: sync bytes, length, checksum, counters and angles, each with its evidence;
-    all other bytes are marked as unknown.
+    The distribution contains an invented sensor with frames, checksum, points, commands and
+    simulation, its tests, and an entry point, so that lidarspec finds it after installation.
+    --distribution adds a module and its tests to an existing distribution.
+
+    With --from-capture, the frames are drafted from the bytes of a capture. The draft has the sync
+    bytes, the length, the checksum, counters and angles that were found, each with its evidence.
+    All other bytes are marked as unknown.
     """
     names = DistributionNames(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
@@ -118,7 +120,7 @@ def new(
 def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
     """Return the files with a draft of the frames of a capture.
 
-    If several senders or ports occur, the group with the most bytes is used.
+    Only the packets of one sender to one port are used: the group with the most bytes.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:
@@ -162,13 +164,14 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
 @click.option(
     "--vectors",
     metavar="FILE",
-    help="File of golden vectors; default: vectors.json beside the modules.",
+    help="File with example frames and their expected values; default: vectors.json beside the"
+    " modules.",
 )
 @click.option(
     "-v",
     "--verbose",
     is_flag=True,
-    help="Also print measured values, and skipped checks with the reason.",
+    help="Also print measured values, and the reasons for skipped checks.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @output_option
@@ -182,9 +185,9 @@ def check(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Check a sensor, a file or a distribution against every property of the test kit.
+    """Run the checks of the test kit on a sensor, a file or a distribution.
 
-    No test file is needed. The exit code is 1 if there are findings.
+    No test file is needed. The exit code is 1 if a check fails.
     """
     import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None
@@ -238,7 +241,7 @@ def _format_report(report: Report, *, verbose: bool) -> list[str]:
     "-f",
     "--frame",
     metavar="NAME",
-    help="Export this frame type only; default: all types, or the data frame.",
+    help="Export only this frame type; default: all types.",
 )
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
     """Export a sensor's spec: wireshark, c, ksy (Kaitai), md, svg, json, pyi.

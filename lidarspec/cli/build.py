@@ -28,7 +28,8 @@ from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 
-#: Timeout for the reply to the bytes of --hex, and the silence that ends the reply, in seconds.
+#: Timeout for the reply to the bytes of --hex, in seconds. The reply ends when no data arrives for
+#: `REPLY_SILENCE_S`.
 REPLY_TIMEOUT_S = 1.0
 REPLY_SILENCE_S = 0.2
 
@@ -41,12 +42,12 @@ REPLY_SILENCE_S = 0.2
 def build(
     sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None
 ) -> None:
-    """Build one frame from field=value, raw or with a unit such as 1.5m.
+    """Build one frame from the values of its fields.
 
-    A number without a unit is the raw integer. points[*].distance=1m sets every element,
-    points[3].intensity=7 a single one; a later assignment overrides an earlier one. Constants,
-    counts and checksums are filled in. -o writes the bytes, or hexadecimal text if FILE ends in
-    .hex.
+    A number without a unit is the raw integer, and a number with a unit, such as 1.5m, is
+    converted. points[*].distance=1m sets every element of an array, and points[3].intensity=7 sets
+    a single element. A later assignment overrides an earlier one. Constants, counts and checksums
+    are filled in. -o writes the bytes, or hexadecimal text if FILE ends in .hex.
     """
     sensor = named_sensor(sensor_id)
     if "=" in frame:
@@ -96,7 +97,7 @@ def build(
     "--timeout",
     type=DURATION,
     metavar="TIME",
-    help="Reply timeout; default: declared by the sensor.",
+    help="Timeout for the reply; default: the timeout that the sensor declares.",
 )
 @output_options
 def send(
@@ -111,12 +112,12 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    Only this command is sent: a started sensor keeps running after the verb ends. Values are in the
-    unit that `show` prints, or have their own unit: rate=600rpm. If a sensor sends nothing until it
-    is started, name it with -s.
+    No other command is sent, so a sensor that was started keeps running when the verb ends. A value
+    without a unit is in the unit that `show` prints; rate=600rpm has a unit. If a sensor sends
+    nothing until it is started, name it with -s.
     """
     if (command is None) == (digits is None):
-        raise UsageError("send requires either the name of a command, or bytes: --hex 'a5 50'")
+        raise UsageError("send requires the name of a command, or bytes such as --hex 'a5 50'")
     data = b"" if digits is None else _parse_hex(digits)
     answer = _AnswerLog()
     record = (lambda _: answer) if digits is not None and is_live(source) else None
@@ -164,9 +165,13 @@ class _AnswerLog:
         """Do nothing."""
 
     def after(self, number: int, seconds: float) -> list[Chunk]:
-        """Return the chunks from index `number` on.
+        """Wait for the end of a reply, and return its chunks.
 
-        Waits until nothing has arrived for `REPLY_SILENCE_S` seconds, at most `seconds`.
+        Waits until no data arrives for `REPLY_SILENCE_S`, but at most `seconds`.
+
+        Args:
+            number: number of chunks that were received before the reply.
+            seconds: maximum waiting time.
         """
         end = time.monotonic() + seconds
         count = number
@@ -189,7 +194,10 @@ def _write_bytes(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Send bytes, and print an explanation of the reply; data frames are only counted."""
+    """Send bytes, and print an explanation of the reply.
+
+    Data frames are not explained, only counted.
+    """
     _refuse_file(device, source)
     sensor = device.sensor
     before = len(answer.chunks)
@@ -201,10 +209,9 @@ def _write_bytes(
     else:
         pieces = []
     rest = [piece for piece in pieces if piece.frame not in sensor.data_frames]
-    if len(rest) < len(
-        pieces
-    ):  # other data frames: the incomplete pieces at both ends are parts of data frames
-        note(f"{len(pieces) - len(rest)} data frames received meanwhile")
+    if len(rest) < len(pieces):
+        # Data frames arrived as well, so incomplete pieces at both ends are parts of data frames.
+        note(f"{len(pieces) - len(rest)} data frames were received as well")
         rest = [piece for piece in rest if piece.is_valid or piece not in (pieces[0], pieces[-1])]
     parts = [
         (piece, part)
@@ -238,7 +245,7 @@ def _send_command(
 
 def _refuse_file(device: Device, source: str) -> None:
     if not device.is_live:
-        raise suggest(UsageError(f"cannot send to {source}: it is a file"), "lidarspec ports")
+        raise suggest(UsageError(f"cannot send to a file: {source}"), "lidarspec ports")
 
 
 def _reply_to_dict(sensor: Sensor, reply: Reply) -> dict[str, Any]:

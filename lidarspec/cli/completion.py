@@ -1,8 +1,9 @@
 """Completion of the command line in bash, zsh and fish.
 
-Extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the code for the
-shell. The name of a parameter decides how it is completed, for all verbs (`BY_NAME`): as the id of
-a sensor, a frame, a field, a command, a port, a device of `lidarspec.toml`, or a file.
+This module extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the
+code to load into bash. `BY_NAME` maps the name of a parameter to the function that completes it in
+all verbs, for example with sensor ids, frames, fields, commands, ports, or the devices of
+`lidarspec.toml`.
 """
 
 from __future__ import annotations
@@ -47,10 +48,13 @@ class BashCompletion(BashComplete):
         "COMPREPLY+=($value)",
         "COMPREPLY+=($value)\n            [[ $value == *[=:/] ]] && compopt -o nospace",
     )
-    _bash_prefix = ""  # the part of the word at the cursor that bash regards as earlier words
+    _bash_prefix = ""  # the part of the current word that bash treats as separate words
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the cursor and the word at it, which bash has split."""
+        """Return the words before the cursor, and the word at the cursor.
+
+        Bash splits words at the characters in `BREAKS`; the parts are joined again.
+        """
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in (*args, incomplete):
@@ -63,7 +67,7 @@ class BashCompletion(BashComplete):
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return the completion of the part of the word that bash replaces."""
+        """Return a completion without the part of the word that bash does not replace."""
         return f"{item.type},{item.value.removeprefix(self._bash_prefix)}"
 
 
@@ -77,7 +81,7 @@ def complete(group: click.Command, instruction: str) -> int:
 
 
 def attach(command: click.Command) -> None:
-    """Complete the parameters of a verb by their names."""
+    """Add completion to the parameters of a verb, chosen by their names."""
     for param in command.params:
         list_names = BY_NAME.get(param.name or "")
         if list_names is not None and isinstance(param.type, click.types.StringParamType):
@@ -91,7 +95,8 @@ def _complete_word(
 ) -> list[CompletionItem]:
     """Return the possible values that begin with a word.
 
-    If files are possible and no value begins with the word, the shell completes files.
+    If no value begins with the word, and the parameter accepts files, the shell completes file
+    names.
     """
     items = [
         CompletionItem(name)
@@ -110,7 +115,7 @@ def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Return devices, ports, simulated sensors, and the files that match.
 
-    If only files match, the result is empty, so that the shell completes files.
+    The result is empty if only files match, so that the shell completes file names.
     """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]
@@ -130,9 +135,9 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _find_sensor(ctx: click.Context) -> Sensor | None:
-    """Return the sensor that the words before the cursor name; None if they name none.
+    """Return the sensor that the words before the cursor give; None if they give none.
 
-    They name it with -s, with a device of lidarspec.toml, or with a simulated source.
+    They give a sensor by -s, by a device of lidarspec.toml, or by a simulated source.
     """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
@@ -158,7 +163,7 @@ def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return the fields of a frame, or the arguments of a command, each with "="."""
+    """Return the fields of a frame or the arguments of a command, followed by "="."""
     sensor = _find_sensor(ctx)
     frame = ctx.params.get("frame") or ""
     command = ctx.params.get("command") or ""
@@ -180,7 +185,10 @@ def _format_path(path: str, info: FieldInfo) -> str:
 
 
 def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return the columns that every sensor has; only data shows the others."""
+    """Return the columns that every sensor has.
+
+    The other columns of a sensor are known only when its data is read.
+    """
     return ("range", "intensity")
 
 
@@ -205,7 +213,7 @@ def _sensors_and_distributions(ctx: click.Context, incomplete: str) -> Iterable[
     return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
 
 
-#: Functions that return all possible values. For the other functions, files are possible as well.
+#: Functions for parameters that do not accept files.
 WITHOUT_FILES = (_frames, _commands, _assignments, _verbs, _columns, _formats)
 #: name of a parameter -> function that returns its possible values.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {

@@ -47,13 +47,13 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
-#: The suffixes of files that hold packets. `.bin` means points here, as in KITTI's data set.
+#: The suffixes of files with packets. In `convert`, `.bin` is a file with points, as in KITTI.
 _PACKET_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
 
 
 @dataclass
 class _Counts:
-    """The numbers of written scans and points, which are also shown as progress."""
+    """Counts the scans and points that are written, and shows them as progress."""
 
     device: Device
     target: str
@@ -87,7 +87,7 @@ class _Counts:
 @click.option(
     "--organized",
     is_flag=True,
-    help="Write all points of a scan as rows and columns; missing points are nan.",
+    help="Write all points of a scan in rows and columns; missing points are nan.",
 )
 @click.option(
     "--packets",
@@ -148,26 +148,29 @@ def convert(
 ) -> None:
     """Write the points of a recording or capture to a file of another format.
 
-    The suffix of OUT selects the format. .csv and .npz hold x y z range azimuth elevation intensity
-    time ring return_index column, if the sensor has them, its further columns, and the number of
-    the scan, in metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and the
-    compressed .lzf.pcd hold x y z intensity ring time, further columns and, for several scans,
-    their number; .bin, as in KITTI, x y z intensity; .xyz x y z. To write one file for each scan,
-    put a number into the name: scans/%05d.pcd. With %F, %H, %M or %S in the name, all scans of one
-    date, hour, minute or second share a file.
+    The suffix of OUT selects the format. .csv and .npz contain the columns x y z range azimuth
+    elevation intensity time ring return_index column that the sensor has, its further columns, and
+    the number of the scan. Units are metres, radians, and seconds since the scan's stamp. .npy,
+    .ply, .pcd and the compressed .lzf.pcd contain x y z intensity ring time, the further columns
+    and, for several scans, the number of the scan. .bin contains x y z intensity, as in KITTI.
+    .xyz contains x y z.
 
-    With -f NAME, and for devices without points, .csv, .parquet, .arrow, .feather and .mcap hold
-    the fields of frames, in units.
+    A number in the name, scans/%05d.pcd, writes one file for each scan. With %F, %H, %M or %S in
+    the name, all scans of one date, hour, minute or second share a file.
 
-    .lsr, .pcap and .pcapng hold the packets as they were received.
+    With -f NAME, and for sensors without points, .csv, .parquet, .arrow, .feather and .mcap
+    contain the fields of frames, in units.
+
+    .lsr, .pcap and .pcapng contain the packets as they were received.
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, and logs of ROS (.mcap,
     .bag, .rosbag2, .db3), Foxglove (.foxglove.mcap) and Rerun (.rrd) require optional libraries:
     lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
     With --to, each IN is a file, a quoted pattern ('drives/**/*.pcap') or a URL
-    (s3://bucket/a.pcap), and OUT is a folder. Its manifest.jsonl lists the finished pieces; repeat
-    the command to convert only the missing ones. If a file fails, the others are still converted.
+    (s3://bucket/a.pcap), and OUT is a folder. OUT/manifest.jsonl lists the finished pieces. If the
+    command is repeated, it converts only the missing pieces. If a file fails, the others are still
+    converted.
     """
     chooses_scans = replace(selection, times=(None, None), time="device") != EVERYTHING
     properties = {
@@ -183,11 +186,11 @@ def convert(
         raise UsageError(f"Missing argument 'OUT': the output file for the points of {target}")
     if suffix is not None:
         if count or is_imu or frame or organized or with_packets:
-            raise UsageError(
-                "-n, --imu, -f, --organized and --packets cannot be combined with --to"
-            )
+            raise UsageError("--to cannot be combined with -n, --imu, -f, --organized or --packets")
         if jobs and scheduler:
-            raise UsageError("--dask uses its own workers: omit --jobs")
+            raise UsageError(
+                "--jobs cannot be combined with --dask, which uses the workers of the scheduler"
+            )
         records = batch.convert(
             sources,
             target,
@@ -204,12 +207,14 @@ def convert(
         _follow_batch(records, target, file_count, as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:
-        error = UsageError("several input files, --jobs, --dask and --piece require --to FORMAT")
+        error = UsageError(
+            "--to FORMAT is required for several input files, --jobs, --dask and --piece"
+        )
         raise suggest(error, "repeat with --to parquet")
     source = sources[0]
     if Path(target).suffix.lower() in _PACKET_SUFFIXES:
         if count or is_imu or frame or chooses_scans:
-            raise UsageError(f"packets in {target} can be selected by --slice only")
+            raise UsageError(f"{target} contains packets, which can be selected only by --slice")
         refuse_overwriting([target], source, sensor_id, force=force)
         _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
         return
@@ -223,7 +228,7 @@ def convert(
     with open_device(source, sensor) as device:
         if frame is not None or not (is_imu or device.sensor.has_points):
             if is_imu or organized or with_packets or chooses_scans:
-                raise UsageError("frames can be selected by -n, --slice and --time only")
+                raise UsageError("frames can be selected only by -n, --slice and --time")
             frames = _choose_frames(device, target, frame)
             summary = _write_frames(device, target, frames, selection, count)
         elif is_imu:
@@ -258,26 +263,25 @@ def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
     """Return the frame types to write.
 
-    These are the requested frame type, or all frame types of a device without points.
-
+    This is the requested frame type, or all types that a sensor without points sends.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
-        UsageError: if the format allows a single frame type, and no type is requested.
+        UsageError: if no type is requested, but the format can contain only one.
     """
     sensor = device.sensor
-    known = sensor.incoming
+    frames = sensor.incoming
     if frame is not None:
-        if frame not in known:
-            raise UnknownFrame(frame, known, place=sensor.id)
+        if frame not in frames:
+            raise UnknownFrame(frame, frames, place=sensor.id)
         return [frame]
-    if len(known) > 1 and not holds_several_types(target):
+    if len(frames) > 1 and not holds_several_types(target):
         error = UsageError(
-            f"{sensor.id} has no points, and {target} holds one frame type: choose one of"
-            f" {', '.join(known)}"
+            f"{sensor.id} has no points, and {target} can contain only one frame type: choose"
+            f" one of {', '.join(frames)}"
         )
-        raise suggest(error, f"repeat with -f {next(iter(known))}")
-    return list(known)
+        raise suggest(error, f"repeat with -f {next(iter(frames))}")
+    return list(frames)
 
 
 def _write_frames(
@@ -300,7 +304,7 @@ def _write_frames(
 def _select_frames(
     device: Device, frames: Sequence[str], selection: Selection, count: int | None
 ) -> Iterator[dict[str, Packets]]:
-    """Yield the selected frames in batches; empty batches are omitted."""
+    """Yield batches with the selected frames, without empty batches."""
     slices = {frame: TimeSlice(selection.times) for frame in frames}
     left = math.inf if count is None else count
     for arrived in device.packets_by_frame(frames):
@@ -336,7 +340,7 @@ def _write_packets(
         if sensor_id is not None:
             sensor = named_sensor(sensor_id)
         elif not opened.datagrams and Path(target).suffix.lower() != ".lsr":
-            # The packets of the new file are the frames of the sensor.
+            # Each packet of the new file is a frame of the sensor.
             sensor = _detect_sensor(source, target)
         try:
             with make_recorder(opened, source, str(part), sensor, overwrite=True) as file:
@@ -388,13 +392,14 @@ def _write_points(
 
 @contextlib.contextmanager
 def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
-    """Open a file a second time for its packets; yield None if `wanted` is false."""
+    """Open a file a second time and yield its packets; yield None if not `wanted`."""
     if not wanted:
         yield None
         return
     if is_live(source) or source == "-":
         raise UsageError(
-            f"--packets reads IN twice, but {source} can be read only once: record it first"
+            f"--packets requires to read IN twice, but {source} can be read only once: record it"
+            " first"
         )
     with contextlib.closing(open_transport(source)) as opened:
         if not opened.datagrams:
@@ -440,11 +445,11 @@ def _follow_batch(
 
 
 def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -> str:
-    # The number of pieces is only printed if a file was cut.
+    # The number of pieces is printed only if a file was split into several pieces.
     names = [name for name in totals if name != "pieces" or totals[name] > totals["files"]]
     parts = [", ".join(f"{totals[name]} {name}" for name in names) or "nothing"]
     if done_before:
-        parts.append(f"{done_before} pieces were finished before")
+        parts.append(f"{done_before} pieces had been converted before")
     if failed_count:
         parts.append(f"{failed_count} failed")
     return "; ".join(parts)
@@ -461,9 +466,9 @@ def _detect_sensor(source: str, target: str) -> Sensor:
 
 
 def _no_data_error(device: Device, target: str) -> Exception:
-    """Return the error that explains why a file gave no data.
+    """Return the error that explains why a file contains no data of the sensor.
 
-    The file is empty or damaged, or its data is from another sensor or not from a lidar.
+    The file is empty or damaged, it has data of another sensor, or it has no lidar data.
     """
     sensor = device.sensor
     stats = device.stats

@@ -1,4 +1,4 @@
-"""Failures as one message on stderr and an exit code.
+"""Report a failure as one message on standard error, and an exit code.
 
 The exit code depends on the cause: the command line, the source, its data or the device. A
 traceback is printed only with --verbose or LIDARSPEC_DEBUG.
@@ -23,8 +23,8 @@ NO_DATA = 4
 DEVICE = 5
 INTERRUPTED = 130
 
-#: (error class, exit code, next command); the first entry that matches applies. "{sensor}" and
-#: "{verb}" are filled in.
+#: (error class, exit code, next command). The first entry with the class of an error applies.
+#: "{sensor}" and "{verb}" are filled in.
 CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
     (
@@ -52,7 +52,7 @@ def report(error: Exception, verb: str) -> int:
     if is_detailed:
         note("".join(traceback.format_exception(error)))
     if not command:
-        note(f"a bug in lidarspec: {type(error).__name__}: {error}")
+        note(f"this is a bug in lidarspec: {type(error).__name__}: {error}")
         note("  next: repeat with LIDARSPEC_DEBUG=1, and report the output")
         return code
     message = _format_message(error)
@@ -68,7 +68,7 @@ def report(error: Exception, verb: str) -> int:
 
 
 def _lacks_sensors(error: Exception) -> bool:
-    """Return whether an error occurs because no sensor is installed."""
+    """Return whether the cause of an error is that no sensor is installed."""
     suggestion = errors.suggestion(error)
     named = (
         str(getattr(error, "sensor", ""))
@@ -95,10 +95,10 @@ def _format_message(error: Exception) -> str:
 
 
 def _find_next_command(error: Exception, command: str, verb: str) -> str:
-    """Return the next command.
+    """Return the command to suggest after an error.
 
-    For an unknown sensor it is `lidarspec plugins` if a plugin fails to load, as that plugin may
-    provide the sensor.
+    For an unknown sensor, this is `lidarspec plugins` if a plugin fails to load, because that
+    plugin may provide the sensor.
     """
     from lidarspec.plugins import registry
 

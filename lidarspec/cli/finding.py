@@ -1,4 +1,4 @@
-"""`ports`, `detect`, `doctor` and `crc`: find ports, sensors, faults, checksums."""
+"""`ports`, `detect`, `doctor`, `crc`: find ports, sensors, faults and checksums."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, list_serial_ports
 from lidarspec.transports.protocol import no_bytes
 
-#: Bits of evidence below which a match may be chance.
+#: A match with fewer bits of evidence may be coincidence.
 WEAK_BITS = 12
 #: Maximum number of matches to print.
 MAX_PRINTED_MATCHES = 4
@@ -131,7 +131,7 @@ def _udp_to_dict(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any
     "--period",
     type=click.IntRange(min=3),
     metavar="N",
-    help="Length of the frames in bytes, for a file of consecutive frames.",
+    help="Length of a frame in bytes, if the file consists of frames of equal length.",
 )
 @click.option(
     "--offset",
@@ -146,10 +146,10 @@ def crc(
 ) -> None:
     """Find the checksum of sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
 
-    Frames are arguments of hexadecimal digits, one frame each; a text file with one frame on each
-    line (.hex, .txt); or a capture. In raw bytes the frames are found by their structure, or by
-    their length with --period. More frames give a more certain result; a dozen is enough. Only the
-    beginning of a long file is read.
+    Each argument is a frame in hexadecimal digits. Frames can also be read from a text file with
+    one frame per line (.hex, .txt), a capture, or raw bytes. In raw bytes, frames are found by
+    their structure, or by their length with --period. More frames give a more certain result; a
+    dozen is enough. Only the beginning of a long file is read.
     """
     frames = _parse_frames(words, period, offset)
     matches = search(frames)
@@ -169,7 +169,7 @@ def crc(
         )
         raise click.exceptions.Exit(FINDINGS)
     if matches[0].evidence_bits < WEAK_BITS:
-        note("the match may be chance: give more frames")
+        note("the match may be coincidence; repeat with more frames")
 
 
 def _parse_frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
@@ -186,7 +186,7 @@ def _parse_frames(words: Sequence[str], period: int | None, offset: int) -> list
 
 def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     if path != "-" and not path.endswith(HEX):
-        sample = max(read_samples(path), key=lambda one: one.size)
+        sample = max(read_samples(path), key=lambda sample: sample.size)
         if not sample.size:
             raise suggest(WireError(no_bytes(path, sample.warnings)), "lidarspec sensors")
         for warning in sample.warnings:
@@ -206,14 +206,14 @@ def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     structure = find_structure(chunks, datagrams=datagrams)
     if structure is None:
         raise suggest(
-            UsageError(f"{path}: cannot find where its frames begin"),
+            UsageError(f"{path}: no repeated structure found, so the starts of frames are unknown"),
             f"lidarspec crc {quote(path)} --period BYTES --offset BYTES",
         )
     if structure.period:
         length = f"{structure.period} bytes"
     else:
         length = f"{structure.length} bytes"
-    note(f"{len(structure.frames)} frames that begin with {structure.sync.hex(' ')}, {length} long")
+    note(f"{len(structure.frames)} frames of {length} that begin with {structure.sync.hex(' ')}")
     return list(structure.frames)
 
 
@@ -241,7 +241,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
     if match.evidence_bits >= WEAK_BITS:
         chance = f"1 in {match.odds} by chance"
     else:
-        chance = "may be chance"
+        chance = "may be coincidence"
     lines = [
         (
             f"{match.algorithm.describe()}{name}: correct in {match.right} of {match.total} frames;"
@@ -277,13 +277,13 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
 def detect(
     source: str | None, duration: float, start: bool, as_json: bool, output: str | None
 ) -> None:
-    """Identify the installed sensor that sends, its port and its baud rate.
+    """Identify the sensor that sends data, its port and its baud rate.
 
-    SOURCE is a port, a file or a capture; by default every serial port at every baud rate that
-    installed sensors declare, and every UDP port. Sensors are ranked by the share of the bytes that
-    are in frames with valid checksum and plausible values. Sensors with the same frames are
-    distinguished by their clocks, names in their frames and baud rates, if possible; -v also lists
-    the sensors that were ruled out.
+    SOURCE is a port, a file or a capture. Without SOURCE, all serial ports are tried at the baud
+    rates of the installed sensors, and all their UDP ports. Sensors are ranked by the share of the
+    bytes that are in frames with a valid checksum and plausible values. Sensors with the same
+    frames are distinguished by clock, baud rate, or a model name in the frames, if possible. -v
+    also lists the sensors that were ruled out.
     """
     if source == "-":
         raise suggest(
@@ -301,15 +301,15 @@ def detect(
                 start=start,
                 on_progress=lambda text: progress(lambda: f"listening to {text}"),
             )
-    fitting = [one for one in found_verdicts if one.scores]
-    if fitting or any(one.fault for one in found_verdicts):
+    fitting = [verdict for verdict in found_verdicts if verdict.scores]
+    if fitting or any(verdict.fault for verdict in found_verdicts):
         unknown = None
     else:
         unknown = _find_structure(found_verdicts)
     if as_json:
         emit_json(
             {
-                "sources": [_verdict_to_dict(one) for one in found_verdicts],
+                "sources": [_verdict_to_dict(verdict) for verdict in found_verdicts],
                 "structure": _structure_to_dict(unknown),
             },
             output,
@@ -320,17 +320,17 @@ def detect(
         emit(_structure_text(unknown), output)
     for line in _iter_conclusions(source, found_verdicts, unknown, start=start):
         note(line)
-    if not any(one.candidates for one in fitting):
+    if not any(verdict.candidates for verdict in fitting):
         raise click.exceptions.Exit(_find_exit_code(source, found_verdicts))
 
 
 def _find_exit_code(source: str | None, verdicts: Sequence[Verdict]) -> int:
     """Return the exit code if no sensor fits.
 
-    It is `DEVICE` if every live source was silent; otherwise `NO_DATA`.
+    It is `DEVICE` if no live source sent any data, else `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
-    is_silent = is_live and not any(one.sample.size for one in verdicts)
+    is_silent = is_live and not any(verdict.sample.size for verdict in verdicts)
     if is_silent:
         return DEVICE
     return NO_DATA
@@ -344,7 +344,7 @@ def _detect_source(
     on_progress: Callable[[str], None] = ignore_progress,
 ) -> list[Verdict]:
     verdicts = identify_senders(source, seconds=duration, on_progress=on_progress)
-    if start and not any(one.scores for one in verdicts):
+    if start and not any(verdict.scores for verdict in verdicts):
         for sample in probe(source):
             verdicts = [select_best([*verdicts, identify_sample(sample)])]
             if verdicts[0].is_clear:
@@ -377,7 +377,7 @@ def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
 
 
 def _find_structure(verdicts: Sequence[Verdict]) -> FrameStructure | None:
-    """Return the structure of the bytes that fit no sensor."""
+    """Return the structure of bytes that no sensor fits; None if none is found."""
     sample = max(
         (verdict.sample for verdict in verdicts), key=lambda sample: sample.size, default=None
     )
@@ -443,14 +443,14 @@ def _iter_conclusions(
         elif verdict.candidates:
             yield (
                 f"{_describe_place(verdict.sample)}: {', '.join(list_candidates(verdict))} send the"
-                " same frames, which do not identify the model: choose one"
+                " same frames, so the model is not certain: choose one"
             )
             if files := [
                 name
                 for name in verdict.candidates[0].sensor.configure.files
                 if verdict.candidates[0].sensor.recognise is not None
             ]:
-                yield f"the packets do not contain beam angles: pass -O {files[0]}=FILE"
+                yield f"the packets do not contain the beam angles: add -O {files[0]}=FILE"
             options = format_sensor_options(verdict.candidates[0].sensor)
             yield f"next: lidarspec {_find_verb(verdict)} {_format_source(verdict)} {options}"
         elif verdict.others:
@@ -483,7 +483,7 @@ def _iter_conclusions(
         if unknown:
             structure_note = ""
         else:
-            structure_note = "; no repeated structure found"
+            structure_note = ", and without a repeated structure"
         yield f"{size} bytes{kind} without a frame of an installed sensor{structure_note}"
         yield f"next: {_find_next_command(source, unknown)}"
         return
@@ -500,7 +500,7 @@ def _iter_conclusions(
     )
     if is_serial and not start and list_start_required():
         yield (
-            f"{', '.join(sensor.id for sensor in list_start_required())} send nothing until they"
+            f"{', '.join(sensor.id for sensor in list_start_required())} send no data until they"
             " are started"
         )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
@@ -509,7 +509,7 @@ def _iter_conclusions(
 
 
 def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return the known sensors that are not installed and may have sent most bytes.
+    """Return the known sensors, not installed, that may have sent the largest sample.
 
     Returns an empty list if an installed sensor fits.
     """
@@ -533,7 +533,7 @@ def _find_verb(verdict: Verdict) -> str:
 
 
 def _find_next_command(source: str | None, unknown: FrameStructure | None) -> str:
-    """Return the next command for bytes that fit no sensor."""
+    """Return the command to suggest for bytes that no sensor fits."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
     if unknown is None or unknown.checksums:
@@ -546,7 +546,7 @@ def _find_next_command(source: str | None, unknown: FrameStructure | None) -> st
 
 
 def _format_source(verdict: Verdict) -> str:
-    """Return the source with the baud rate and the sender that were found."""
+    """Return the SOURCE of a verdict with its baud rate and sender, for a command."""
     source = verdict.sample.source
     sample = verdict.sample
     link = data_link(verdict.sensor, Serial)
@@ -617,9 +617,7 @@ def _structure_text(structure: FrameStructure) -> str:
         lines.append(
             f"  checksum  {checksum} in {match.place}: correct in {match.right} of {match.total}"
         )
-    return "\n".join(
-        lines if structure.checksums else [*lines, "  checksum  not found at the usual places"]
-    )
+    return "\n".join(lines if structure.checksums else [*lines, "  checksum  not found"])
 
 
 @click.command()
@@ -643,9 +641,9 @@ def doctor(
 ) -> None:
     """Diagnose why no data arrives from a sensor, and suggest a fix.
 
-    Checks for missing ports and permissions, ports in use, small buffers, silence, a wrong baud
-    rate and a wrong interface. Without SOURCE it checks all ports of this computer. The exit code
-    is 1 if something is wrong.
+    The checks find missing ports, missing permissions, ports in use, small buffers, sensors that
+    send nothing, a wrong baud rate and a wrong interface. Without SOURCE, all ports of this
+    computer are checked. The exit code is 1 if a fault is found.
     """
     if sensor_id is None:
         sensor = None
@@ -661,9 +659,9 @@ def doctor(
         emit_json([finding.to_dict() for finding in diagnoses], output)
     else:
         lines = [
-            f"{'ok   ' if one.ok else 'wrong'}  {one.text}"
-            + (f"\n       next: {one.fix}" if one.fix else "")
-            for one in diagnoses
+            f"{'ok   ' if finding.ok else 'wrong'}  {finding.text}"
+            + (f"\n       next: {finding.fix}" if finding.fix else "")
+            for finding in diagnoses
         ]
         emit("\n".join(lines) or "no problem found with the ports of this computer", output)
     if sensor is None and not sensors():

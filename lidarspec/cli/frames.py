@@ -42,9 +42,9 @@ def parse(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print the fields of each frame in some bytes.
+    """Print the fields of each frame in hexadecimal text or a file.
 
-    --slice selects by arrival time; offsets then count from the beginning of the slice.
+    --slice selects by arrival time. Offsets are then relative to the beginning of the slice.
     """
     with open_input(words, selection.times) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id)
@@ -64,7 +64,7 @@ def parse(
         else:
             emit_parts(_iter_tables(sensor, frames, output), output)
         if wanted.unframed:
-            note(f"{wanted.unframed} bytes outside frames; lidarspec explain shows them")
+            note(f"{wanted.unframed} bytes outside frames; use lidarspec explain to show them")
 
 
 def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
     "-f",
     "--frame",
     metavar="NAME",
-    help="Read the bytes as this frame type; of many frames, show only this type.",
+    help="Frame type of the bytes; show only frames of this type.",
 )
 @count_option("frames")
 @click.option("--bad", is_flag=True, help="Show only damaged frames and bytes outside frames.")
@@ -110,12 +110,12 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
 @click.option(
     "--bits",
     is_flag=True,
-    help="Draw the bits of every array element; default: of the first one.",
+    help="Draw the bits of every array element; default: only of the first element.",
 )
 @click.option(
     "--diff",
     metavar="HEX|FILE|next",
-    help="Compare with this frame, bit by bit; 'next': with the second frame of the input.",
+    help="Compare with this frame bit by bit; 'next' is the second frame of the input.",
 )
 @output_options
 def explain(
@@ -134,14 +134,15 @@ def explain(
 ) -> None:
     """Explain every byte of each frame: offset, hex, field, value, unit, meaning.
 
-    For a damaged frame the damage is described: a flipped bit, a lost or inserted byte, or the
-    position at which it is cut off. With --bad the exit code is 1 if something is damaged. OFFSETs
-    are those that are printed, 940 or 0x3ac; in a capture they count through the joined payloads;
-    with --slice, which selects by the times of arrival, from the beginning of the slice.
+    For a damaged frame, the damage is described: a flipped bit, a lost or inserted byte, or the
+    offset at which the frame is truncated. With --bad, the exit code is 1 if a frame is damaged or
+    bytes are outside frames. An OFFSET is 940 or 0x3ac, as printed. In a capture, it is an offset
+    in the joined payloads. --slice selects by arrival time; offsets are then relative to the
+    beginning of the slice.
     """
     if at is not None and stretch is not None:
         raise UsageError(
-            "--at and --bytes cannot be combined: use --at for a byte, --bytes for a range"
+            "--at and --bytes cannot be combined: use --at for one byte, or --bytes for a range"
         )
     with open_input(words, selection.times) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id, damaged=True)
@@ -169,20 +170,20 @@ def listing(
     every: bool = False,
     verdicts: bool = False,
 ) -> Iterator[Line]:
-    """Yield the lines of explained pieces, each below a title.
+    """Yield the lines of explained pieces; each piece has a title.
 
     Args:
-      at: the offset of a byte; the title names its field.
-      every: draw the bits of every element of an array, not only of the first.
-      verdicts: add the damage of each piece to its title.
+      at: the offset of a byte; the title names the field at this offset.
+      every: whether to draw the bits of every element of an array, instead of only the first.
+      verdicts: whether to add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
         title = TextSpan(_format_title(sensor, piece, part.frame), "title")
         if at is None:
-            place = ""
+            path = ""
         else:
-            place = next(
+            path = next(
                 (
                     value.path
                     for value in part.fields.values()
@@ -196,7 +197,7 @@ def listing(
             verdict = ""
         yield (
             title,
-            TextSpan(f"; byte {at} is in {place}" if place else ""),
+            TextSpan(f"; byte {at} is in {path}" if path else ""),
             TextSpan(verdict, "bad"),
         )
         yield from part.lines(every=every)
@@ -209,11 +210,14 @@ class FrameSelection:
         frame: show only this frame type.
         count: maximum number of frames; with `bad`, of damaged frames.
         bad: show only damaged pieces.
-        at, stretch: show only the byte at this offset, or these bytes, as "FROM:TO".
+        at: show only the byte at this offset.
+        stretch: show only the bytes in this range, "FROM:TO".
 
     Attributes:
-        valid, damaged, unframed, others: numbers of valid frames, damaged frames, bytes outside
-            frames, and frames of other types.
+        valid: number of valid frames.
+        damaged: number of damaged frames.
+        unframed: number of bytes outside frames.
+        others: number of frames of other types.
 
     Raises:
         UsageError: if `stretch` is invalid.
@@ -294,19 +298,19 @@ class FrameSelection:
             raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
-        """Print the counts of an input that was shown.
+        """Print the numbers of frames and bytes of an input after it was shown.
 
         Raises:
-            UsageError: if the input ends before the stretch.
-            WireError: if it has no frame.
-            Exit: if `bad` is set and there is damage.
+            UsageError: if the input ends before the selected bytes.
+            WireError: if the input contains no frame.
+            Exit: if `bad` is set and the input is damaged.
         """
         if self._ended and not self._shown and self._end <= self._from:
-            raise UsageError(f"{sample.source} has {self._end} bytes: no byte {self._from}")
+            raise UsageError(f"{sample.source} has only {self._end} bytes, so no byte {self._from}")
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 if self.others:
-                    others = f", but {self.others} of other types"
+                    others = f", but {self.others} frames of other types"
                 else:
                     others = ""
                 raise WireError(
@@ -332,7 +336,7 @@ class FrameSelection:
 
 
 def _parse_stretch(text: str | None) -> tuple[float, float]:
-    """Return the first offset and the end of "FROM:TO"; an empty end is infinity."""
+    """Return the start and the end of "FROM:TO"; an empty TO is infinity."""
     first, colon, last = (text or ":").partition(":")
     try:
         start = int(first or "0", 0)
@@ -412,14 +416,14 @@ def _find_sensor(
     if sensors:
         fits = [sensor.id for sensor in sensors]
         note(
-            f"these bytes match {fits[0]}"
-            + (f", and also {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
+            f"these bytes are frames of {fits[0]}"
+            + (f", or of {', '.join(fits[1:])}; choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
     fault = nearest_fault_error(sample)
     if not damaged or not fault.sensor:
         raise fault
-    note(f"these bytes match no sensor; the closest is {fault.sensor}")
+    note(f"these bytes contain no valid frame; they are most similar to {fault.sensor}")
     return named_sensor(fault.sensor), []
 
 

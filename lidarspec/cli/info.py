@@ -19,14 +19,14 @@ from lidarspec.explaining.file_contents import format_contents, read_contents
 def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     """Describe the contents of files: kind, times, senders, sensor, rates, loss.
 
-    FILE is any readable file: a recording, a capture, a robotics log, raw bytes. If a file is long,
-    only its beginning and its last timestamp are read. Several files are printed one after another.
-    If no sensor is identified in a file, the exit code is 4.
+    FILE is a recording, a capture, a robotics log, raw bytes or hexadecimal text. Only the
+    beginning and the last timestamp of a long file are read. The exit code is 4 if no sensor is
+    identified in a file.
     """
     has_unknown_file = False
 
     def iter_texts() -> Iterator[str]:
-        """Yield the texts about the files, and note whether a sensor is unknown."""
+        """Yield the texts about the files, and record whether one has no known sensor."""
         nonlocal has_unknown_file
         for file in files:
             contents = read_contents(file)

@@ -1,9 +1,8 @@
 """Read the input of verbs, and explain why it contains no frame.
 
-The input is hexadecimal text, a file, standard input or a configured device.
-
-Modules for sources, files and sensor identification are imported inside functions, because
-commands on hexadecimal text for a named sensor start faster without them.
+The input is hexadecimal text, a file, standard input or a configured device. Verbs that read
+hexadecimal text of a named sensor do not need the modules for sources, files and detection.
+Functions therefore import these modules, so that these verbs start faster.
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ if TYPE_CHECKING:
     from lidarspec.device.device import Device
     from lidarspec.transports.files import FileTransport
 
-#: Maximum length of hexadecimal text that is copied into the suggested command.
+#: Maximum length of hexadecimal text to copy into a suggested command.
 MAX_REPEATED_CHARS = 400
-#: Maximum length of other input that is quoted in a message.
+#: Maximum length of other input to quote in a message.
 MAX_QUOTED_CHARS = 64
 #: Maximum number of bytes that `read` returns.
 MAX_INPUT_BYTES = 1 << 20
@@ -75,8 +74,8 @@ def open_input(
         The first bytes of the input, and an iterator over all its chunks, which reads lazily.
 
     Args:
-        words: the arguments: hexadecimal text, "-", a file name, or the name of a device.
-        times: the time range to read of a file.
+        words: the arguments: hexadecimal text, "-", a file name, or a device of lidarspec.toml.
+        times: the part of a file to read, by arrival time.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -170,7 +169,7 @@ def _iter_standard_input(file: FileTransport) -> Iterator[Chunk]:
 def read(words: Sequence[str]) -> SampleBytes:
     """Return the first bytes of the input that command-line arguments name.
 
-    There are at most `MAX_INPUT_BYTES`.
+    At most `MAX_INPUT_BYTES` are returned.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -189,12 +188,14 @@ def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
     text = " ".join(words)
     if len(words) == 1 and live_address(text) is not None:
         return suggest(
-            UsageError(f"{text} is a live source: expected bytes or a file"),
+            UsageError(f"expected hexadecimal bytes or a file, got the live source {text}"),
             f"lidarspec read {quote(text)} --packets",
         )
     if len(words) == 1 and re.search(r"[/\\.]", text):
         return SourceError(f"{text}: no such file")
-    return UsageError(f"{text[:MAX_QUOTED_CHARS]!r} is neither a file nor hexadecimal: {error}")
+    return UsageError(
+        f"{text[:MAX_QUOTED_CHARS]!r} is neither a file nor hexadecimal text: {error}"
+    )
 
 
 def refuse_overwriting(
@@ -202,12 +203,12 @@ def refuse_overwriting(
 ) -> None:
     """Raise an error if an output file is also an input, or exists without `force`.
 
-    Files are compared by identity, not by name.
+    Two names of the same file, such as a symbolic link, are recognised.
 
     Args:
         target: the output file or files.
-        inputs: SOURCEs and file names; also sensors, because their options may be file names.
-        force: allow existing files that are not inputs.
+        inputs: SOURCEs, file names, and sensors with options that may be file names.
+        force: whether existing files that are not inputs may be overwritten.
 
     Raises:
         UsageError: if a file would be overwritten.
@@ -230,14 +231,14 @@ def refuse_overwriting(
                 name = f"the same file as the input {path}"
             else:
                 name = "the input"
-            raise UsageError(f"{same} is {name}: it would be overwritten")
+            raise UsageError(f"{same} is {name}, and would be overwritten")
     if existing and not force:
-        error = UsageError(f"{existing[0]} exists already, and is not overwritten without --force")
+        error = UsageError(f"{existing[0]} exists already; --force overwrites it")
         raise suggest(error, "repeat with --force, or with another file")
 
 
 def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
-    """Yield the files that may be read for this argument."""
+    """Yield the files that may be read for an argument."""
     if isinstance(argument, Sensor):
         yield from (
             str(value) for value in argument.options.values() if isinstance(value, str | Path)
@@ -251,9 +252,8 @@ def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
     )
     from lidarspec.device.named_devices import find_device
 
-    with contextlib.suppress(
-        LidarSpecError
-    ):  # errors in the settings are reported when a device is looked up
+    # Errors in the settings are reported when the source is opened.
+    with contextlib.suppress(LidarSpecError):
         device = find_device(word)
         yield from (
             (device.source.partition("?")[0], *map(str, device.options.values())) if device else ()
@@ -261,7 +261,7 @@ def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
 
 
 def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
-    """Return the error for input without a frame of this sensor."""
+    """Return the error for an input that contains no frame of a sensor."""
     data = sample.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
     command = f"lidarspec explain {quote(sample.source)} -s {sensor.id}"
@@ -285,13 +285,15 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
         identify(sensor, data)
     except WireError as error:
         return suggest(error, command)
-    return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
+    return suggest(
+        WireError("the values of the frame are not plausible", sensor=sensor.id, data=data), command
+    )
 
 
 def nearest_fault_error(sample: SampleBytes) -> WireError:
-    """Return the error for input that no sensor fits.
+    """Return the error for an input that no sensor fits.
 
-    It is the error of the sensor that parsed most of the input, or a general error.
+    It is the error of the sensor that parsed the most bytes, or a general error.
     """
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -303,9 +305,9 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
     best = find_nearest_fault(sample.data)
     if best is None:
         if sensors():
-            text = f"no frame of the {len(sensors())} installed sensors"
+            text = f"no frame of the {len(sensors())} installed sensors found"
         else:
-            text = "no frame of an installed sensor"
+            text = "no frame of an installed sensor found"
         if sample.is_text:
             text = f"{sample.source} is text: {text}"
         error = suggest_installation(WireError(text, data=sample.data[:MAX_QUOTED_CHARS]), sample)
@@ -314,9 +316,9 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
 
 def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
-    """Return an error if all frames of a sensor in the input have wrong checksums.
+    """Return an error if the input has frames of a sensor with only wrong checksums.
 
-    Returns None otherwise.
+    Returns None for any other input.
     """
     from lidarspec.detect.identification import find_wrong_checksums
 
@@ -331,8 +333,8 @@ def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
 def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Return the error for a source without a scan.
 
-    It names the cause: an exception of the plugin, a file without data frames, a device that sends
-    nothing, or bytes that are not frames.
+    It gives the cause: the plugin raised an exception, a file has no data frames, a device sent
+    nothing, or the bytes are not frames.
     """
     sensor = device.sensor
     stats = device.stats
@@ -347,7 +349,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
         if sample is not None and (fault := _wrong_checksums_error(sample)) is not None:
             return fault
         if sample is not None and sample.is_text:
-            error = WireError(f"{source} is text without a data frame: {stats}", sensor=sensor.id)
+            error = WireError(f"{source} is text, without a data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
             reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
@@ -363,7 +365,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
     if stats.bytes_in == 0:
         others = ""
         if stats.foreign:
-            others = f", other senders sent {stats.foreign} datagrams"
+            others = f"; other senders sent {stats.foreign} datagrams"
         return suggest(
             CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"),
             f"lidarspec doctor {quote(source)} -s {sensor.id}",
@@ -376,11 +378,12 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
 
 
 def conclude(device: Device) -> None:
-    """Print learned values and warnings after a source was read.
+    """Print values that the sensor reported, and warnings, after reading a source.
 
     Raises:
         PluginError: if plugin code raised for some packets.
-        click.exceptions.Exit: with exit code 1, if corrupt bytes of the source could not be read.
+        click.exceptions.Exit: with exit code 1, if a part of the source was corrupt and could not
+            be read.
     """
     failure = device.stats.failure(device.sensor.id)
     for name, value in device.learned.items():
@@ -398,7 +401,7 @@ def conclude(device: Device) -> None:
 
 
 def reread(source: str) -> SampleBytes | None:
-    """Read the beginning of a file a second time; return None if that is not possible."""
+    """Read the beginning of a file again; return None if that is not possible."""
     from lidarspec.transports.open_url import open_transport
 
     if not Path(source.partition("?")[0]).is_file():
@@ -415,7 +418,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """Identify a file that has no data frame of `sensor`.
 
     Returns:
-        A description of its content, and the command-line options that read it; None if no sensor
+        A description of its content, and the command-line options to read it; None if no sensor
         fits.
     """
     from lidarspec.detect.identification import format_sensor_options, identify_sample
@@ -426,7 +429,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())
         return (
-            f"does not contain the sensor's settings; data frames are found with {assignments}",
+            f"does not contain the sensor's settings; its data frames require {assignments}",
             format_sensor_options(sensor.configure(**own)),
         )
     others = [score.sensor for score in scores if score.sensor.id != sensor.id]
@@ -434,7 +437,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
         return None
     return (
         (
-            "has no data frame of this sensor, but frames of"
+            "has no data frame of this sensor; it has frames of"
             f" {', '.join(other.id for other in others)}"
         ),
         format_sensor_options(others[0]),
@@ -444,12 +447,12 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
 def require_points(device: Device, source: str) -> None:
     """Raise a UsageError for a sensor without points.
 
-    It suggests a command that prints the frames.
+    The error suggests a command that prints the frames.
     """
     sensor = device.sensor
     if not sensor.has_points:
         frames = ", ".join(sensor.incoming)
-        error = UsageError(f"{sensor.id} has no points; its frames are {frames}")
+        error = UsageError(f"{sensor.id} measures no points; it sends the frames {frames}")
         frame = next(iter(sensor.incoming), "FRAME")
         raise suggest(error, f"lidarspec read {quote(source)} -s {sensor.id} -f {frame}")
 
@@ -474,8 +477,8 @@ class FirstFrameTimeout:
         """Raise an error if the timeout has passed without a data frame.
 
         Raises:
-            CommandError, WireError: if the device has sent nothing, or no frame of the sensor, for
-                too long.
+            CommandError: if the device has sent nothing.
+            WireError: if the device has sent no frame of the sensor.
         """
         waited = time.monotonic() - self._began
         if (
@@ -496,8 +499,8 @@ def iter_device_scans(
         until: a time of `time.monotonic` at which to end.
 
     Raises:
-        CommandError, WireError: if the device has sent nothing, or no frame of the sensor, for too
-            long.
+        CommandError: if the device sends nothing until a timeout.
+        WireError: if the device sends no frame of the sensor until a timeout.
         UsageError: if none of the scans is selected.
     """
     patience = FirstFrameTimeout(device, source)

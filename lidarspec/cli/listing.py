@@ -10,7 +10,7 @@ from lidarspec.cli.output import emit_parts, render
 from lidarspec.errors import printable
 from lidarspec.explaining.listing import Line, fold, join_text as plain_text
 
-#: The style of each role of a part of a line.
+#: Role of a part of a line -> its style on a terminal.
 STYLES = {
     "title": "bold",
     "offset": "dim",
@@ -27,8 +27,8 @@ STYLES = {
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
     """Print each line when it is made, with colours only on a terminal.
 
-    Lines are folded to the width of the terminal. NO_COLOR and FORCE_COLOR are respected; coloured
-    output into a pipe is not folded.
+    Lines are folded to the width of the terminal. NO_COLOR and FORCE_COLOR are respected. Output
+    into a pipe is not folded.
     """
     may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
     if output is not None or not may_be_coloured:

@@ -1,6 +1,6 @@
-"""Options and types of values that verbs share, and the options that select scans.
+"""Options that several verbs share, and the types of their values.
 
-All verbs that read scans have the same options for selection.
+All verbs that read scans have the same options to select scans.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ def sensor_option(function: Function) -> Function:
 
 
 def configuring(function: Function) -> Function:
-    """Add ``-O`` and ``--calibration``; the verb gets an id or the configured sensor."""
+    """Add ``-O`` and ``--calibration``.
+
+    The verb gets `sensor_id`: the id, or the sensor that the options configure.
+    """
 
     @functools.wraps(function)
     def call_with_sensor(
@@ -46,15 +49,16 @@ def configuring(function: Function) -> Function:
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `sensor_option`, and pass them on as typed.
+    """Add the options of `sensor_option`, without configuring the sensor.
 
-    The verb gets `sensor_id`, `options` and `calibration`, which `configure_sensor` takes.
+    The verb gets the texts `sensor_id`, `options` and `calibration`, the arguments of
+    `configure_sensor`.
     """
     return _add_sensor_option(_optional(function))
 
 
 def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    help_text = "Sensor: an id, an alias, or a file ./mysensor.py."
+    help_text = "Id or alias of the sensor, or a file ./mysensor.py."
     return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=help_text)(function)
 
 
@@ -73,15 +77,16 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
 def configure_sensor(
     sensor_id: str | None, options: Sequence[str], calibration: str | None
 ) -> str | Sensor | None:
-    """Return the id, or the sensor with these options.
+    """Return the id of a sensor, or the configured sensor if options are given.
 
     Args:
-        options: "NAME=VALUE" each.
-        calibration: the name of a file.
+        sensor_id: the id of the sensor; None if it is not given.
+        options: texts "NAME=VALUE".
+        calibration: the name of a calibration file; None for no file.
 
     Raises:
-        UsageError: for options without a sensor or a value, and for options that the sensor does
-            not have.
+        UsageError: for options without a sensor, an option without a value, or an option that the
+            sensor does not have.
     """
     options = [*options, *(() if calibration is None else (f"calibration={calibration}",))]
     if not options:
@@ -101,8 +106,8 @@ def configure_sensor(
 def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
     """Return the value of an option given as text.
 
-    Numbers and booleans are parsed as in `lidarspec.toml` if the option accepts them. All other
-    values stay text.
+    A number or boolean is parsed as in `lidarspec.toml` if the option accepts this type. Any other
+    value stays a text.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
@@ -126,7 +131,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 
 def colour_option(function: Function) -> Function:
-    """Add ``--colour`` for pictures, in both spellings."""
+    """Add ``--colour``, also spelled ``--color``, for pictures."""
     help_text = "Value that sets the colour: range, intensity, or a further column of the points."
     return click.option(
         "--colour",
@@ -144,8 +149,8 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
 
     Args:
         name: the name of the type, for help pages.
-        parse: converts a text to a number; raises ValueError or UsageError for invalid text.
-        form: the expected syntax, for messages.
+        parse: converts a text to a number. It raises ValueError or UsageError for an invalid text.
+        form: the expected syntax in words, for error messages.
     """
 
     def __init__(self, name: str, parse: Callable[[str], Any], form: str) -> None:
@@ -160,7 +165,7 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
         try:
             return self._parse(value)
         except (ValueError, UsageError):
-            self.fail(f"{value!r} is not {self._form}", param, ctx)
+            self.fail(f"expected {self._form}, got {value!r}", param, ctx)
 
 
 def _parse_duration(text: str) -> float:
@@ -202,9 +207,10 @@ def _parse_speed(text: str) -> float:
 
 
 def _parse_pair(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
-    """Return the values before and after the colon of a text; None for an empty side.
+    """Return the values before and after a colon; None for an empty side.
 
-    Every colon is tried, because dates contain colons.
+    The text is split at each colon in turn until both sides are valid, because dates contain
+    colons.
     """
     for index in (index for index, mark in enumerate(text) if mark == ":"):
         try:
@@ -226,7 +232,7 @@ def _parse_moment(text: str) -> float | datetime:
 
 
 def _parse_index(text: str) -> int:
-    return int(text)  # `Selection` refuses negative numbers, and gives the reason
+    return int(text)  # `Selection` raises an error with the reason for negative numbers
 
 
 def _parse_indices(text: str) -> tuple[int, int | None]:
@@ -259,7 +265,7 @@ OFFSET = NumberType("offset", _parse_offset, "the offset of a byte, such as 940 
 BYTES = NumberType("size", _parse_bytes, "a size of at least 1MB, such as 256MB or 1GB")
 #: A factor above 0; 0 for "max".
 SPEED = NumberType("speed", _parse_speed, "a speed, such as 1, 0.5, 10 or max")
-#: A begin and an end, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
+#: A start and an end, in seconds or as dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
 SLICE = NumberType(
     "slice",
     lambda text: _parse_pair(text, _parse_moment),
@@ -272,21 +278,21 @@ DISTANCES = NumberType(
     "distances", _parse_distances, "a span of distances, such as 0.5m:30m, 50cm: or :30"
 )
 
-#: Argument of `Selection` -> its option.
+#: Argument of `Selection` -> the option that sets it.
 SELECTING: dict[str, Callable[[Any], Any]] = {
     "times": click.option(
         "--slice",
         "times",
         type=SLICE,
         metavar="FROM:TO",
-        help="Select by time since the first scan, such as 10s:20s, or by date.",
+        help="Select scans by the time since the first scan, such as 10s:20s, or by date.",
     ),
     "scans": click.option(
         "--scans",
         "scans",
         type=INDICES,
         metavar="FROM:TO",
-        help="Select by number: 5:10 is scans 5 to 9; the first scan is 0.",
+        help="Select scans by number: 5:10 is scans 5 to 9; the first scan is 0.",
     ),
     "every": click.option(
         "--every", type=click.IntRange(min=1), metavar="N", help="Keep every Nth selected scan."
@@ -307,18 +313,18 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
     "columns": click.option(
         "--columns",
         metavar="NAME,...",
-        help="Columns in this order, such as x,y,z,intensity.",
+        help="Names of the columns to write, in this order, such as x,y,z,intensity.",
     ),
     "time": click.option(
         "--time",
         type=click.Choice(["device", "host"]),
-        help="Clock of the stamps and of --slice.  [default: device]",
+        help="Clock for the stamps and for --slice.  [default: device]",
     ),
     "beams": click.option(
         "--beams",
         type=click.IntRange(min=1),
         metavar="N",
-        help="Number of ranges in each LaserScan.",
+        help="Number of ranges in each LaserScan message.",
     ),
     "frame_id": click.option(
         "--frame-id", metavar="NAME", help="frame_id of the ROS messages.  [default: laser]"
@@ -327,10 +333,10 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
 
 
 def selecting(*names: str) -> Callable[[Function], Function]:
-    """Add options that select; the verb gets a `Selection`.
+    """Add options that select scans. The verb gets a `Selection`.
 
     Args:
-        names: arguments of `Selection`, keys of `SELECTING`.
+        names: the arguments of `Selection` to add options for, keys of `SELECTING`.
     """
 
     def options(function: Function) -> Function:
@@ -354,5 +360,5 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
 def points_option(function: Function) -> Function:
     """Add ``--all`` and ``--valid``."""
-    help_text = "All points, or only those with a valid return.  [default: --valid]"
+    help_text = "All points, or only points with a valid return.  [default: --valid]"
     return click.option("--all/--valid", "every_point", default=False, help=help_text)(function)

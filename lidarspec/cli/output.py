@@ -28,8 +28,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 #: Seconds between two updates of the progress line.
 UPDATE_PERIOD_S = 0.2
-#: In characters: gap between the columns of a table, indentation of prose below its row, and
-#: minimum width of a column of prose.
+#: Number of spaces between the columns of a table. The next constants are the indentation of prose
+#: below its row, and the minimum width of a column of prose, in characters.
 COLUMN_GAP = 2
 PROSE_INDENT = 6
 MIN_PROSE_WIDTH = 24
@@ -43,7 +43,10 @@ def output_options(function: Function) -> Function:
 
 
 def output_option(function: Function) -> Function:
-    """Add ``-o/--output`` to a verb; a file that the verb reads is refused."""
+    """Add ``-o/--output`` to a verb.
+
+    The output file must not be one that the verb reads.
+    """
 
     @functools.wraps(function)
     def refuse_and_call(*args: Any, output: str | None, **others: Any) -> Any:
@@ -65,12 +68,12 @@ def output_option(function: Function) -> Function:
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
-    """A progress line on standard error if that is a terminal.
+    """A progress line on standard error; a context manager that removes it at its end.
 
-    A context manager that removes the line at the end.
+    Nothing is shown if standard error is not a terminal.
 
     Args:
-        unit: formats an amount of work.
+        unit: converts an amount of work to text.
         period: minimum seconds between two updates; 0 shows every text.
     """
 
@@ -85,9 +88,9 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         """Show a text if an update is due.
 
         Args:
-            text: makes the text; called only if an update is due.
-            done: the completed and the total amount; if given, a bar, the rate and the remaining
-                time are also shown.
+            text: returns the text. It is called only if an update is due.
+            done: (completed amount, total amount) of work, to show a bar, the rate and the
+                remaining time as well; None shows only the text.
         """
         if not self._is_shown or time.monotonic() < self._due:
             return
@@ -104,11 +107,12 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._make_bar.refresh()
 
     def show_progress(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
-        """Run a task, print its remarks, and show a text meanwhile.
+        """Run a task, print its remarks, and show progress while it runs.
 
         Args:
-            remarks: runs the task when it is iterated; an empty remark only updates the text.
-            text: makes the text.
+            remarks: iterating it runs the task. It yields texts to print; an empty text only
+                updates the progress.
+            text: returns the progress text.
         """
         for remark in remarks:
             self(text)
@@ -196,10 +200,12 @@ def emit(content: str | bytes, output: str | None) -> None:
 def emit_parts(
     parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None
 ) -> None:
-    """Write texts of one or more lines, or bytes, as they are made, like `emit`.
+    """Write each text or each piece of bytes when it is made, like `emit`.
 
     Args:
-        colour: keep colours in a pipe.
+        parts: texts of one or more lines, or bytes.
+        output: the file; None for standard output.
+        colour: True keeps colours in a pipe.
     """
     if output is None or output == "-":
         for part in parts:
@@ -228,13 +234,20 @@ def emit_json(value: Any, output: str | None) -> None:
 def emit_json_list(
     head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
 ) -> None:
-    """Write a JSON object that ends with a list, each item as it is made, like `emit`."""
+    """Write a JSON object with a list, each item when it is made, like `emit`.
+
+    Args:
+        head: the entries before the list.
+        name: the key of the list.
+        items: the items of the list.
+        output: the file; None for standard output.
+    """
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
     emit_parts(itertools.chain(_iter_items(beginning, items), ["  ]\n}"]), output)
 
 
 def _iter_items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
-    """Yield each item with its comma; each item waits until the next is known."""
+    """Yield each item as text, with a comma if another item follows."""
     held = beginning
     for number, item in enumerate(items):
         yield held + "," * bool(number)
@@ -245,9 +258,9 @@ def _iter_items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
     """Format rows as aligned columns, fitted to the width of a terminal.
 
-    Without a terminal each row is one line. Cells are folded between words, so that ids and paths
-    stay whole. If that leaves too little width for the prose of the last column, it is printed on
-    lines of its own below each row.
+    Cells are folded between words, so that ids and paths are not split. If the last column is then
+    narrower than `MIN_PROSE_WIDTH`, its cells are printed on separate lines below each row. Without
+    a terminal, each row is one line.
     """
     lines = [headers, *rows]
     if output is None and sys.stdout.isatty():
@@ -266,21 +279,21 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
 
 
 def _fit_widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
-    """Return the widths of columns that fit in `room` characters, if possible.
+    """Return widths of columns that fit into `room` characters, if possible.
 
-    The widest column is narrowed first, but not below the width of its longest word.
+    The widest column is narrowed first. No column is narrower than its longest word.
     """
     columns = list(zip(*lines, strict=True))
     widths = [max(map(len, cells)) for cells in columns]
-    for place in sorted(range(len(columns)), key=lambda place: -widths[place]):
+    for index in sorted(range(len(columns)), key=lambda index: -widths[index]):
         excess = max(sum(widths) + COLUMN_GAP * (len(widths) - 1) - room, 0)
-        word = max((len(word) for cell in columns[place] for word in cell.split()), default=0)
-        widths[place] = max(word, widths[place] - excess)
+        word = max((len(word) for cell in columns[index] for word in cell.split()), default=0)
+        widths[index] = max(word, widths[index] - excess)
     return widths
 
 
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
-    """Yield the lines of one row; cells without a width are printed below it."""
+    """Yield the lines of one row. Cells without a width are printed below the row."""
 
     def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:
@@ -297,9 +310,9 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 
 
 def render(what: Text) -> str:
-    """Render an object of rich as coloured text.
+    """Convert a text of rich to a string with colour codes.
 
-    Printing with rich itself would end the process on a closed pipe.
+    Rich does not print the text itself, because it ends the process if the pipe is closed.
     """
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""`plot`: draw a scan, or figures over time."""
+"""`plot`: draw a scan, or statistics over time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ from lidarspec.view.svg import svg
     "-t",
     "--duration",
     type=DURATION,
-    help="Time to read a live source.  [default: 10s, except for a scan]",
+    help="Time to read a live source.  [default: 10s; for a scan, until it is complete]",
 )
 @selecting("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
@@ -88,9 +88,9 @@ def plot(
     """Draw a scan, or intensities, ranges and rates over time.
 
     A scan is drawn to scale from above, and also from the side if the points are not in one plane.
-    --kind intensity draws a histogram of the intensities, ranges the number of returns at each
-    range over time, and rates the packets and scans per second, with losses and errors. Everything
-    except the SVG of a scan requires matplotlib: lidarspec[plot].
+    --kind intensity draws a histogram of the intensities. --kind ranges draws the number of returns
+    at each range over time. --kind rates draws the packets and scans per second, with losses and
+    errors. All plots except a scan in SVG require matplotlib: lidarspec[plot].
     """
     if output == "-":
         suffix = ".svg"
@@ -130,8 +130,8 @@ def _draw_scan(
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
     """Return the complete scan with this number, counted from 1.
 
-    If there are fewer complete scans, returns the last one, or an incomplete scan if all scans are
-    incomplete.
+    If the source has fewer complete scans, returns the last of them. If it has none, returns an
+    incomplete scan.
     """
     chosen: Scan | None = None
     whole_count = 0
@@ -147,7 +147,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
     if whole_count < number:
         plural = "" if whole_count == 1 else "s"
         note(
-            f"{source} has {whole_count} whole scan{plural}: drawing the last part that can be"
+            f"{source} has {whole_count} complete scan{plural}: drawing the last part that can be"
             " drawn"
         )
     return chosen
@@ -156,7 +156,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
 def _draw_over_time(
     device: Device, source: str, selection: Selection, kind: str, end_s: float
 ) -> Any:
-    """Return a figure of the data until a time of `time.monotonic`."""
+    """Return a figure of the data that arrives until `end_s` on `time.monotonic`."""
     title = f"{device.sensor.id}, {Path(source).name if device.progress else source}"
     if kind == "rates":
         rates = matplotlib_figures.RateSeries(LiveScans(device, select=selection), end_s)

@@ -1,4 +1,4 @@
-"""`read` and `stats`: print points, packets, or statistics at intervals."""
+"""`read` and `stats`: print points or packets, or statistics at regular intervals."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from lidarspec.view.live_frames import LiveFrames, open_live
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading, format_figure
 
-#: Width and decimals of the columns of points.
+#: Column of points -> (width in characters, number of decimals).
 POINT_FORMATS = {
     **dict.fromkeys(("x", "y", "z", "range"), (9, 3)),
     **dict.fromkeys(("azimuth", "elevation"), (9, 4)),
@@ -53,8 +53,8 @@ POINT_FORMATS = {
         "column": (6, 0),
     },
 }
-#: Significant digits of a field of a packet and of a further column in float32; minimum width of a
-#: column in characters.
+#: Number of significant digits of a packet's field. The next constants are the number of digits of
+#: a further column in float32, and the minimum width of a column in characters.
 FIELD_DIGITS = 10
 FLOAT32_DIGITS = 7
 MIN_COLUMN_WIDTH = 8
@@ -95,12 +95,12 @@ def read(
     every_point: bool,
     as_json: bool,
 ) -> None:
-    """Print the points that a sensor sends, or its packets, one row each.
+    """Print the points or the packets of a sensor, one per row.
 
     Points are printed when their scan is complete, with the columns of a PointCloud and the number
-    of the scan, in metres, radians, and seconds since the scan's stamp. Packets are printed with
-    their offset in the input, their time, and the values of their fields in units; arrays only with
-    --json. Packets can be selected by --slice and --time only.
+    of the scan. Units are metres, radians, and seconds since the scan's stamp. Packets are printed
+    with their offset in the input, their time, and the values of their fields in units. Arrays are
+    printed only with --json. Packets can be selected only by --slice and --time.
     """
     with open_device(source, sensor_id) as device:
         if frame is not None and frame not in device.sensor.frames:
@@ -126,7 +126,7 @@ def read(
 
 
 def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
-    """Yield each row as JSON, or as aligned columns below their names and units."""
+    """Yield each row as JSON, or as aligned columns below names and units."""
     widths: list[int] = []
     for units, row in rows:
         if as_json:
@@ -146,7 +146,10 @@ def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator
 
 
 def _iter_points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
-    """Yield the points of all complete scans, and of incomplete scans at both ends."""
+    """Yield (units, row) for each point of the complete scans.
+
+    Also yields the points of incomplete scans at the beginning and the end.
+    """
     units: Units = UNITS
     for number, scan in enumerate(scans):
         if every_point:
@@ -166,9 +169,9 @@ def _iter_packets(
     patience: FirstFrameTimeout,
     selection: Selection,
 ) -> Iterator[tuple[Units, Row]]:
-    """Yield each packet with the fields of its header in units; arrays stay arrays."""
+    """Yield (units, row) for each packet; the row has its fields in units."""
     if replace(selection, times=(None, None), time="device") != Selection():
-        raise UsageError("packets can be selected by --slice and --time only")
+        raise UsageError("packets can be selected only by --slice and --time")
     wanted = TimeSlice(selection.times)
     number = 0
     for batch in device.packets(frame, wait=LOOK_S):
@@ -237,16 +240,16 @@ def _to_json(value: Any) -> Any:
     if isinstance(number, float):
         if not math.isfinite(number):
             return None
-        # A float32 has the digits that it prints; decimal scales cause rounding errors in the last
-        # digits of a float64.
+        # A float32 is printed with the digits that identify it. A float64 is rounded, because
+        # decimal scales cause errors in its last digits.
         if number.is_integer() and abs(number) < 2**53:
             return int(number)
         return float(str(value) if single else f"{number:.{JSON_DIGITS}g}")
     return number
 
 
-#: Name and unit of each measured value, the width of its column (0: only in the summary), and the
-#: function that formats it.
+#: (name, unit, width of the column, function that formats it) of each measured value. A value with
+#: the width 0 is printed only in the summary.
 FIGURES: tuple[tuple[str, str, int, Callable[[MeterReading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
     ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
@@ -266,7 +269,7 @@ WIDTHS = [6, *(width for _, _, width, _ in COLUMNS), 6]
 
 @dataclass
 class StatsPrinter:
-    """Prints a row of measured values, or a JSON object, for each interval."""
+    """Prints the statistics of each interval as a row or a JSON object."""
 
     device: Device
     as_json: bool
@@ -302,7 +305,7 @@ class StatsPrinter:
         else:
             lasted = ""
         if self.device.sensor.has_points:
-            counted = f"{reading.packets} packets, {reading.scans} whole scans"
+            counted = f"{reading.packets} packets, {reading.scans} complete scans"
         else:
             counted = f"{reading.packets} frames"
         say(f"\n{self.device.sensor.id}: {counted}{lasted}; {self.device.stats}")
@@ -341,7 +344,7 @@ class StatsPrinter:
 @click.option(
     "--max-errors",
     type=SHARE,
-    help="Exit with code 1 if more frames are invalid or lost, such as 1%.",
+    help="Exit with code 1 if a larger share of frames is invalid or lost, such as 1%.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
@@ -356,10 +359,10 @@ def stats(
 ) -> None:
     """Print speed, rates, errors, loss, jitter and queue of a sensor.
 
-    One line for each interval, and a summary at the end. Errors are frames with a wrong checksum,
-    length or value; loss counts missing packets by the sensor's own counter or clock. A file is
-    read as fast as possible, in batches; its intervals are measured by packet time and can be
-    longer than requested. Several sources are read one after another.
+    A line is printed for each interval, and a summary at the end. Errors are frames with a wrong
+    checksum, length or value. Loss is the share of missing packets, by the packet counter or the
+    clock of the sensor. A file is read as fast as possible, in batches. Its intervals are measured
+    by packet time, and can be longer than requested. Several sources are read one after another.
     """
     lasting = min(duration or math.inf, interval * count if count else math.inf)
     has_findings = False
@@ -393,7 +396,7 @@ def _print_stats(
 
     Args:
         interval: seconds between two lines.
-        lasting: total duration in seconds.
+        lasting: maximum duration in seconds.
     """
     start = time.monotonic()
     try:
@@ -417,7 +420,7 @@ def _measure_input(feed: LiveScans | LiveFrames, start: float) -> MeterReading:
     """Return the measured values of the whole input.
 
     Args:
-        start: the begin of the measurement of a live source, a time of `time.monotonic`.
+        start: start of the measurement of a live source, a time of `time.monotonic`.
     """
     return feed.meter.summary(
         feed.device.stats, time.monotonic() - start if feed.device.is_live else None
@@ -432,7 +435,7 @@ def _print_by_clock(
     lasting: float,
     patience: FirstFrameTimeout,
 ) -> None:
-    """Print a line for each interval of the clock."""
+    """Print a line for each interval of the host's clock."""
     edge = last = start
     end = start + lasting
     while end - edge > TOLERANCE_S and not feed.ended:
@@ -447,7 +450,10 @@ def _print_by_clock(
 def _print_by_packet_time(
     feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> None:
-    """Print a line for each interval of the packets' time, at least one batch long."""
+    """Print a line for each interval of the packets' time.
+
+    An interval contains at least one batch of packets.
+    """
     start: int | None = None
     edges = 0
     passed = 0.0

@@ -1,4 +1,4 @@
-"""`record` and `replay`: record a source into a file, and send a recording again."""
+"""`record` and `replay`: record a source to a file, and send a recording again."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ from lidarspec.transports.replays import LATE_NS, Replay
     type=DURATION,
     help="Stop after this time, such as 10s; default: at Ctrl-C.",
 )
-@count_option("packets or more: data packets, or datagrams if no sensor is named")
+@count_option("data packets or, if no sensor is named, datagrams; a few more may be recorded")
 @click.option("--no-start", is_flag=True, help="Send no commands to the sensor.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option(
@@ -76,7 +76,7 @@ def record(
     times: str | None,
     as_json: bool,
 ) -> None:
-    """Record a source with arrival times, in one file that survives a crash.
+    """Record a source with arrival times; a crash does not damage the file.
 
     With -s ID or a source sim:ID, the sensor is started and its description is stored in the file.
     Without a sensor, raw bytes are recorded.
@@ -130,17 +130,17 @@ def record(
 
 
 def _slice_error(source: str, target: str, times: str) -> UsageError:
-    """Return the error for --slice, with the command that cuts a recording."""
+    """Return the error for --slice, with the command that copies a part of a file."""
     if is_live(source):
         return suggest(
-            UsageError("--slice is for recordings; for a live source, use -t"),
+            UsageError("--slice requires a recording; for a live source, use -t"),
             "lidarspec record --help",
         )
     command = (
         f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice"
         f" {shlex.quote(times)}"
     )
-    return suggest(UsageError("record copies whole files; replay copies a part"), command)
+    return suggest(UsageError("record copies only whole files; use replay to copy a part"), command)
 
 
 def _print_recording(task: SourceRecording) -> None:
@@ -165,7 +165,7 @@ def _sum_up_recording(
     *,
     as_json: bool,
 ) -> None:
-    """Print a summary of a recording and the next command; delete an empty file."""
+    """Print a summary of a recording and the next command; delete it if it is empty."""
     device = task.device
     if not recorder.records:
         if not recorder.discard():
@@ -200,7 +200,7 @@ def _sum_up_recording(
 def _describe_damage(stats: Counters) -> str:
     """Format the counters of lost and damaged input.
 
-    Counters of decoded data are omitted, because not all of that data is in the file.
+    Counters of decoded data are omitted, because the file does not contain all decoded data.
     """
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):
@@ -220,7 +220,7 @@ def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
 @click.argument("file", metavar="FILE")
 @click.option(
     "--to",
-    "place",
+    "target",
     default="pty",
     show_default=True,
     metavar="PLACE",
@@ -229,7 +229,8 @@ def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
 @click.option(
     "--speed",
     type=SPEED,
-    help="1 as recorded, 0.5 at half speed, max without pauses.  [default: 1; max to a file]",
+    help="1 is the recorded speed, 0.5 is half of it, max is without pauses."
+    "  [default: 1; to a file: max]",
 )
 @click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
 @click.option("--force", is_flag=True, help="Overwrite the destination file.")
@@ -243,7 +244,7 @@ def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
 )
 def replay(
     file: str,
-    place: str,
+    target: str,
     speed: float | None,
     loop: bool,
     force: bool,
@@ -253,35 +254,35 @@ def replay(
 ) -> None:
     """Replay a recording or capture, byte for byte and in real time.
 
-    A pty or tcp:// starts when a reader opens it. udp:// without a port uses those of the
-    recording. A new .lsr or .pcap file keeps the times of the recording. --slice selects by the
-    times of arrival.
+    With a pty or tcp://, the replay starts when a reader opens the port. udp:// without a port
+    sends to the ports of the recording. A new .lsr or .pcap file contains the arrival times of the
+    recording. --slice selects by arrival time.
     """
     if is_live(file):
         raise suggest(
-            UsageError(f"{file} is a live source: only a file can be replayed"),
+            UsageError(f"only a file can be replayed, but {file} is a live source"),
             f"lidarspec record {shlex.quote(file)} -o recording.lsr",
         )
-    is_file = place.endswith(SUFFIXES) and "://" not in place
+    is_file = target.endswith(SUFFIXES) and "://" not in target
     if is_file and loop:
         raise UsageError("--loop requires a port or socket, not a file")
     if file == "-" and loop:
         raise UsageError("standard input can be read only once: omit --loop")
     if is_file:
-        refuse_overwriting(place, file, sensor_id)
+        refuse_overwriting(target, file, sensor_id)
     with contextlib.ExitStack() as undo:
         source = undo.enter_context(contextlib.closing(open_transport(file)))
         sensor = _find_sensor(source, sensor_id)
         destination: Outlet | BackgroundWriter
         if is_file:
-            destination = _make_file(source, file, place, sensor, force=force)
+            destination = _make_file(source, file, target, sensor, force=force)
         else:
             port = declared_port(sensor)
-            destination = make_replay_outlet(place, datagrams=source.datagrams, port=port)
-        undo.pop_all()  # the replay closes it
+            destination = make_replay_outlet(target, datagrams=source.datagrams, port=port)
+        undo.pop_all()  # the replay closes the source
     if isinstance(destination, Outlet):
-        place = destination.local_source
-        _announce(file, place, sensor, as_json=as_json)
+        target = destination.local_source
+        _announce(file, target, sensor, as_json=as_json)
     factor = speed or None  # 0 is as fast as possible
     if speed is None and not is_file:
         factor = 1.0
@@ -295,13 +296,13 @@ def replay(
         times=selection.times,
     )
     is_interrupted = _run_replay(played, destination, file)
-    _print_summary(file, place, sensor, played, is_file=is_file, as_json=as_json)
+    _print_summary(file, target, sensor, played, is_file=is_file, as_json=as_json)
     if is_interrupted:
         raise click.exceptions.Exit(INTERRUPTED)
 
 
 def _run_replay(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:
-    """Run a replay; return whether it was interrupted before its end."""
+    """Run a replay, and return whether the user interrupted it."""
     with contextlib.closing(destination), Progress() as progress:
         try:
             progress.show_progress(played.run(), lambda: _describe_progress(played))
@@ -327,38 +328,41 @@ def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | 
 
 
 def _make_file(
-    source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool
+    source: Transport, file: str, target: str, sensor: Sensor | None, *, force: bool
 ) -> BackgroundWriter:
     """Return a new file for the bytes of another file."""
     try:
-        return make_recorder(source, file, place, sensor, overwrite=force)
+        return make_recorder(source, file, target, sensor, overwrite=force)
     except UsageError as error:
-        if os.path.exists(place) and not force:
+        if os.path.exists(target) and not force:
             raise suggest(error, "repeat with --force, or with another file") from None
         raise
 
 
-def _announce(file: str, place: str, sensor: Sensor | None, *, as_json: bool) -> None:
-    """Print the destination, unless standard output is for JSON, and the next command."""
+def _announce(file: str, target: str, sensor: Sensor | None, *, as_json: bool) -> None:
+    """Print the destination and the next command.
+
+    With `as_json`, the destination is not printed, because standard output is for JSON.
+    """
     if not as_json:
-        say(place)
-    if not place.startswith("udp:"):
-        note(f"replaying {file} to {place} when a reader opens it")
-        note(f"next: lidarspec {_view_words(sensor, place)}")
+        say(target)
+    if not target.startswith("udp:"):
+        note(f"replaying {file} to {target} when a reader opens it")
+        note(f"next: lidarspec {_view_words(sensor, target)}")
         return
-    source = place
-    has_port = ":" in place.removeprefix("udp://")
+    source = target
+    has_port = ":" in target.removeprefix("udp://")
     if not has_port:
         source = "udp://" if sensor else "udp://:PORT"
-    note(f"replaying {file} to {place}")
+    note(f"replaying {file} to {target}")
     note(f"next: lidarspec {_view_words(sensor, source)}")
 
 
-def _view_words(sensor: Sensor | None, place: str) -> str:
-    """Return the words after `lidarspec` that show the data at a place."""
+def _view_words(sensor: Sensor | None, target: str) -> str:
+    """Return the words after `lidarspec` that show the data of a source."""
     if sensor is None:
-        return f"detect {shlex.quote(place)}"
-    return f"{verb_to_show(sensor)} {shlex.quote(place)} -s {sensor.id}"
+        return f"detect {shlex.quote(target)}"
+    return f"{verb_to_show(sensor)} {shlex.quote(target)} -s {sensor.id}"
 
 
 def _describe_progress(played: Replay) -> str:
@@ -367,16 +371,16 @@ def _describe_progress(played: Replay) -> str:
 
 def _print_summary(
     file: str,
-    place: str,
+    target: str,
     sensor: Sensor | None,
     played: Replay,
     *,
     is_file: bool,
     as_json: bool,
 ) -> None:
-    note(f"{file} to {place}: {_describe_progress(played)}")
+    note(f"{file} to {target}: {_describe_progress(played)}")
     if not played.is_timed:
-        note(f"{file} has no arrival times: its bytes were sent as fast as possible")
+        note(f"{file} has no arrival times, so its bytes were sent as fast as possible")
     if played.late:
         note(
             f"{played.late} chunks were sent more than {LATE_NS // 1_000_000} ms late, up to"
@@ -384,15 +388,15 @@ def _print_summary(
         )
     if len(played.senders) > 1 and not is_file:
         note(
-            f"the datagrams of {len(played.senders)} senders were sent from one address; choose one"
-            f" sender with '{file}?src=ADDRESS'"
+            f"the datagrams of {len(played.senders)} senders were all sent from one address; choose"
+            f" one sender with '{file}?src=ADDRESS'"
         )
     if is_file:
-        note(f"next: lidarspec {_view_words(sensor, place)}")
+        note(f"next: lidarspec {_view_words(sensor, target)}")
     if as_json:
         summary = {
             "source": file,
-            "to": place,
+            "to": target,
             "chunks": played.chunks,
             "bytes": played.bytes,
             "sha256": played.digest.hexdigest(),

@@ -1,7 +1,7 @@
 """The verbs, their shared options, and the entry point `main`.
 
-A verb's module is imported when the verb is used; a failure becomes one message and an exit code.
-This module imports neither NumPy nor construct, so that ``lidarspec --help`` is quick.
+The module of a verb is imported when the verb is used. A failure is reported as one message and an
+exit code. This module imports neither NumPy nor construct, so that ``lidarspec --help`` is fast.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean, suggest
 from lidarspec.known_sensors import install_command
 
-#: Group -> verb -> (module, summary); the summary equals the first line of the verb's help.
+#: Group -> verb -> (module, summary). The summary is the same as the first line of the verb's help.
 GROUPS = {
     "look": {
         "sensors": ("sensors", "List the installed sensors, and how each was verified."),
-        "show": ("sensors", "Describe a sensor, with a wire table for each of its frames."),
+        "show": ("sensors", "Describe a sensor, with a table of the fields of each frame."),
         "ports": (
             "finding",
             "List the serial ports of this computer, and the UDP ports of installed sensors.",
         ),
         "detect": (
             "finding",
-            "Identify the installed sensor that sends, its port and its baud rate.",
+            "Identify the sensor that sends data, its port and its baud rate.",
         ),
         "doctor": ("finding", "Diagnose why no data arrives from a sensor, and suggest a fix."),
         "plugins": (
             "sensors",
-            "List the installed plugins, and the errors of those that fail to load.",
+            "List the installed plugins, with the error of each plugin that fails.",
         ),
         "trust": (
             "sensors",
-            "Trust a folder: its lidarspec.toml may name Python files and files elsewhere.",
+            "Trust a folder, so that its lidarspec.toml may name Python files.",
         ),
         "demo": (
             "sim",
@@ -52,11 +52,11 @@ GROUPS = {
         "help": ("root", "Print the help of a verb, or the list of all verbs."),
     },
     "stream": {
-        "read": ("read", "Print the points that a sensor sends, or its packets, one row each."),
+        "read": ("read", "Print the points or the packets of a sensor, one per row."),
         "view": ("view", "Draw a live sensor in the terminal, or with --web in the browser."),
         "record": (
             "recordings",
-            "Record a source with arrival times, in one file that survives a crash.",
+            "Record a source with arrival times; a crash does not damage the file.",
         ),
         "replay": ("recordings", "Replay a recording or capture, byte for byte and in real time."),
         "sim": ("sim", "Simulate a sensor on a serial port, UDP, TCP or in a file."),
@@ -75,12 +75,12 @@ GROUPS = {
         "plot": ("plot", "Draw a scan, or intensities, ranges and rates over time."),
     },
     "bytes": {
-        "parse": ("frames", "Print the fields of each frame in some bytes."),
+        "parse": ("frames", "Print the fields of each frame in hexadecimal text or a file."),
         "explain": (
             "frames",
             "Explain every byte of each frame: offset, hex, field, value, unit, meaning.",
         ),
-        "build": ("build", "Build one frame from field=value, raw or with a unit such as 1.5m."),
+        "build": ("build", "Build one frame from the values of its fields."),
         "crc": (
             "finding",
             "Find the checksum of sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.",
@@ -89,11 +89,11 @@ GROUPS = {
     "authors": {
         "new": (
             "authors",
-            "Create a distribution for your own sensor; it works before you change anything.",
+            "Create a distribution for your own sensor, with a working example.",
         ),
         "check": (
             "authors",
-            "Check a sensor, a file or a distribution against every property of the test kit.",
+            "Run the checks of the test kit on a sensor, a file or a distribution.",
         ),
         "export": (
             "authors",
@@ -101,7 +101,7 @@ GROUPS = {
         ),
     },
 }
-VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
+VERBS = {verb: entry for verbs in GROUPS.values() for verb, entry in verbs.items()}
 #: Verbs of plugins that are installed separately -> distribution.
 SEPARATE_VERBS = {"ros2": "lidarspec-ros2"}
 
@@ -116,7 +116,7 @@ def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Optio
     return click.Option(names, is_flag=True, expose_value=False, callback=set_verbosity, help=help)
 
 
-#: Options of all verbs, except of verbs that have an option of the same name.
+#: Options that every verb has, unless the verb has its own option with the same name.
 COMMON_OPTIONS = (
     _make_verbosity_option(
         -1,
@@ -135,7 +135,7 @@ COMMON_OPTIONS = (
 
 @functools.cache
 def find_added_verbs() -> dict[str, EntryPoint]:
-    """Return the verbs of installed plugins, without loading them.
+    """Return the verbs of installed plugins, without loading the plugins.
 
     A plugin cannot replace a verb of lidarspec.
     """
@@ -143,7 +143,7 @@ def find_added_verbs() -> dict[str, EntryPoint]:
 
 
 class Verbs(click.Group):
-    """The group of all verbs; a verb's module is imported when the verb is used."""
+    """The group of all verbs. The module of a verb is imported when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [*VERBS, *find_added_verbs()]
@@ -173,7 +173,7 @@ class Verbs(click.Group):
         if args[0] not in VERBS and args[0] not in find_added_verbs() and not ctx.resilient_parsing:
             if args[0] in SEPARATE_VERBS:
                 error = click.UsageError(
-                    f"the verb {args[0]!r} is part of a plugin that is not installed", ctx
+                    f"the verb {args[0]!r} requires a plugin that is not installed", ctx
                 )
                 raise suggest(error, install_command(SEPARATE_VERBS[args[0]], extra=args[0]))
             raise click.UsageError(
@@ -192,7 +192,7 @@ class Verbs(click.Group):
                 )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
-        """Return the verbs, without loading them, and the options."""
+        """Return the names of verbs and options, without loading the verbs."""
         from click.shell_completion import CompletionItem
 
         verbs = {verb: text for verb, (_, text) in VERBS.items()} | {
@@ -208,7 +208,7 @@ class Verbs(click.Group):
     def main(  # type: ignore[override]
         self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any
     ) -> NoReturn:
-        """Run one verb and exit with its code; raises no other exception."""
+        """Run one verb, and exit with its code; no exception but SystemExit is raised."""
         if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
             from lidarspec.cli.completion import complete
 
@@ -244,7 +244,7 @@ def _run(group: click.Group, words: list[str]) -> int:
 
 
 def _format_cost(seconds: float) -> str:
-    """Format the time of a verb, and its memory if the system reports it."""
+    """Format the time of a verb, and the memory it used if the system reports it."""
     try:
         import resource
     except ImportError:

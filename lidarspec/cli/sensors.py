@@ -1,7 +1,7 @@
 """`sensors`, `show`, `plugins` and `trust`: the installed sensors and plugins.
 
-`sensors` and `show` are used often and need little of the package: each function imports the
-modules that the other verbs do not need.
+The modules that only some of these verbs need are imported inside functions, so that `sensors` and
+`show` start fast.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
 
-#: Number of packets for which a plan is made: a turn may have this many, some of them shorter.
+#: Number of simulated packets for which a plan is made. Some packets of a revolution may be
+#: shorter, so a single packet is not enough.
 PLANNED_PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
-    """Return a row for each installed sensor, and the plugins that failed to load.
+    """Return facts about each installed sensor, and the plugins that failed to load.
 
-    Most plugins are not loaded for this.
+    Most plugins need not be loaded, because their facts are stored.
     """
     is_fresh = (
         "lidarspec.plugins" not in sys.modules
@@ -67,8 +68,8 @@ def guide() -> str:
         "demo": "simulate a sensor, and draw it",
         "sensors": "list the installed sensors",
         "detect": "find the sensor that sends",
-        f"view {source}": "draw its points",
-        f"record {source} -o a.lsr -t 10s": "record it for 10 s",
+        f"view {source}": "draw the points of the sensor",
+        f"record {source} -o a.lsr -t 10s": "record the sensor for 10 s",
         "convert a.lsr points.csv": "write the points to a file",
         "explain a.lsr -n 1": "explain every byte of a frame",
         "doctor": "diagnose why no data arrives",
@@ -76,7 +77,7 @@ def guide() -> str:
     width = max(len(command) for command in commands)
     lines.append("")
     lines += [f"  lidarspec {command:<{width}}  {text}" for command, text in commands.items()]
-    lines += ["", "lidarspec help lists all verbs, lidarspec help VERB its options"]
+    lines += ["", "lidarspec help lists all verbs; lidarspec help VERB lists the options of a verb"]
     return "\n".join(lines)
 
 
@@ -125,11 +126,11 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="Show how points are computed, and which parts use plain evaluation.",
+    help="Show how points are computed, and which parts use the slow reference evaluator.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
-    """Describe a sensor, with a wire table for each of its frames."""
+    """Describe a sensor, with a table of the fields of each frame."""
     from lidarspec.frames.wire_table import frame_size, wire_table
     from lidarspec.plugins import sensor as named_sensor, summarize_links
 
@@ -189,7 +190,7 @@ def _format_range(sensor: Sensor) -> str:
 
 
 def _format_unit(sensor: Sensor, path: str) -> str:
-    """Return the unit of a field, "frame.path", after a comma."""
+    """Return ", " and the unit of a field, "frame.path"; "" if it has no unit."""
     from lidarspec.frames.schema import make_schema
 
     frame, _, field = path.partition(".")
@@ -215,7 +216,7 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
         maker = FrameMaker(sensor, frame)
         sweep = sensor.simulation_of(frame).sweep
     except SpecError as error:
-        return [f"plain evaluation: {error}"]
+        return [f"reference evaluator: {error}"]
     if sweep:
         frames = maker.seal(maker.table([sweep(index) for index in range(PLANNED_PACKETS)]))
     else:
@@ -223,22 +224,23 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
     sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
-        return ["plain evaluation: the example has no points"]
+        return ["reference evaluator: the example has no points"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
     if isinstance(plan, Plan):
         return describe(plan)
-    return [f"plain evaluation: {plan}"]
+    return [f"reference evaluator: {plan}"]
 
 
 @click.command()
 @output_options
 @click.pass_context
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
-    """List the installed plugins, and the errors of those that fail to load.
+    """List the installed plugins, with the error of each plugin that fails.
 
-    They are loaded in a separate process. If that fails, each is loaded in its own process, to find
-    the plugin that hangs or ends the program. The exit code is 1 if a plugin fails.
+    All plugins are loaded in a separate process. If this process hangs or exits, each plugin is
+    loaded in its own process, to find the plugin that caused it. The exit code is 1 if a plugin
+    fails.
     """
     from lidarspec.plugins import try_plugins
 
@@ -269,14 +271,13 @@ def _describe_plugin(plugin: Plugin) -> str:
 @click.command()
 @click.argument("folder", default=".")
 def trust(folder: str) -> None:
-    """Trust a folder: its lidarspec.toml may name Python files and files elsewhere.
+    """Trust a folder, so that its lidarspec.toml may name Python files.
 
-    Trust only your own folders, with files that you know. The decision is stored, for this folder
-    only. LIDARSPEC_TRUST trusts a folder for a single run.
+    The lidarspec.toml of a trusted folder may also name files outside the folder. Trust only your
+    own folders, with files that you know. The decision is stored for this folder.
+    LIDARSPEC_TRUST=FOLDER trusts a folder for a single run.
     """
-    say(
-        f"{trusted(folder)}: its {FILE} is trusted from now on; stored in {user_folder() / TRUSTED}"
-    )
+    say(f"{trusted(folder)}: its {FILE} is now trusted; stored in {user_folder() / TRUSTED}")
 
 
 def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`sim` and `demo`: simulate a sensor on a port or in a file, and show one."""
+"""`sim` and `demo`: simulate a sensor on a port or in a file, and demonstrate one."""
 
 from __future__ import annotations
 
@@ -42,10 +42,12 @@ if TYPE_CHECKING:
 
 #: Default duration of a file, in seconds.
 FILE_DURATION_S = 10.0
-#: Maximum width and height of the picture in cells, and number of lines for the summary.
+#: Maximum width of the picture in characters. The next constants are its maximum height, and the
+#: number of lines for the summary.
 MAX_PICTURE_COLUMNS = 100
 MAX_PICTURE_LINES = 42
 SUMMARY_LINES = 8
+#: Help text of --to.
 PLACES = (
     f"pty, udp://HOST:PORT, tcp://HOST:PORT, or a file ({', '.join(SUFFIXES)}).  [default: pty or"
     " udp]"
@@ -61,19 +63,19 @@ PLACES = (
     "-t",
     "--duration",
     type=DURATION,
-    help="Stop after this time; for a file, its duration.  [default: never; 10s]",
+    help="Stop after this time.  [default: never; for a file, 10s]",
 )
 @click.option(
     "--rate",
     metavar="FACTOR",
     default="1",
     show_default=True,
-    help="Speed relative to the real sensor, or max.",
+    help="Speed relative to the real sensor; max is as fast as possible.",
 )
 @click.option(
     "--scene",
     metavar="FILE",
-    help="Scene that the sensor measures, a TOML file.  [default: a room]",
+    help="TOML file with the scene that the sensor measures.  [default: a room]",
 )
 @click.option(
     "--seed",
@@ -81,7 +83,7 @@ PLACES = (
     metavar="N",
     default=0,
     show_default=True,
-    help="Random seed of the room and of the errors.",
+    help="Random seed for the room and the errors.",
 )
 @click.option(
     "--errors",
@@ -103,9 +105,9 @@ PLACES = (
     metavar="N",
     default=0,
     show_default=True,
-    help="Delay datagrams by up to this many places.",
+    help="Delay datagrams so that up to N later datagrams overtake them.",
 )
-@click.option("--unplug", type=DURATION, help="Disconnect repeatedly after this time.")
+@click.option("--unplug", type=DURATION, help="Disconnect the sensor repeatedly after this time.")
 @click.option(
     "--shake",
     type=click.FloatRange(min=0),
@@ -145,8 +147,9 @@ def sim(
 ) -> None:
     """Simulate a sensor on a serial port, UDP, TCP or in a file.
 
-    It behaves as its spec describes: it runs in real time, replies to commands, starts and stops.
-    Its address is printed on standard output, everything else on standard error.
+    The simulated sensor behaves as its spec describes: it sends data in real time, replies to
+    commands, starts and stops. Its address is printed on standard output; all other text is printed
+    on standard error.
     """
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
@@ -154,21 +157,21 @@ def sim(
     device = SimulatedDevice(
         sensor, scene=simulated_scene, seed=seed, rate=parse_rate(rate), faults=faults
     )
-    place = to or ("udp://" if sensor.datagrams else "pty")
-    if place != "pty" and "://" not in place:
+    target = to or ("udp://" if sensor.datagrams else "pty")
+    if target != "pty" and "://" not in target:
         if link is not None:
             raise UsageError("--link requires --to pty")
-        if Path(place).suffix.lower() not in SUFFIXES:
+        if Path(target).suffix.lower() not in SUFFIXES:
             raise UsageError(
-                f"--to {place}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
+                f"--to {target}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
                 f" ({', '.join(SUFFIXES)})"
             )
-        written = write_file(device, place, duration or FILE_DURATION_S, overwrite=force)
-        _announce(sensor, place, place, {}, as_json=as_json)
+        written = write_file(device, target, duration or FILE_DURATION_S, overwrite=force)
+        _announce(sensor, target, target, {}, as_json=as_json)
         note(f"{_format_sent(device)}, {size(written)}")
         return
     try:
-        opened = make_simulated_outlet(sensor, place, link)
+        opened = make_simulated_outlet(sensor, target, link)
     except UsageError as error:
         raise suggest(
             error,
@@ -182,7 +185,7 @@ def sim(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; {size(opened.unsent_bytes)} had no reader"
+            lost = f"; {size(opened.unsent_bytes)} were not read by any program"
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")
@@ -208,7 +211,7 @@ def _announce(
         return
     say(where)
     control_lines = "".join(
-        f"\n  commands over {name}: {place}" for name, place in controls.items()
+        f"\n  commands over {name}: {address}" for name, address in controls.items()
     )
     note(f"{sensor.id}, simulated{control_lines}\n  next: {following}")
 
@@ -216,7 +219,7 @@ def _announce(
 def _make_watcher(
     device: SimulatedDevice, opened: Outlet, progress: Progress
 ) -> Callable[[], None]:
-    """Return a callback that prints received commands, and each unplugging."""
+    """Return a callback that prints received commands and disconnections."""
     began = time.monotonic()
     printed = 0
     present = True
@@ -226,7 +229,7 @@ def _make_watcher(
         events = device.commands_received[printed:]
         if device.present != present:
             events += [
-                f"plugged in again at {opened.local_source}" if device.present else "unplugged"
+                f"connected again at {opened.local_source}" if device.present else "disconnected"
             ]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
@@ -244,7 +247,7 @@ def _format_sent(device: SimulatedDevice) -> str:
 
 @click.command()
 @sensor_option
-@count_option("whole scans", default=5, show_default=True)
+@count_option("complete scans", default=5, show_default=True)
 @click.option(
     "--errors",
     type=SHARE,
@@ -256,15 +259,15 @@ def _format_sent(device: SimulatedDevice) -> str:
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
     """Simulate a sensor on a port, read it over a noisy line, record it and draw it."""
     simulated = (
-        one
-        for one in registry().sensors().values()
-        if any(one.simulation_of(name).sweep for name in one.data_frames)
+        sensor
+        for sensor in registry().sensors().values()
+        if any(sensor.simulation_of(name).sweep for name in sensor.data_frames)
     )
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
         raise UsageError(no_sensors_text())
     if not sensor.has_points:
-        error = UsageError(f"{sensor.id} has no points, and demo draws a scan")
+        error = UsageError(f"{sensor.id} measures no points, so demo cannot draw a scan")
         raise suggest(error, f"lidarspec stats sim:{sensor.id} -t 5s")
     result = demonstrate(sensor, turns=count, errors=errors)
     whole = [scan for scan in result.scans if scan.whole]
@@ -316,7 +319,7 @@ def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[
     else:
         rate = ""
     lines.append(
-        f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
+        f"{len(whole)} complete scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
         " last scan:"
         f" {whole[-1]}"
     )

@@ -1,8 +1,8 @@
-"""Standard output and standard error of all verbs.
+"""Print to standard output and standard error.
 
 Addresses, file names and texts of devices and plugins are not trusted: characters that control a
-terminal are escaped. A remark that cannot be written does not end a verb, because that would stop a
-recording; data that cannot be written is an error.
+terminal are escaped. If a remark cannot be printed, the verb continues, so that a recording is not
+lost. If data cannot be printed, an error is raised.
 """
 
 from __future__ import annotations
@@ -22,30 +22,35 @@ from lidarspec.errors import SourceError, printable
 
 
 class Verbosity:
-    """The amount of remarks that are printed on standard error.
+    """How many remarks are printed on standard error.
 
     Attributes:
-        loudness: -1 for no remarks, 0 for the default, 1 for more remarks; each command begins
-            with 0.
+        loudness: -1 for no remarks, 0 for the default, 1 for more remarks. It is set to 0 at the
+            start of each command.
     """
 
     loudness = 0
 
 
 voice = Verbosity()
-#: Pattern of the escape sequences that only change colours.
+#: Matches an escape sequence that changes only colours.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
 
 def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) -> None:
-    """Print data on standard output; bytes as they are.
+    """Print data on standard output.
 
     Args:
-        colour: True keeps the colours of the text in a pipe; None if lidarspec has not coloured it.
+        content: text, in which characters that control a terminal are escaped; or bytes, which are
+            written unchanged.
+        nl: whether to end the output with a line break.
+        colour: whether to print the colours of a text that lidarspec has coloured: True also in a
+            pipe, False never. None for a text without colours; all escape sequences are then
+            escaped.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.
-        SourceError: if it cannot be written for another reason.
+        SourceError: if the data cannot be written for another reason.
     """
     if isinstance(content, str):
         if colour is None:
@@ -57,7 +62,10 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
 
 
 def note(text: str) -> None:
-    """Print a remark on standard error, unless remarks are off or it is closed."""
+    """Print a remark on standard error, unless remarks are switched off.
+
+    If standard error is closed, nothing is printed.
+    """
     if voice.loudness < 0:
         return
     try:
@@ -70,7 +78,7 @@ def note(text: str) -> None:
 def prepare_streams() -> Iterator[None]:
     """Prepare standard input, output and error for a verb, and flush them at its end.
 
-    Closed streams are replaced. Each warning is printed once, as a remark.
+    Closed streams are replaced by the null device. Each warning is printed once, as a remark.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.
@@ -79,8 +87,8 @@ def prepare_streams() -> Iterator[None]:
     voice.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:
-            # Without this, a file that is opened later would get the descriptor of the closed
-            # stream, and with it the printed text. Writing to a closed output is refused.
+            # Otherwise a file that is opened later would get the descriptor of the closed stream,
+            # and printed text would be written to this file. Output to a closed stream fails.
             descriptor = os.open(os.devnull, flags)
             mode = "r" if name == "stdin" else "w"
             setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
@@ -136,7 +144,7 @@ def _discard_stream(stream: Any) -> None:
 
 @contextlib.contextmanager
 def handle_sigterm() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C, so that a symbolic link is removed."""
+    """Handle SIGTERM like Ctrl-C, so that the verb removes its symbolic link."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

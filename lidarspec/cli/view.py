@@ -51,19 +51,19 @@ from lidarspec.view.terminal_window import Window
     "-t",
     "--duration",
     type=DURATION,
-    help="Stop after this time, such as 30s; with --once: timeout for the first scan, 10s.",
+    help="Stop after this time, such as 30s; with --once: timeout for the first scan.",
 )
 @click.option(
     "--once",
     is_flag=True,
-    help="Print one picture and exit; the default if standard output is not a terminal.",
+    help="Print one picture and exit; this is the default if output is not a terminal.",
 )
 @selecting("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
 @click.option(
     "--web",
     is_flag=True,
-    help="Show a page in the browser; the link with its token is printed.",
+    help="Serve a page with the scans, and print its link for the browser.",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @click.option(
@@ -86,7 +86,7 @@ from lidarspec.view.terminal_window import Window
     "-o",
     "--output",
     metavar="FILE.rrd|URL",
-    help="With --rerun: write a file, or use a running viewer, rerun+http://HOST:9876/proxy.",
+    help="With --rerun: write to this file, or send to a running viewer (rerun+http://HOST:9876/proxy).",
 )
 def view(
     source: str,
@@ -104,13 +104,13 @@ def view(
 ) -> None:
     """Draw a live sensor in the terminal, or with --web in the browser.
 
-    It is drawn from above, and also from the side if the points are not in one plane. A file is
-    played at its own speed. If standard output is not a terminal, one picture is printed.
+    The points are drawn from above, and also from the side if they are not in one plane. A file is
+    played at the speed of its times. If standard output is not a terminal, one picture is printed.
 
-    Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ?
-    helps, q quits.
+    Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all points, ?
+    lists the keys, q quits.
 
-    --rerun requires lidarspec[rerun]; it reads a file as fast as possible, and the viewer plays it.
+    --rerun requires lidarspec[rerun]. It reads a file as fast as possible, and the viewer plays it.
     """
     if once + web + in_rerun > 1:
         raise UsageError("--once, --web and --rerun cannot be combined")
@@ -193,7 +193,7 @@ def _serve(
         with handle_sigterm(), server:
             say(server.link)
             if opens and not _open_in_browser(server):
-                note("no browser found: open the link yourself")
+                note("no browser found; open the link in a browser")
             server.run(duration)
             conclude(server.device)
     finally:
@@ -201,7 +201,7 @@ def _serve(
 
 
 def _open_in_browser(server: PageServer) -> bool:
-    """Open the page in the browser, and return whether there is one."""
+    """Open the page in the browser, and return whether a browser was found."""
     try:
         return webbrowser.open(server.opening_page())
     except OSError:
@@ -209,7 +209,7 @@ def _open_in_browser(server: PageServer) -> bool:
 
 
 def parse_address(address: str | None) -> tuple[str, int]:
-    """Return the host and the port of the page; with port 0, the system chooses one.
+    """Return the host and the port of the page; 0 lets the system choose a port.
 
     Raises:
         UsageError: if the port is not a number.
@@ -229,16 +229,16 @@ def _show_in_rerun(
     duration: float | None,
     selection: Selection,
 ) -> None:
-    """Show scans in Rerun's viewer, or write its file.
+    """Show scans in Rerun's viewer, or write a file for it.
 
-    Ends with the input or after the duration.
+    Returns at the end of the input, or after the duration.
     """
     from lidarspec.formats.rerun import RERUN  # imports all formats, which takes a moment
     from lidarspec.view.rerun import SCHEMES, show
 
     if target and not target.startswith(SCHEMES):
         if not target.lower().endswith(RERUN.suffix):
-            raise UsageError(f"{target}: a recording for Rerun requires the suffix {RERUN.suffix}")
+            raise UsageError(f"{target}: the file for Rerun needs the suffix {RERUN.suffix}")
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK_S) as device:
         require_points(device, source)
@@ -251,10 +251,10 @@ def _show_in_rerun(
 
 
 def _run_window(device: Device, window: Window, *, taken: bool) -> None:
-    """Run the window until it or its terminal is closed.
+    """Run the window until the user closes the window or the terminal.
 
     Args:
-        taken: whether standard input contains the data, so that no keys can be read.
+        taken: whether standard input is the source, so that no keys can be read.
     """
     try:
         with Screen(sys.stdout, keyboard(taken=taken)) as screen:
@@ -271,7 +271,8 @@ def _draw_once(
     """Return a picture of the first complete scan, and a line about it.
 
     Raises:
-        WireError, CommandError: if no scan arrives.
+        CommandError: if the sensor sends nothing.
+        WireError: if its data contains no scan.
     """
     feed = LiveScans(device, select=selection)
     end = time.monotonic() + patience

@@ -104,8 +104,8 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
     """Return the number in a text, and the unit that the text has; "" for no unit.
 
     Args:
-        text: a number, which may have a unit. unit: the unit to convert to; used only if the text
-            has a unit.
+        text: a number, which may have a unit.
+        unit: the unit to convert to; used only if the text has a unit.
         expected: description of a valid text, for the error message.
     """
     digits, unit_text = split_unit(text)

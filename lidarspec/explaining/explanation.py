@@ -97,7 +97,7 @@ class Explanation:
 
         Args:
             number: index of the point in the frame, or in the part if the points are in parts.
-                part: index of the part that contains the point; 0 if the points are not in parts.
+            part: index of the part that contains the point; 0 if the points are not in parts.
         """
         return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
@@ -305,8 +305,8 @@ def _find_point_numbers(
         path: the path of the row.
         chain: the axes of the nested arrays with the points, outermost first.
         axes: the array along each dimension of `numbers`; None if the dimension is not an array of
-            the frame. numbers: index of the point of each array element; -1 for an element without
-            a point.
+            the frame.
+        numbers: index of the point of each array element; -1 for an element without a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

@@ -478,7 +478,7 @@ local function show(frame, tvb, at, size, root, told, is_sound, doubts)
   local named = frame.name
   for _, other in ipairs(doubts or {}) do named = named .. " or " .. other end
   if named ~= frame.name then
-    shown:add_proto_expert_info(marks.unsure, named .. ": what tells them is not in these bytes, or is Python code")
+    shown:add_proto_expert_info(marks.unsure, named .. ": these bytes do not distinguish the types, or only Python code can")
   end
   if is_sound and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, named) end
   local begun = walk(frame, tvb, at, at + size)
@@ -499,7 +499,7 @@ local function leftover(tvb, at, stop, root, told, last)
     else
       length = 1
       while at + length < stop and not likely(tvb, at + length, stop, last) do length = length + 1 end
-      root:add(proto, tvb(at, length), string.format("%s, %d bytes of no frame", sensor.title, length)):add_proto_expert_info(marks.skipped)
+      root:add(proto, tvb(at, length), string.format("%s, %d bytes outside frames", sensor.title, length)):add_proto_expert_info(marks.skipped)
     end
     at = at + length
   end

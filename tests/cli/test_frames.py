@@ -149,7 +149,7 @@ def test_explain_can_show_damaged_frames_only(tmp_path: Path) -> None:
         *(
             line
             for line in result.stdout.splitlines()
-            if line.startswith("note: one lost byte would explain it")
+            if line.startswith("note: one lost byte explains the damage")
         ),
     ]
     assert result.stderr == "29 frames, 1 damaged, 0 bytes outside frames\n"

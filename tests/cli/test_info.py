@@ -52,7 +52,7 @@ def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_
         assert content["reading"]["speed_hz"] == pytest.approx(10, abs=0.1)
     text = ran("info", path).stdout
     assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:20.395Z, 0.395 s" in text
-    assert "sensor    velodyne-vlp16: 100.0% of the bytes are in its frames" in text
+    assert "sensor    velodyne-vlp16: 100.0% of the bytes are in valid frames" in text
     assert max(len(line) for line in text.replace(str(path), "drive.pcap").splitlines()) <= 80
 
 
@@ -73,7 +73,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
     text = ran("info", path).stdout
     assert "named in the file" in text
-    assert "only its beginning is counted" in text
+    assert "only the beginning of this long file is counted" in text
 
 
 @pytest.mark.slow
@@ -96,5 +96,5 @@ def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
         None,
     )
     assert "no arrival times" in ran("info", raw).stdout
-    assert "not identified among the installed ones" in ran("info", noise, code=4).stdout
+    assert "no installed sensor matches" in ran("info", noise, code=4).stdout
     ran("info", empty, code=4)

@@ -134,7 +134,7 @@ def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Pa
     failed = ran(
         "convert", source, tmp_path / "out.npy", "--organized", "-s", "ldrobot-stl27l", code=2
     )
-    assert "points of ldrobot-stl27l have no rows and columns" in failed.stderr
+    assert "the points of ldrobot-stl27l are not in rows and columns" in failed.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["in.bin"]
 
 

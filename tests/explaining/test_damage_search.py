@@ -55,11 +55,11 @@ def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
 
 def test_a_lost_byte_and_an_inserted_byte_are_reported() -> None:
     assert explain(EXAMPLE[1:], STL, "data").notes == (
-        "one lost byte would explain it: 0x54 before byte 0, in header",
+        "one lost byte explains the damage: 0x54 before byte 0, in header",
     )
     (note,) = explain(EXAMPLE[:20] + EXAMPLE[21:], STL).notes
     assert re.fullmatch(
-        r"one lost byte would explain it, at any of \d+ places",
+        r"a single lost byte explains the damage, at one of \d+ offsets",
         note,
     )
     assert "byte 20, 0x9b" in " ".join(explain(EXAMPLE[:20] + b"\x9b" + EXAMPLE[20:], STL).notes)
@@ -81,10 +81,10 @@ def test_a_suggested_repair_makes_the_frame_valid(name: str) -> None:
 
 def test_a_flipped_bit_is_reported_with_its_field() -> None:
     notes = explain(make_bit_flip(46, 0).repair(EXAMPLE), STL).notes
-    assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
+    assert "a flipped bit explains the damage: byte 46 bit 0, crc 81, sent as 80" in notes
     assert (
-        "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m"
-        in notes
+        "a flipped bit explains the damage:"
+        " byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m" in notes
     )
     assert explain(EXAMPLE[:20], STL).notes == ()
 
@@ -94,6 +94,6 @@ def test_damage_by_any_single_bit_is_summarized() -> None:
     data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
     (note,) = explain(make_bit_flip(20, 2).repair(data), sensor, "data").notes
     assert re.fullmatch(
-        r"one flipped bit would explain it, at any of \d+ places",
+        r"a single flipped bit explains the damage, at one of \d+ offsets",
         note,
     )

@@ -257,7 +257,7 @@ def test_checksums_of_every_kind_are_judged() -> None:
         SHAPES["shape-numbers"].build("data", values, crc=0), SHAPES["shape-numbers"]
     ).rows[-1]
     assert row.remarks == (
-        "0x0000 means not filled (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",
+        "0x0000 means no checksum (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",
     )
     assert row.right
 
@@ -395,7 +395,7 @@ def test_look_ahead_and_implausible_frames_are_noted() -> None:
     values = ls.sensor("ldrobot-stl27l").parse(EXAMPLE)
     values.start_angle = 36001
     found = explain(ls.sensor("ldrobot-stl27l").build("data", values), ls.sensor("ldrobot-stl27l"))
-    assert found.notes == ("not plausible: decoders skip this frame",)
+    assert found.notes == ("the values are not plausible, so decoders skip this frame",)
 
 
 def test_bytes_that_begin_like_no_frame_are_refused() -> None:

@@ -63,7 +63,7 @@ def test_differences_are_listed_by_field_and_bit() -> None:
     ]
     assert (
         join_text(list(list_differences(first.differences(first), (47, 47)))[-1])
-        == "47 bytes, all identical"
+        == "47 bytes; the frames are identical"
     )
 
 

@@ -344,4 +344,4 @@ def test_the_functions_of_a_frame_have_the_names_that_the_header_documents() -> 
         "checksum_stored",
     ):
         assert f" shape_count_data_{ending}(" in header
-    assert "..._computed(p), ..._stored(p)" in header
+    assert "..._computed(p) and ..._stored(p)" in header

@@ -50,7 +50,7 @@ CAPTURES = [
 LATER, LONG = {"velodyne-hdl32e", "hesai-xt32", "hesai-qt64"}, pytest.mark.soak
 
 #: what is said of a frame that may be of another type, too.
-UNSURE = "what tells them is not in these bytes"
+UNSURE = "these bytes do not distinguish the types"
 
 
 @pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
