@@ -500,7 +500,7 @@ def _iter_conclusions(
     )
     if is_serial and not start and list_start_required():
         yield (
-            f"{', '.join(sensor.id for sensor in list_start_required())} send no data until they"
+            f"{', '.join(sensor.id for sensor in list_start_required())} send nothing until they"
             " are started"
         )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"

@@ -3,17 +3,17 @@
 In: a device, or points. Out: pictures. The distribution `lidarspec-web` draws the page in a
 browser. Modules in reading order:
 
-* `terminal_window`: shows a running sensor in the terminal: keys in, pictures and figures out.
-* `terminal_window_parts`: title, figures, colours and keys around the picture.
+* `terminal_window`: a window in the terminal that shows a running sensor and reads keys.
+* `terminal_window_parts`: the title, statistics, colours and keys around the picture.
 * `live_scans`: reads, counts and plays the scans of a device.
-* `live_frames`: the same for the frames of a device without points.
+* `live_frames`: reads and counts the frames of a device without points.
 * `rate_meter`: speed, rates, losses and jitter of a running sensor.
-* `polar`: points from above and from the side.
-* `canvas`: pictures in character cells, and their colours.
-* `terminal_screen`: the terminal: writes changed cells, reads single keys.
-* `svg`: one scan as a file.
-* `matplotlib_figures`: a scan, intensities, ranges and rates over time, for reports.
-* `rerun`: scans in the Rerun viewer.
-* `notebook`: scans, packets, explained frames and sensors in notebooks.
-* `page_server`: the interface of the server of `view --web`, a plugin.
+* `polar`: draws points from above and from the side.
+* `canvas`: pictures made of characters, and their colours.
+* `terminal_screen`: writes changed cells to the terminal, and reads single keys.
+* `svg`: draws a scan as SVG.
+* `matplotlib_figures`: figures of a scan, of intensities, and of ranges and rates over time.
+* `rerun`: shows scans in the Rerun viewer.
+* `notebook`: shows scans, packets, explained frames and sensors in notebooks.
+* `page_server`: the interface to the plugin that serves the page of `view --web`.
 """

@@ -1,8 +1,9 @@
-"""Pictures in character cells, with two by four braille dots per cell.
+"""Pictures made of characters in cells, with braille characters for dots.
 
-The dots are square if a cell is twice as high as wide. Each cell has a character and an ink, which
-is an index of `INKS`, so that two pictures can be compared cell by cell. The colour depth of the
-terminal decides how an ink is shown: with true colour, 256 colours, 16 colours, or no colour.
+A cell has 2 columns and 4 rows of dots. The dots are square if a cell is twice as high as wide.
+Each cell has a character and an ink. An ink is an index of `INKS`, so that two pictures can be
+compared cell by cell. It is shown in true colour, 256 colours, 16 colours or without colour, as the
+terminal supports.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from lidarspec.points.colours import Rgb, make_ramp
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 
-#: SGR codes of the ramp in 16 colours, from dark to light.
+#: SGR codes (terminal colours) of the ramp for terminals with 16 colours, from dark to light.
 _STANDARD = (94, 36, 92, 93)
 #: indices of the inks that are not part of the ramp.
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
@@ -34,8 +35,8 @@ DOTS_DOWN = 4
 BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
 BLANK = 0x2800
 _SPACE = ord(" ")
-#: character -> its replacement in ASCII. `_BY_DOTS` has the replacements of braille characters, by
-#: their number of dots.
+#: character -> its replacement in ASCII. A braille character is replaced by the character of
+#: `_BY_DOTS` at the index of its number of dots.
 ASCII = {
     "▲": "^",
     "▶": ">",
@@ -59,7 +60,8 @@ class TextStyle:
 
     Attributes:
         rgb: the colour; None for the default colour of the terminal.
-        standard: the SGR code of the nearest of 16 colours; None for the default colour.
+        standard: the SGR code of the nearest of the 16 standard colours; None for the default
+            colour.
         bold: whether the weight is bold.
         faint: whether the weight is faint.
     """
@@ -91,7 +93,7 @@ INKS: tuple[TextStyle, ...] = (*_FIXED, *_SCALE)
 def sgr(ink: int, depth: Depth) -> str:
     """Return the escape sequence that selects an ink.
 
-    If the terminal has no colours, the weights distinguish faint lines from points.
+    Without colours, only bold and faint text distinguish the inks.
     """
     chosen = INKS[ink]
     parts = ["0"]
@@ -126,7 +128,7 @@ class CellGrid:
 
     Attributes:
         codes: the characters as code points, (height, width) int32.
-        inks: their inks as indices of `INKS`, (height, width) int16.
+        inks: the ink of each character, as an index of `INKS`, (height, width) int16.
     """
 
     codes: NDArray[np.int32]
@@ -143,7 +145,7 @@ class CellGrid:
         return self.codes.shape[1], self.codes.shape[0]
 
     def write(self, row: int, column: int, text: str, ink: int = PLAIN) -> None:
-        """Write text that begins in a cell; cut it off at the edges."""
+        """Write text from a cell to the right. Characters outside the picture are omitted."""
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
@@ -154,7 +156,10 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy a picture with its upper left corner in a cell; cut it off at the edges."""
+        """Copy a picture so that its upper left corner is in a cell.
+
+        Parts outside this picture are omitted.
+        """
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
         if width > 0 and height > 0:
@@ -198,10 +203,10 @@ class Canvas:
     Attributes:
         width: number of columns of cells.
         height: number of rows of cells.
-        ramp: the column that colours show. For "range", a cell has the colour of its nearest point;
-            for other columns, the colour of its strongest point.
+        ramp: the column that the colours show. For "range", a cell has the colour of its nearest
+            point; for other columns, of the point with the highest value.
         dots: the dots of points, (4 * height, 2 * width) bool.
-        lines: the dots of rings and axes, (4 * height, 2 * width) bool. They are only shown in
+        lines: the dots of rings and axes, (4 * height, 2 * width) bool. They are shown only in
             cells without points.
         steps: the step of the ramp of each cell's points, (height, width) int16; -1 for cells
             without points.
@@ -217,7 +222,7 @@ class Canvas:
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
-        """Set dots of points; points outside the canvas are ignored.
+        """Set the dots of points. Points outside the canvas are ignored.
 
         Args:
             column, row: fractional coordinates in dots, (n,).
@@ -237,14 +242,14 @@ class Canvas:
     def label(
         self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False
     ) -> bool:
-        """Write text that begins in a cell, if there is room for it.
+        """Write text from a cell to the right, if there is space for it.
 
         Args:
             over: whether the text may hide points.
 
         Returns:
-            Whether the text was written. It is not if it would leave the canvas, or hide points or
-            other text.
+            Whether the text was written. It is not written if it would leave the canvas, or hide
+            points or other text.
         """
         cells = [(row, column + index) for index in range(len(text))]
         if not (0 <= row < self.height and column >= 0 and column + len(text) <= self.width):
@@ -278,7 +283,7 @@ class Canvas:
 
 
 def _to_braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the braille bits of each cell for dots, (height, width)."""
+    """Return the bits of the braille character of each cell, (height, width)."""
     blocks = dots.reshape(
         dots.shape[0] // DOTS_DOWN, DOTS_DOWN, dots.shape[1] // DOTS_ACROSS, DOTS_ACROSS
     )

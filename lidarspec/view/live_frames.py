@@ -1,6 +1,6 @@
 """Read and count the frames of an open device without points.
 
-`open_live` chooses between these frames and the scans of a device with points (`live_scans`).
+For a device with points, `open_live` returns its scans instead (`live_scans`).
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ def open_live(device: Device, select: Selection = EVERYTHING) -> LiveScans | Liv
     """Return the scans of an open device, or the frames of a device without points.
 
     Raises:
-        UsageError: if scans are selected, and the sensor has no points.
+        UsageError: if `select` selects scans, but the sensor has no points.
     """
     if device.sensor.has_points:
         return LiveScans(device, select=select)
     if select != EVERYTHING:
-        raise UsageError(f"{device.sensor.id} has no points: omit the options that select scans")
+        raise UsageError(
+            f"{device.sensor.id} measures no points: omit the options that select scans"
+        )
     return LiveFrames(device)
 
 
@@ -38,7 +40,7 @@ class LiveFrames:
         device: the open device; it is not closed.
 
     Attributes:
-        packets: the batches that were read last, one for each frame type that arrived.
+        packets: the packets that were read last, one batch for each frame type.
         ended: whether the input has ended.
         meter: counts the frames.
     """
@@ -52,14 +54,16 @@ class LiveFrames:
 
     @property
     def times_ns(self) -> Times:
-        """The arrival times of the frames that were read last, ascending, ns."""
+        """Arrival times of the frames that were read last, ascending, (n,) ns."""
         arrivals = np.concatenate(
             [np.zeros(0, np.int64), *(packets.host_ns for packets in self.packets)]
         )
         return np.sort(arrivals[arrivals > 0])
 
     def read(self, until: float) -> None:
-        """Read at least once, until a time of `time.monotonic` or the end of the input.
+        """Read batches until a time of `time.monotonic`, at least one.
+
+        Also returns at the end of the input.
 
         Raises:
             LidarSpecError: if the source fails.

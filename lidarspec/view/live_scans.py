@@ -1,8 +1,8 @@
 """Read, count and play the scans of an open device.
 
-`read` reads the data that has arrived, counts it in a `RateMeter` and keeps the newest scan. A file
-can be played: scans are then shown at the intervals of their times. Only little of the file is read
-ahead, so that figures and bytes belong to the scan that is shown.
+`LiveScans.read` reads the data that has arrived, counts it in a `RateMeter` and keeps the newest
+scan. A file can be played: each scan is then shown when it is due by its time. The file is read
+only a little ahead of the shown scan, so that the statistics belong to this scan.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from lidarspec.scans.selection import ScanSelector, Selection, TimeSlice
 from lidarspec.scans.stream import ScanStream
 from lidarspec.view.rate_meter import RateMeter
 
-#: the longest time that one read of a live source waits for data.
+#: maximum time that one read of a live source waits for data.
 LOOK_S = 0.04
-#: time between scans of a file without times.
+#: time between two scans of a file without times.
 DEFAULT_STEP_S = 0.1
-#: the longest time between two scans of a file; longer times are replaced by `DEFAULT_STEP_S`.
+#: maximum time between two scans of a file. A longer time is replaced by `DEFAULT_STEP_S`.
 MAX_STEP_S = 2.0
-#: recorded time that one read of a played file covers.
+#: duration of the recorded data that one read of a played file reads.
 READ_AHEAD_S = 0.1
 #: size of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
@@ -40,19 +40,20 @@ class LiveScans:
 
     Args:
         device: the open device; it is not closed.
-        played: whether scans of a file are shown at the intervals of their times, not as fast as
-            possible.
+        played: whether scans of a file are shown when they are due by their times, instead of as
+            fast as possible.
         speed: the speed of a played file, relative to the recorded speed.
         select: the scans to show; None for all.
-        ahead: recorded time of a played file that is read at once, in seconds; None for the fastest
-            size.
+        ahead: duration of the recorded data that one read of a played file reads, in seconds; None
+            for the size that is read fastest.
 
     Attributes:
         speed: the speed of a played file; it may be changed.
         packets: the batch that was read last; None if nothing arrived.
-        scans: the scans, and pieces of scans, of the last `read` or `step`.
-        scan: the newest whole scan; until there is a whole scan, the newest piece; None at first.
-        number: how often `scan` has changed.
+        scans: the complete and incomplete scans of the last `read` or `step`.
+        scan: the newest complete scan. Before the first complete scan, it is the newest incomplete
+            scan or None.
+        number: number of times that `scan` has changed.
         meter: counts packets and scans.
 
     Raises:
@@ -86,7 +87,7 @@ class LiveScans:
         self._is_read_out = False
         self._plays_in_real_time = played and not device.is_live
         self._waiting = deque[Scan]()  # scans of a played file that are not due yet
-        self._due: float | None = None  # when the last scan was due, by `time.monotonic`
+        self._due: float | None = None  # time at which the last scan was due, by `time.monotonic`
         self._last_stamp_ns = 0
         self._read_ahead_s = ahead if self._plays_in_real_time else None
         self._portion = MIN_PORTION_BYTES
@@ -100,7 +101,10 @@ class LiveScans:
 
     @property
     def times_ns(self) -> Times:
-        """The arrival times of the packets that were read last, or else their times, ns."""
+        """Arrival times of the packets that were read last, (n,) ns.
+
+        If arrival times are unknown, these are the times of the sensor's clock.
+        """
         if self.packets is None:
             return np.zeros(0, np.int64)
         if self.packets.host_ns.any():
@@ -108,11 +112,13 @@ class LiveScans:
         return self.packets.time_ns
 
     def read(self, until: float) -> None:
-        """Read at least once, until a time of `time.monotonic` or the end of the input.
+        """Read batches until a time of `time.monotonic`, at least one.
+
+        Also returns at the end of the input.
 
         Raises:
             LidarSpecError: if the source fails.
-            UsageError: if the input has ended and contained no selected scan.
+            UsageError: if the input has ended without a selected scan.
         """
         self.scans = []
         while not self.ended:
@@ -124,11 +130,11 @@ class LiveScans:
                 return
 
     def step(self) -> None:
-        """Show the next scan of a played file at once; do nothing at its end.
+        """Show the next scan of a played file now; do nothing at the end of the file.
 
         Raises:
             LidarSpecError: if the source fails.
-            UsageError: if the input has ended and contained no selected scan.
+            UsageError: if the input has ended without a selected scan.
         """
         self.scans = []
         number = self.number
@@ -140,12 +146,13 @@ class LiveScans:
         self.stop_clock()
 
     def stop_clock(self) -> None:
-        """Stop the clock of a played file, while the picture does not change."""
+        """Pause a played file: the next scan is due one interval after it is continued."""
         self._due = None
 
     def _read(self) -> None:
         """Read the next batch, or handle the end of the input."""
-        # Figures begin with the first selected packet, and the counters before it was read.
+        # The statistics begin with the first selected packet, so the counters of the decoder before
+        # this packet are subtracted.
         if self._has_counted:
             meter = self.meter
         else:
@@ -182,7 +189,7 @@ class LiveScans:
             raise self._sieve.missing()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
-        """Adjust the size of a read to `ahead` seconds of recorded time."""
+        """Adjust the size of a read so that it contains `ahead` seconds of recorded data."""
         portion = self._portion
         duration_s = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9
         if duration_s < ahead / 2 and portion < BATCH_BYTES:
@@ -194,11 +201,11 @@ class LiveScans:
             self.device.read_ahead(portion)
 
     def _make_meter(self) -> RateMeter:
-        """Return a new meter, which counts from now on."""
+        """Return a new meter, with all counts at 0."""
         return RateMeter(self.device.stats, counts_losses=self.device.sensor.counts_losses)
 
     def _select_packets(self, packets: Packets) -> Packets:
-        """Return the packets at the selected times."""
+        """Return the packets with selected times."""
         if not self._select.is_timed:
             return packets
         if self._select.time == "host":
@@ -211,7 +218,7 @@ class LiveScans:
         return packets.take(is_selected)
 
     def _store_scans(self, scans: list[Scan]) -> None:
-        """Show the selected scans, or keep them until they are due."""
+        """Show the selected scans, or store them until they are due."""
         for scan in scans:
             if self._sieve.ended:
                 return
@@ -231,13 +238,13 @@ class LiveScans:
             self.number += 1
 
     def _show_when_due(self, until: float) -> None:
-        """Wait until the next scan of a file is due and show it, or wait until a time."""
+        """Show the next scan of a file when it is due, or return at the time `until`."""
         now = time.monotonic()
         if self._due is None:
             self._due = now
             self._show_next()
             return
-        # If the reader is late, it catches up by at most the longest pause.
+        # After a delay, scans are shown faster to catch up, but at most for `MAX_STEP_S`.
         due = max(self._due + self._find_step() / self.speed, now - MAX_STEP_S)
         if due > until:
             time.sleep(max(until - now, 0.0))
@@ -247,7 +254,7 @@ class LiveScans:
         self._show_next()
 
     def _find_step(self) -> float:
-        """Return the seconds from the last scan to the next scan, by their stamps."""
+        """Return the time from the last shown scan to the next scan, in seconds."""
         step = (self._waiting[0].stamp_ns - self._last_stamp_ns) * 1e-9
         if 0 < step <= MAX_STEP_S:
             return step

@@ -1,6 +1,6 @@
 """Draw figures for reports with matplotlib.
 
-They show a scan to scale, a histogram of intensities, ranges over time, and rates over time.
+The figures show a scan to scale, a histogram of intensities, ranges over time, and rates over time.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ from lidarspec.view.rate_meter import totals
 
 #: supported suffixes of `save`.
 SUFFIXES = (".png", ".pdf", ".svg")
-#: width of a figure and height of a panel.
+#: width of a figure. The next constant is the height of a panel.
 WIDTH_INCHES = 7.0
 PANEL_INCHES = 4.2
-#: limits of the height of the side view.
+#: minimum and maximum height of the side view.
 MIN_SIDE_INCHES = 0.7
 MAX_SIDE_INCHES = 3.0
 DPI = 160
-#: maximum number of bins of intensities, of ranges, and of time.
+#: maximum number of bins of the intensity histogram. The next two constants are the numbers of bins
+#: of the range axis and, at most, of the time axis.
 MAX_INTENSITY_BINS = 128
 RANGE_BINS = 200
 MAX_TIME_BINS = 400
-#: the shortest bin of time.
+#: minimum width of a bin of the time axis.
 MIN_TIME_BIN_S = 0.1
-#: the axis of ranges shows this percentile.
+#: the axis of ranges ends at this percentile of the ranges.
 SHOWN_PERCENTILE = 99.8
 #: number of steps of the colour ramp.
 COLOUR_COUNT = 256
@@ -58,7 +59,7 @@ _Drawing = TypeVar("_Drawing", bound=Callable[..., Any])
 
 
 def _with_style(draw: _Drawing) -> _Drawing:
-    """Decorate a function to draw in the style of these figures."""
+    """Decorate a function so that it draws in the style of these figures."""
 
     @functools.wraps(draw)
     def drawn(*args: Any, **options: Any) -> Any:
@@ -81,9 +82,9 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Draw a scan to scale, from above with forward up.
+    """Return a figure of a scan to scale, from above with forward up.
 
-    If the appearance is not flat, the view from the right side is drawn as well.
+    If `look` is not flat, the figure also has a view from the right side.
     """
     cloud = scan.points[scan.points.valid]
     column: Any
@@ -142,10 +143,10 @@ def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
 
 @_with_style
 def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
-    """Draw the histogram of the intensities.
+    """Return a figure with the histogram of the intensities.
 
     Raises:
-        UsageError: if the sensor has no intensities.
+        UsageError: if the sensor measures no intensity.
     """
     counted = Counter[float]()
     for scan in scans:
@@ -155,7 +156,7 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
             )
             counted.update(dict(zip(values.tolist(), value_counts.tolist(), strict=True)))
     if not counted:
-        raise UsageError("the points have no intensity")
+        raise UsageError("the sensor measures no intensity")
     strengths, counts = np.array(sorted(counted.items())).T
     middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
     figure = _make_figure(f"{title}: {int(counts.sum()):,} returns")
@@ -178,9 +179,9 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
-    """Draw the number of returns by range over time, and the median range.
+    """Return a figure of the number of returns at each range over time.
 
-    If there are many scans, only every n-th scan is shown.
+    The figure also shows the median range. Of many scans, only every n-th scan is shown.
 
     Args:
         scans: at least one scan.
@@ -192,7 +193,7 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
     for number, scan in enumerate(scans, 1):
         if (number - 1) % step == 0:
             kept.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
-        if len(kept) == 2 * MAX_TIME_BINS:  # limits memory for any duration
+        if len(kept) == 2 * MAX_TIME_BINS:  # limits the memory use of long inputs
             kept = kept[::2]
             step = 2 * step
     whole = [entry for entry in kept if entry[2]]
@@ -237,7 +238,9 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def draw_rates(rates: RateSeries, title: str) -> Any:
-    """Draw packets and scans per second, and lost and invalid shares, over time.
+    """Return a figure of the rates over time.
+
+    It shows packets and scans per second, and the shares of lost and invalid frames.
 
     Raises:
         UsageError: if the packets have no times.
@@ -270,19 +273,20 @@ def draw_rates(rates: RateSeries, title: str) -> Any:
 
 
 class RateSeries:
-    """Counts of packets, losses and invalid frames in even steps of time.
+    """Counts packets, lost packets and invalid frames in equal steps of time.
 
     The times are arrival times, or times of the sensor's clock if arrival times are unknown.
 
     Args:
-        live: the scans of an open device, which are read to the end, or until a time.
+        live: the scans of an open device. They are read to the end, or until the time `until`.
         until: a time of `time.monotonic`.
 
     Attributes:
-        width: the length of a step, in seconds.
-        totals: packets, lost packets and invalid frames in each step, (3, n). Losses and invalid
-            frames are counted per batch of packets, and distributed over the batch.
-        scans: for each whole scan: seconds from the first packet, and scans per second.
+        width: the duration of a step, in seconds.
+        totals: numbers of packets, lost packets and invalid frames in each step, (3, n). Losses and
+            invalid frames are known per batch of packets, and distributed evenly over the time of
+            the batch.
+        scans: (seconds since the first packet, scans per second) of each complete scan.
     """
 
     def __init__(self, live: LiveScans, until: float) -> None:
@@ -303,7 +307,7 @@ class RateSeries:
             ]
 
     def _seconds(self, at: int) -> float:
-        """Return a time as seconds from the first packet."""
+        """Return a time in seconds since the first packet."""
         return (at - self._first) * 1e-9
 
     def _take(self) -> None:
@@ -329,10 +333,13 @@ class RateSeries:
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the edges of the steps, (n + 1,) seconds, and their counts, (3, n).
 
-        The last step is omitted, because it is incomplete.
+        Steps are joined so that there are at most `MAX_TIME_BINS`. The last step is omitted,
+        because it is incomplete.
         """
         if self._last < self.width:
-            raise UsageError(f"{self._live.device.source}: packets have no times, or all the same")
+            raise UsageError(
+                f"{self._live.device.source}: the packets have no times, or all have the same time"
+            )
         full = max(int(self._last / self.width), 1)
         joined = -(-full // MAX_TIME_BINS)
         counts = self.totals[:, : max(full // joined, 1) * joined]
@@ -342,7 +349,7 @@ class RateSeries:
 
 
 def colour_map() -> Any:
-    """Return the colour map of matplotlib for a white background."""
+    """Return the colour map for matplotlib on a white background."""
     colours = import_library("matplotlib.colors", "plot")
     return colours.ListedColormap(
         [to_hex(rgb) for rgb in make_ramp("light", COLOUR_COUNT)], "lidarspec"
@@ -350,12 +357,12 @@ def colour_map() -> Any:
 
 
 def _draw_legend(axes: Any) -> None:
-    """Draw the legend above the axes, where it hides no data."""
+    """Draw the legend above the axes, so that it hides no data."""
     axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 0.99), borderpad=0.2)
 
 
 def _percentage(part: NDArray[np.float64], rest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `part` in percent of `part` and `rest`; nan if both are 0."""
+    """Return `part` as a percentage of `part + rest`; nan if both are 0."""
     total = part + rest
     return np.asarray(np.divide(100 * part, total, out=np.full(len(part), np.nan), where=total > 0))
 

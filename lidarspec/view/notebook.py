@@ -1,9 +1,9 @@
 """HTML and SVG for notebooks.
 
 Scans and clouds are shown as pictures, packets and explained frames as tables, sensors as packet
-diagrams. `lidarspec.notebook_display` calls the function for the kind of value. The output is
-escaped and limited in size. It is readable on light and dark pages: pictures have a background, and
-tables use the text colour of the page.
+diagrams. `lidarspec.notebook_display` calls the function for the type of a value. Texts are
+escaped, and the size of the output is limited. The output is readable on light and dark pages:
+pictures have a background, and tables use the text colour of the page.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from lidarspec.view.svg import svg
 PICTURE_PX = 520
 #: maximum number of dots of a view.
 MAX_DOTS = 12_000
-#: number of packets that are shown from the beginning, and from the end.
+#: number of packets to show from the beginning, and number to show from the end.
 END_ROWS = 5
 #: maximum number of fields of packets.
 MAX_FIELDS = 24
 #: maximum number of rows of an explanation.
 MAX_ROWS = 200
-#: difference of hue between two fields.
+#: difference of hue between two consecutive fields.
 HUE_STEP_DEG = 67
-#: higher tables scroll.
+#: maximum height of a table; a higher table has a scroll bar.
 MAX_TABLE_PX = 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
 
 def scan(value: Scan) -> str:
-    """Return a scan as SVG, from above, and if it is not flat also from the side."""
+    """Return a scan as SVG, from above and, if the points are not flat, from the side."""
     return _make_picture(value.points, f"{value.sensor.id}: {value}")
 
 
@@ -60,8 +60,8 @@ def cloud(value: PointCloud) -> str | None:
 def packets(value: Packets) -> str:
     """Return the first and the last packets as an HTML table.
 
-    Its columns are offset, times, and fields in their units; an array is shown as the number and
-    the range of its values.
+    The columns are the offset, the times, and the fields in their units. An array is shown as the
+    number and the range of its values.
     """
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
     shown = dict(list(fields.items())[:MAX_FIELDS])
@@ -79,9 +79,8 @@ def packets(value: Packets) -> str:
         rows.insert(END_ROWS, ["⋮"] * len(columns))
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
     if len(value):
-        first = (
-            f"; first at {np.datetime64(int(value.time_ns[0]), 'ns')} by the {_clock(value)} clock"
-        )
+        moment = np.datetime64(int(value.time_ns[0]), "ns")
+        first = f"; the first at {moment} by the {_clock(value)} clock"
     else:
         first = ""
     return _make_table(
@@ -93,9 +92,9 @@ def packets(value: Packets) -> str:
 
 
 def explanation(value: Explanation) -> str:
-    """Return every byte of a frame as an HTML table, with a colour for each field.
+    """Return every byte of a frame as an HTML table.
 
-    Invalid values are red.
+    Each field has its own colour. Invalid values are red.
     """
     rows = []
     for number, row in enumerate(value.rows[:MAX_ROWS]):
@@ -132,7 +131,10 @@ def explanation(value: Explanation) -> str:
 
 
 def sensor(value: Sensor) -> str:
-    """Return the packet diagrams of a sensor as HTML; only data frames are open."""
+    """Return the packet diagrams of a sensor as HTML.
+
+    Each diagram can be opened and closed; at first, only those of data frames are open.
+    """
     head = (
         f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
         f" <code>{escape(value.id)}</code>, verified by {escape(value.status)}"
@@ -166,7 +168,7 @@ def _make_picture(points: PointCloud, title: str) -> str:
 
 
 def _end_indices(count: int) -> NDArray[np.intp]:
-    """Return the indices of the first and the last of `count` rows."""
+    """Return the indices of the rows to show: the first and the last of `count` rows."""
     return np.array(
         [index for index in range(count) if index < END_ROWS or index >= count - END_ROWS], np.intp
     )
@@ -179,7 +181,7 @@ def _clock(packets: Packets) -> str:
 
 
 def _format_times(times: NDArray[np.int64]) -> list[str]:
-    """Return the times of the first and the last packets, in seconds since the first.
+    """Return the times of the packets to show, as text, in seconds since the first.
 
     An unknown time is "-".
     """
@@ -214,7 +216,7 @@ def _format_number(value: float) -> str:
 def _make_table(
     caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left"
 ) -> str:
-    """Return an HTML table; cells are HTML, but caption and heads are plain text."""
+    """Return an HTML table. Cells are HTML; the caption and the heads are plain text."""
     cell = _CELL.format(align=align)
     head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
     body = "\n".join(

@@ -1,4 +1,4 @@
-"""The interface of the server of `lidarspec view --web`, which is a plugin.
+"""The interface to the plugin that serves the page of `lidarspec view --web`.
 
 The page and its server are a separate distribution, `lidarspec-web`, because only they need a web
 framework.
@@ -22,7 +22,10 @@ DISTRIBUTION = "lidarspec-web"
 
 
 class PageServer(AbstractContextManager["PageServer"], Protocol):
-    """Serves the page of a source; a context manager that closes the source at its end."""
+    """Serves the page of a source; a context manager.
+
+    The end of the context closes the source.
+    """
 
     @property
     def link(self) -> str:
@@ -34,11 +37,11 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
 
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
-        """The recordings that pages have made: path, and number of recorded bytes."""
+        """(path, size in bytes) of each recording that was made from a page."""
 
     @property
     def trouble(self) -> str:
-        """The reason why the last recording could not be written; "" if it could."""
+        """The reason why the last recording could not be written; "" if it was written."""
 
     def opening_page(self) -> str:
         """Write a file that redirects to `link`, and return its URL for a browser.
@@ -50,7 +53,10 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
         """
 
     def run(self, duration_s: float | None) -> None:
-        """Read the source for some seconds; if None, until an interrupt.
+        """Read the source and serve the page.
+
+        Args:
+            duration_s: seconds after which this returns; None to run until an interrupt.
 
         Raises:
             LidarSpecError: if the source fails.
@@ -67,7 +73,9 @@ def open_page_server(
     control: bool,
     report: Callable[[str], None],
 ) -> PageServer:
-    """Open a source, and return the server of its page from the hook `lidarspec_page`.
+    """Open a source, and return the server of its page.
+
+    The hook `lidarspec_page` of a plugin makes the server.
 
     Args:
         source: the SOURCE.
@@ -76,7 +84,7 @@ def open_page_server(
         host: the address to listen on.
         port: the port to listen on; 0 for any free port.
         control: whether pages may send commands.
-        report: called with messages for the user.
+        report: called with each message for the user.
 
     Raises:
         UsageError: if no plugin serves the page.

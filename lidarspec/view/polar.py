@@ -1,6 +1,6 @@
 """Draw clouds in character cells, from above with range rings.
 
-Forward is up; the view is not mirrored. 3D clouds are also drawn from the right side.
+Forward is up, and left is left. 3D clouds are also drawn from the right side.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from lidarspec.points.appearance import REACH_PERCENTILE, CloudAppearance, ramp_
 from lidarspec.points.cloud import PointCloud
 from lidarspec.view.canvas import DOTS_ACROSS, DOTS_DOWN, FAINT, LABEL, STRONG, Canvas, CellGrid
 
-#: distance between two dots of a ring, in dots.
+#: distance between two drawn dots of a ring, in units of dots.
 RING_GAP_DOTS = 4
 #: share of the height of the window for the view from above, if there are two views.
 TOP_VIEW_SHARE = 0.62
-#: possible exaggerations of heights in the side view.
+#: factors by which heights can be enlarged in the side view.
 HEIGHT_FACTORS = (1, 2, 5, 10)
-#: maximum share of the side view that the heights fill.
+#: maximum share of the height of the side view that the points fill.
 MAX_FILLED_SHARE = 0.9
 
 
 def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
     """Draw a cloud from above, in `width` by `height` cells.
 
-    If the appearance is not flat, the view from the right side is below.
+    If `look` is not flat, the view from the right side is drawn below.
     """
     cloud = points[points.valid]
     if look.flat:
@@ -46,7 +46,7 @@ def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppear
 
 
 def _find_scale(width: int, height: int, reach: float) -> float:
-    """Return the scale, in dots per metre, with which `reach` fits into half a canvas."""
+    """Return the scale in dots per metre that fits `reach` metres into half a canvas."""
     return (min(width * DOTS_ACROSS, height * DOTS_DOWN) - 1) / 2 / reach
 
 
@@ -85,7 +85,7 @@ def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
 
 
 def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
-    """Write the range of a ring at the first crossing with an axis that has room."""
+    """Write the range of a ring at an axis, at the first crossing with space for it."""
     text = f"{radius:g} m"
     across = round(radius * scale / DOTS_ACROSS)
     down = round(radius * scale / DOTS_DOWN)
@@ -104,9 +104,9 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
 def _draw_from_side(
     cloud: PointCloud, width: int, height: int, look: CloudAppearance, scale: float
 ) -> tuple[CellGrid, int]:
-    """Return the view from the right side, and the exaggeration of heights.
+    """Return the view from the right side, and the factor that enlarges heights.
 
-    Forward is right. The view is vertically centred on the points.
+    Forward is right. The points are in the vertical middle of the view.
     """
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
@@ -143,9 +143,9 @@ def _draw_from_side(
 
 
 def _find_heights(z: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest and highest height in the side view.
+    """Return the lowest and the highest z of the side view, in metres.
 
-    It shows the sensor and most of the points.
+    The view contains the sensor and most of the points.
     """
     if not len(z):
         return 0.0, 0.0
@@ -156,7 +156,7 @@ def _find_heights(z: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _find_middle(canvas: Canvas) -> tuple[float, float]:
-    """Return column and row of the middle of the middle cell of a canvas, in dots."""
+    """Return the column and row of the centre of the middle cell, in dots."""
     return (
         canvas.width // 2 * DOTS_ACROSS + DOTS_ACROSS / 2,
         canvas.height // 2 * DOTS_DOWN + DOTS_DOWN / 2,

@@ -18,28 +18,28 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 
-#: maximum number of scans for means and medians.
+#: maximum number of scans that means and medians are calculated from.
 MAX_KEPT_SCANS = 1 << 12
 Seconds = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class MeterReading:
-    """Figures over some time; None for an unknown figure.
+    """Statistics of a period of time; None for an unknown value.
 
     Attributes:
         seconds: the duration.
-        speed_hz: scans per second, by the times of the scans.
-        scans: number of whole scans.
+        speed_hz: scans per second, from the times of the scans.
+        scans: number of complete scans.
         packets: number of packets.
         packet_rate_hz: packets per second.
-        points: points per scan.
-        valid: points with a return, per scan.
+        points: mean number of points per scan.
+        valid: mean number of points with a return per scan.
         error_rate: the share of frames with a wrong checksum, length or value, from 0 to 1.
         skipped_rate: the share of bytes that are not in frames and are not fillers, from 0 to 1.
         loss_rate: the share of lost packets, from 0 to 1; None if losses are not counted.
         jitter_s: standard deviation of the time between the arrivals of packets.
-        longest_gap_s: the longest time between two arrivals.
+        longest_gap_s: maximum time between the arrivals of two packets.
         bytes_per_s: bytes of input per second.
     """
 
@@ -58,7 +58,7 @@ class MeterReading:
     bytes_per_s: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures by name."""
+        """Return the statistics by name."""
         return asdict(self)
 
 
@@ -91,7 +91,9 @@ class RateTally:
         self.scans = 0
         self.packets = 0
         self._rates = deque[float](maxlen=MAX_KEPT_SCANS)
-        self._sizes = deque[tuple[int, int]](maxlen=MAX_KEPT_SCANS)  # points, and valid ones
+        self._sizes = deque[tuple[int, int]](
+            maxlen=MAX_KEPT_SCANS
+        )  # (points, valid points) of each scan
         self._gap_count = 0
         self._gap_sum = 0.0
         self._gap_square_sum = 0.0
@@ -103,8 +105,9 @@ class RateTally:
 
         Args:
             count: number of packets.
-            gaps: seconds from each packet to the next, (n,).
-            by_host: whether the gaps are between arrival times, not times of the sensor's clock.
+            gaps: time from each packet to the next, (n,) seconds.
+            by_host: whether the gaps are from arrival times, instead of times of the sensor's
+                clock.
         """
         self.packets += count
         self._is_by_host = by_host
@@ -115,7 +118,7 @@ class RateTally:
             self._longest_gap = max(self._longest_gap, float(gaps.max()))
 
     def add_scan(self, points: int, valid: int, rate_hz: float) -> None:
-        """Count a whole scan."""
+        """Count a complete scan."""
         self.scans += 1
         self._sizes.append((points, valid))
         if np.isfinite(rate_hz):
@@ -124,11 +127,11 @@ class RateTally:
     def reading(
         self, counters: Counters, *, seconds: float | None, counts_losses: bool
     ) -> MeterReading:
-        """Return the figures up to now.
+        """Return the statistics since the tally was made.
 
         Args:
             counters: the current counters of the decoder.
-            seconds: the duration by the caller's clock; None for the sum of the gaps.
+            seconds: the duration; None to use the sum of the gaps.
             counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
         """
         duration = seconds or self._gap_sum or None
@@ -157,7 +160,7 @@ class RateTally:
         return self._gap_sum > 0 and self._is_by_host
 
     def _packet_rate(self, duration: float | None) -> float | None:
-        """Return packets per second, by the times of packets if they are known."""
+        """Return packets per second, from the times of the packets if they are known."""
         if self._gap_sum:
             return self._gap_count / self._gap_sum
         if duration:
@@ -201,7 +204,7 @@ class RateMeter:
         self._add(count, arrivals, by_host=True)
 
     def _add(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
-        """Count packets, and the gaps between their times, which are ascending, (n,) ns."""
+        """Count packets and the gaps between their times. `times` is ascending, (n,) ns."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
         if len(times):
@@ -210,7 +213,7 @@ class RateMeter:
             tally.add_packets(count, gaps, by_host=by_host)
 
     def scan(self, scan: Scan) -> None:
-        """Count a scan; ignore pieces, because they do not show speed and points."""
+        """Count a scan. Incomplete scans are ignored, because they have fewer points."""
         if not scan.whole:
             return
         valid = int(scan.points.valid.sum())
@@ -218,18 +221,18 @@ class RateMeter:
             tally.add_scan(len(scan), valid, scan.rate_hz)
 
     def reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
-        """Return the figures since the last reading, and start a new reading."""
+        """Return the statistics since the last call, and start a new period."""
         reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
         self._recent = RateTally(counters)
         return reading
 
     def summary(self, counters: Counters, seconds: float | None = None) -> MeterReading:
-        """Return the figures from the beginning."""
+        """Return the statistics since the meter was made."""
         return self._all.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
 
 
 def totals(counters: Counters) -> dict[str, int]:
-    """Return the counts from which the rates of a reading are calculated."""
+    """Return the counts that the rates of a reading are calculated from."""
     rejected = (
         counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible
     )
@@ -243,12 +246,12 @@ def totals(counters: Counters) -> dict[str, int]:
 
 
 def format_figure(value: float | None, form: str, factor: float = 1) -> str:
-    """Return a figure as text; "-" if it is unknown.
+    """Return a number as text; "-" if it is unknown.
 
     Args:
-        value: the figure; None if unknown.
+        value: the number; None if unknown.
         form: the format, for `str.format`.
-        factor: the factor by which the figure is multiplied.
+        factor: the number is multiplied by this factor.
     """
     if value is None or not math.isfinite(value):
         return "-"

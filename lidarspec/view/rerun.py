@@ -12,7 +12,7 @@ from lidarspec.view.live_scans import LOOK_S, LiveScans
 
 #: time between two readings of the statistics, by the stamps of the scans.
 STATISTICS_PERIOD_S = 1.0
-#: the statistics that are logged, except the statistics of a scan, which are logged with the scan.
+#: attributes of `MeterReading` to log. Statistics of a scan are logged with the scan.
 STATISTICS = (
     "packet_rate_hz",
     "error_rate",
@@ -21,18 +21,18 @@ STATISTICS = (
     "jitter_s",
     "bytes_per_s",
 )
-#: schemes of the URL of a viewer.
+#: URL schemes of a running viewer.
 SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
 def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> None:
-    """Log scans and statistics as they arrive.
+    """Log scans and statistics when they arrive.
 
     Args:
         live: the scans of the open device.
         target: a file to write, the URL of a running viewer, or "" to open a viewer.
-        ramp: the column that colours show.
-        until: a time of `time.monotonic` at which this ends, if the input does not end before.
+        ramp: the column that the colours show.
+        until: a time of `time.monotonic` at which to return, unless the input ends before.
 
     Raises:
         UsageError: if no viewer can be opened, or the Rerun SDK is not installed.

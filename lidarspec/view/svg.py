@@ -1,6 +1,6 @@
 """Draw a cloud as SVG, with the same views as in the terminal.
 
-The picture has the colours of the reader's colour scheme, light or dark.
+The picture is light or dark, as the colour scheme of the browser.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidarspec.points.colours import make_ramp, to_hex
 
 #: side of the view from above.
 SIDE_PX = 720
-#: margins of the picture.
+#: margin around the picture. The next constant is the height of its header.
 MARGIN_PX = 24
 HEADER_PX = 58
 #: height of the title of a view.
@@ -39,7 +39,8 @@ VIEW_MARGIN_PX = 24
 #: height of a text above its base line.
 FONT_HEIGHT_PX = 11
 CHARACTER_WIDTH_PX = 6.7
-#: possible distances between dots; the first distance that gives few enough dots is used.
+#: possible distances between dots. The first distance is used with which there are at most as many
+#: dots as allowed.
 GRIDS_PX = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 #: colours of `_PARTS` on light and on dark pages.
 _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
@@ -56,15 +57,15 @@ def svg(
 ) -> str:
     """Return a cloud as an SVG document, from above and from its right side.
 
-    If the appearance is flat, there is only the view from above.
+    If `look` is flat, the document has only the view from above.
 
     Args:
         points: the cloud.
         look: the appearance.
         title: the title of the picture.
         side: side of the view from above, in pixels.
-        most: maximum number of dots of a view, of which each may represent several returns; None
-            for no limit.
+        most: maximum number of dots of a view; None for no limit. A dot may represent several
+            returns.
     """
     cloud = points[points.valid]
     views = _ViewDrawer(cloud, look, side, most, ramp_indices(cloud, look))
@@ -143,7 +144,7 @@ class _ViewDrawer:
         return self.side / 2 / self.look.reach
 
     def draw_from_above(self) -> _View:
-        """Draw rings with their ranges, axes, points, and the sensor; forward is up."""
+        """Draw range rings, axes, points and the sensor, from above with forward up."""
         scale = self._scale
         side = self.side
         forward, left = self.look.middle
@@ -191,7 +192,7 @@ class _ViewDrawer:
         return _View("from above, forward is up", parts, top, bottom - top, dots)
 
     def draw_from_side(self) -> _View:
-        """Draw labelled lines of equal height, points, and the sensor; forward is right."""
+        """Draw height lines, points and the sensor, from the side with forward right."""
         scale = self._scale
         side = self.side
         lowest, highest = find_bounds(self.cloud)
@@ -230,29 +231,30 @@ class _ViewDrawer:
     def _draw_dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
     ) -> tuple[int, list[str]]:
-        """Return the number of dots, and the SVG paths, one for each colour.
+        """Return the number of dots, and an SVG path of the dots of each colour.
 
-        The finest grid with few enough dots is used.
+        The finest grid of `GRIDS_PX` is used that gives at most `most` dots.
 
         Args:
-            across, down: coordinates of the points, (n,) pixels.
+            across: horizontal coordinates of the points, (n,) pixels.
+            down: vertical coordinates of the points, (n,) pixels.
             height: height of the view, in pixels.
         """
         inside = np.flatnonzero(
             (across >= 0) & (across <= self.side) & (down >= 0) & (down <= height)
         )
         for grid in GRIDS_PX:
-            places = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(
+            cells = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(
                 np.int64
             )
-            _, first = np.unique(places @ (1 << 20, 1), return_index=True)
+            _, first = np.unique(cells @ (1 << 20, 1), return_index=True)
             if self.most is None or len(first) <= self.most:
                 break
-        places = places[first]
+        cells = cells[first]
         colours = self.colours[inside[first]]
         width = max(DOT_PX, grid * 1.3) / grid
         paths = [
-            f'<path class="dots{step}" d="{_make_path(places[colours == step])}"'
+            f'<path class="dots{step}" d="{_make_path(cells[colours == step])}"'
             f' stroke="{_COLOURS[step]}"/>'
             for step in np.unique(colours).tolist()
         ]
@@ -264,9 +266,9 @@ class _ViewDrawer:
 
 
 class _Labels:
-    """Places texts in a view, so that they neither leave it nor overlap.
+    """Places texts in a view so that they do not overlap or leave the view.
 
-    If there is no room for a text, it is omitted.
+    A text that does not fit is omitted.
 
     Args:
         side: width of the view, in pixels.
@@ -283,13 +285,14 @@ class _Labels:
         self._taken: list[tuple[float, float, float, float]] = []
         self.parts: list[str] = []
 
-    def write(self, text: str, places: Iterable[tuple[float, float]]) -> None:
-        """Write a text at the first position with room.
+    def write(self, text: str, positions: Iterable[tuple[float, float]]) -> None:
+        """Write a text at the first position at which it fits.
 
         Args:
-            places: possible positions of the left end of the base line, in pixels.
+            text: the text.
+            positions: possible positions of the left end of the base line, in pixels.
         """
-        for left, base in places:
+        for left, base in positions:
             right = left + _text_width(text)
             top = base - FONT_HEIGHT_PX
             if left < 0 or right > self._side or top < self._top or base > self._bottom:
@@ -310,7 +313,7 @@ def _text_width(text: str) -> float:
 
 
 def _make_path(dots: NDArray[np.int64]) -> str:
-    """Return an SVG path of dots, as relative moves.
+    """Return an SVG path that draws dots.
 
     Args:
         dots: row and column of each dot, (n, 2).
@@ -320,7 +323,11 @@ def _make_path(dots: NDArray[np.int64]) -> str:
 
 
 def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
-    """Yield the elements of the ramp with its column and values; it ends at `right`."""
+    """Yield the elements of the legend: colours, name of the column, and end values.
+
+    Args:
+        right: the right edge of the legend, in pixels.
+    """
     low, high = (escape(text) for text in look.ends)
     left = right - 7 * len(high) - 12 - RAMP_STEPS * 6
     yield (
@@ -338,7 +345,7 @@ def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
 def _style_of(part: str, attribute: str = "fill") -> str:
     """Return the SVG attributes for the colour of a part of the picture.
 
-    The colour is for light pages; the class selects the colour for dark pages.
+    The attribute has the colour for light pages. The CSS class sets the colour for dark pages.
 
     Args:
         part: one of `_PARTS`.
@@ -348,7 +355,7 @@ def _style_of(part: str, attribute: str = "fill") -> str:
 
 
 def _make_style() -> str:
-    """Return the CSS for dark pages."""
+    """Return the CSS that sets the colours on dark pages."""
     inks = [to_hex(rgb) for rgb in make_ramp("dark", RAMP_STEPS)]
     dots = [
         f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)

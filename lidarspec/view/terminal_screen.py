@@ -1,8 +1,8 @@
-"""Take over a terminal: the alternate screen, and single keys.
+"""Show pictures on the alternate screen of a terminal, and read single keys.
 
-Only changed cells are written. rich would write all cells of each picture, about 50 times as many,
-so it is used only for output that is printed once. Single keys are read with termios on POSIX and
-with msvcrt on Windows.
+Only changed cells are written. rich writes all cells of each picture, about 50 times as many, so it
+is used only for output that is printed once. Single keys are read with termios on POSIX and with
+msvcrt on Windows.
 """
 
 from __future__ import annotations
@@ -33,32 +33,33 @@ _POSIX = {
     "OC": "right",
     "OD": "left",
 }
-#: a cursor key, the sequence of an unknown key, or a character.
+#: matches a cursor key, the sequence of an unknown key, or a character.
 _KEY = re.compile(r"\x1b([\[O][A-D])|\x1b[\[O][^A-Za-z~]*.?|(.)", re.DOTALL)
 #: code of a cursor key after a prefix byte, on Windows -> its name.
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
-#: time between two checks of the keyboard on Windows, where a program cannot wait for a key.
+#: time between two checks of the keyboard on Windows, which has no function to wait for a key with
+#: a timeout.
 _POLL_S = 0.02
-#: escape sequences that take over the terminal (alternate screen, no cursor, no wrapping), and that
-#: restore it.
+#: escape sequences that switch to the alternate screen, without cursor and line wrapping, and
+#: escape sequences that restore the terminal.
 ENTER = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J"
 LEAVE = "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
-#: escape sequences around a picture, so that terminals show it only when it is complete.
+#: escape sequences before and after a picture. Between them, terminals do not update the screen.
 BEGIN = "\x1b[?2026h"
 END = "\x1b[?2026l"
-#: maximum number of unchanged cells between two changed cells that are written as well, because
-#: moving the cursor needs the same number of bytes.
+#: maximum number of unchanged cells between two changed cells that are written as well. Moving the
+#: cursor would need as many bytes.
 MAX_BRIDGED_CELLS = 4
 
 
 class KeyReader:
-    """A keyboard; a context manager that restores the terminal.
+    """Reads keys; a context manager that restores the terminal.
 
-    This base class never returns keys, but waits like a keyboard.
+    This base class is used without a keyboard: `read` waits for the timeout and returns no keys.
     """
 
     def read(self, timeout: float) -> list[str]:
-        """Return the keys pressed within some seconds.
+        """Wait for a key for at most `timeout` seconds, and return the pressed keys.
 
         Returns:
             Characters, "up", "down", "left", "right" and "escape"; empty if no key was pressed.
@@ -79,7 +80,7 @@ class KeyReader:
 
 
 def decode_keys(text: str) -> list[str]:
-    """Return the keys in the input from a POSIX terminal, without unknown sequences."""
+    """Return the keys in the input from a POSIX terminal; unknown keys are omitted."""
     keys = _KEY.finditer(text)
     return [
         _POSIX[key[1]] if key[1] else "escape" if key[2] == "\x1b" else key[2]
@@ -118,7 +119,10 @@ else:
     import tty
 
     class Keyboard(KeyReader):
-        """Reads single keys of a terminal without echo; Ctrl-C and Ctrl-Z send signals."""
+        """Reads single keys of a terminal; Ctrl-C and Ctrl-Z still send signals.
+
+        The terminal does not print the keys.
+        """
 
         def __init__(self, descriptor: int) -> None:
             self._descriptor = descriptor
@@ -161,7 +165,7 @@ else:
 
 
 class TerminatedError(BaseException):
-    """Raised when a signal ends the process, so that resources are closed.
+    """A signal ends the process; raised so that resources are closed.
 
     Attributes:
         code: the exit code for shells: 128 plus the number of the signal.
@@ -173,7 +177,10 @@ class TerminatedError(BaseException):
 
 
 def find_colour_depth(stream: TextIO) -> Depth:
-    """Return the colour depth of a terminal, from NO_COLOR, COLORTERM and TERM."""
+    """Return the colour depth of a terminal, from the environment variables.
+
+    These are NO_COLOR, COLORTERM and TERM.
+    """
     console = Console(file=stream)
     system = console.color_system
     if system is None or console.no_color:
@@ -195,9 +202,9 @@ def supports_braille(stream: TextIO) -> bool:
 
 
 class Screen:
-    """The screen of a terminal; a context manager that always restores it.
+    """The screen of a terminal; a context manager that restores the terminal.
 
-    It is also restored if the process is ended by SIGTERM or SIGHUP, or suspended by SIGTSTP.
+    The terminal is also restored if SIGTERM or SIGHUP ends the process, or SIGTSTP suspends it.
     """
 
     def __init__(self, stream: TextIO, keys: KeyReader) -> None:
@@ -206,13 +213,13 @@ class Screen:
         self._depth = find_colour_depth(stream)
         self._plain = not supports_braille(stream)
         self._shown: CellGrid | None = None
-        # How often the terminal was taken over again, which clears it. A signal may do this during
-        # `show`.
+        # Number of times that the alternate screen was entered again, which clears it. A signal
+        # handler may do this during `show`.
         self._taken = 0
         self._handlers: dict[int, Any] = {}
 
     def size(self) -> tuple[int, int]:
-        """Return the columns and lines of the window."""
+        """Return the numbers of columns and lines of the terminal."""
         window = os.get_terminal_size(self._stream.fileno())
         return max(window.columns, 1), max(window.lines, 1)
 
@@ -250,7 +257,7 @@ class Screen:
         try:
             self._write(LEAVE)
         except OSError:
-            pass  # the terminal is closed and needs no cleaning
+            pass  # the terminal is closed, so it need not be restored
         finally:
             self.keys.__exit__(kind, error, traceback)
             for number, handler in self._handlers.items():
@@ -262,14 +269,14 @@ class Screen:
             self._stream.write(text)
             self._stream.flush()
             return
-        # This bypasses the buffer of the stream, which a signal handler must not use during a
-        # write.
+        # Write without the buffer of the stream, because a signal handler may run during a write
+        # and must not use the buffer then.
         data = text.encode(self._stream.encoding or "utf-8", "replace")
         while data:
             data = data[os.write(self._stream.fileno(), data) :]
 
     def _suspend(self, number: int, frame: FrameType | None) -> None:
-        """Restore the terminal, suspend the process, and take over the terminal again."""
+        """Restore the terminal and suspend the process; enter the screen again afterwards."""
         self._write(LEAVE)
         self.keys.__exit__(None, None, None)
         signal.signal(number, signal.SIG_DFL)
@@ -282,7 +289,7 @@ class Screen:
 
 
 def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> str:
-    """Return the text that changes a terminal from one picture to another.
+    """Return the text that replaces the shown picture by another.
 
     Args:
         before: the shown picture; None for an empty screen.
@@ -322,5 +329,5 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def is_interactive() -> bool:
-    """Return whether standard output is a terminal with a screen."""
+    """Return whether standard output is a terminal that can move its cursor."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"

@@ -1,8 +1,8 @@
 """The terminal window of a running sensor, drawn at most twelve times a second.
 
-`Window.run` alternately waits for keys and data. Keys change the `ViewSettings`. `Window.cells`
-draws the window from these settings, the newest scan and the figures, and `Screen` writes the
-changed cells.
+`Window.run` alternately reads keys and data. Keys change the `ViewSettings`. `Window.cells` draws
+the window from these settings, the newest scan and the statistics. `Screen` writes the changed
+cells.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ from lidarspec.view.terminal_window_parts import (
 
 #: minimum time between two pictures.
 FRAME_PERIOD_S = 0.08
-#: time between two readings of the figures.
+#: time between two readings of the statistics.
 FIGURES_PERIOD_S = 1.0
-#: zoom factor of one key press, and its limits.
+#: zoom factor of one key press. The next constants are the limits of the zoom.
 ZOOM_FACTOR = 1.25
 MAX_ZOOM = 1e3
 MIN_ZOOM = 1e-2
-#: movement of one key press, as a share of the reach of the picture.
+#: movement of one key press, as a share of the distance from the middle of the picture to its edge.
 MOVE_SHARE = 0.2
-#: key -> movement: forward, left.
+#: key -> (movement forward, movement to the left).
 MOVES = {"up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1)}
-#: if the points need less than this share of the reach of the picture, the reach is reduced.
+#: if the points need less than this share of the picture, the scale is enlarged.
 MIN_USED_SHARE = 0.7
-#: width of the figures beside the picture, in columns.
+#: width of the column with statistics at the right of the picture, in characters.
 SIDE_COLUMNS = 25
-#: if the picture would be narrower, or the window has fewer lines, the figures are in the last
-#: line.
+#: minimum width of the picture if the statistics are at its right. If the picture would be
+#: narrower, or the window has fewer than `MIN_SIDE_LINES`, the statistics are in the last line.
 MIN_PICTURE_COLUMNS = 36
 MIN_SIDE_LINES = 14
-#: error or loss rate above which a figure is an alarm.
+#: an error or loss rate from this value on is shown as an alarm.
 ALARM_RATE = 0.01
 DEFAULT_RAMPS = ("range", "intensity")
 
@@ -59,12 +59,12 @@ class ViewSettings:
     """The settings that keys change.
 
     Attributes:
-        ramp: the column that colours show.
+        ramp: the column that the colours show.
         zoom: magnification; 1.0 shows all points.
         middle: the middle of the picture, in metres forward and left of the sensor.
         paused: whether the picture is paused.
         helped: whether the list of keys is shown.
-        done: whether the window has to close.
+        done: whether the window is to be closed.
     """
 
     ramp: str = "range"
@@ -82,7 +82,7 @@ class ViewSettings:
         Args:
             key: the name of the key.
             reach: distance from the middle of the picture to its edge, in metres.
-            ramps: the columns that colours can show.
+            ramps: the columns that the colours can show.
         """
         if key in ("q", "Q"):
             return replace(self, done=True)
@@ -114,14 +114,14 @@ class ViewSettings:
 
 
 class Window:
-    """Shows the scans of a device with figures.
+    """Shows the scans of a device, with statistics.
 
     Args:
         live: the scans of the open device.
         source: the SOURCE as typed by the user.
-        ramp: the column that colours show at first.
+        ramp: the column that the colours show at first.
         record: switches the recording of a live source on and off; None for other sources.
-        duration: seconds after which the window closes; None to close it only by a key.
+        duration: seconds after which the window closes; None if only a key closes it.
     """
 
     def __init__(
@@ -171,7 +171,7 @@ class Window:
                 drawn_size = size
 
     def _wait(self, screen: Screen) -> list[str]:
-        """Read data until the next picture is due, and return the keys that were pressed."""
+        """Read data until the next picture is due, and return the pressed keys."""
         if self._live.ended or (self.settings.paused and not self._device.is_live):
             self._live.stop_clock()
             return screen.keys.read(FRAME_PERIOD_S)
@@ -179,7 +179,10 @@ class Window:
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> CellGrid:
-        """Draw the window; the figures are in the last line if the window is small."""
+        """Draw the window, with the statistics at the right of the picture.
+
+        If the window is small, the statistics are in its last line.
+        """
         self._update_reading()
         self._update_scan()
         is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES
@@ -198,7 +201,7 @@ class Window:
         return window
 
     def _draw_picture(self, width: int, height: int, current_look: CloudAppearance) -> CellGrid:
-        """Draw the scan, with a warning in the middle if there is one."""
+        """Draw the scan, with the current warning in the middle."""
         if self._scan is None:
             drawn = CellGrid.blank(width, height)
         else:
@@ -209,13 +212,13 @@ class Window:
         return drawn
 
     def _press(self, key: str) -> None:
-        known = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
-        self.settings = self.settings.after_key(key, self._current_look().reach, known)
+        ramps = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
+        self.settings = self.settings.after_key(key, self._current_look().reach, ramps)
         if key in ("r", "R") and self._record is not None:
             self._record.toggle()
 
     def _update_reading(self) -> None:
-        """Read the figures if a second has passed since the last reading."""
+        """Read the statistics if a second has passed since the last reading."""
         now = time.monotonic()
         duration = now - self._read_at
         if duration < FIGURES_PERIOD_S:
@@ -225,7 +228,7 @@ class Window:
         self._read_at = now
 
     def _update_scan(self) -> None:
-        """Use the newest scan, on the scale of the previous scan if that fits."""
+        """Use the newest scan; keep the scale of the previous scan if the points fit."""
         newest = self._live.scan
         if newest is None or newest is self._scan:
             return
@@ -241,7 +244,7 @@ class Window:
         self._look = new
 
     def _current_look(self) -> CloudAppearance:
-        """Return the appearance of the picture, with the changes by keys."""
+        """Return the appearance of the picture, with the settings of the keys."""
         if self._look is None:
             return CloudAppearance("range", 1.0, 1.0)
         if self._scan is not None and self._look.ramp != self.settings.ramp:
@@ -252,7 +255,7 @@ class Window:
         return replace(self._look, reach=reach, middle=self.settings.middle)
 
     def _describe_state(self) -> tuple[str, int]:
-        """Return the state in one or two words, and its ink."""
+        """Return the state of the source in one or two words, and the ink to show it in."""
         if self._record is None:
             recording = None
         else:
@@ -271,7 +274,7 @@ class Window:
         return ("▶ playing", GOOD)
 
     def _list_figures(self) -> list[WindowFigure]:
-        """Return the figures of the last second and of the shown scan."""
+        """Return the statistics of the last second and of the shown scan."""
         reading = self._reading or NOTHING
         figures = [
             WindowFigure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
@@ -288,7 +291,7 @@ class Window:
         return figures
 
     def _list_scan_figures(self) -> list[WindowFigure]:
-        """Return the figures of the shown scan."""
+        """Return the statistics of the shown scan."""
         if self._scan is None:
             return [
                 WindowFigure("points", "0"),
@@ -318,7 +321,7 @@ class Window:
         return WindowFigure("lost", "-" if reading.loss_rate is None else "0")
 
     def _find_warning(self) -> str:
-        """Return the message for the middle of the picture; "" if there is no problem."""
+        """Return the warning for the middle of the picture; "" for no warning."""
         device = self._device
         if self._record is not None and self._record.trouble:
             return self._record.trouble
@@ -350,5 +353,10 @@ def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:
 
 
 def _fits(needed: float, kept: float) -> bool:
-    """Return whether the previous scale fits, so that the picture remains steady."""
+    """Return whether the scale of the previous scan can be kept.
+
+    Args:
+        needed: the distance to show for the new scan, in metres.
+        kept: the distance that the previous scale shows, in metres.
+    """
     return MIN_USED_SHARE * kept <= needed <= kept

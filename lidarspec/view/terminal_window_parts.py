@@ -1,4 +1,7 @@
-"""The parts of the terminal window around the picture: title, figures, colours, keys, messages."""
+"""The parts of the terminal window around the picture.
+
+These are the title, the statistics, the colours, the keys and messages.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import NamedTuple
 from lidarspec.points.appearance import RAMP_STEPS, CloudAppearance
 from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, CellGrid
 
+#: (key, its effect) for the list of keys.
 KEYS = (
     ("space", "pause and continue"),
     ("c", "switch colours"),
@@ -21,14 +25,14 @@ KEYS = (
 )
 HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 HINT_COLUMNS = 13
-#: width of the margins and of the keys in the list of keys.
+#: width of the margin and of the column with the keys, in the list of keys.
 KEY_COLUMNS = 14
-#: minimum room for the name of the source in the title.
+#: minimum width of the source in the title; in less space, it is omitted.
 MIN_SOURCE_COLUMNS = 8
 
 
 class WindowFigure(NamedTuple):
-    """A figure of the window: its name, its value as text, and the ink of the value."""
+    """One of the statistics in the window: its name, its value, and the value's ink."""
 
     name: str
     value: str
@@ -36,7 +40,7 @@ class WindowFigure(NamedTuple):
 
 
 def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int) -> None:
-    """Write sensor, source and state into the first line."""
+    """Write the sensor, the source and the state into the first line."""
     columns = window.size[0]
     room = columns - len(sensor) - len(state) - 6
     window.write(0, 1, sensor, STRONG)
@@ -45,11 +49,13 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 
 
 def shorten_source(source: str, room: int) -> str:
-    """Return the source, or its end if it is too long, or "" if there is no room.
+    """Return the source, or only its end if it is too long.
+
+    Returns "" if there is space for fewer than `MIN_SOURCE_COLUMNS`.
 
     Args:
         source: the source.
-        room: number of columns.
+        room: number of characters that are available.
     """
     if len(source) <= room:
         return source
@@ -61,12 +67,14 @@ def shorten_source(source: str, room: int) -> str:
 def write_side(
     window: CellGrid, left: int, figures: Sequence[WindowFigure], look: CloudAppearance
 ) -> None:
-    """Write figures, colours and keys beside the picture, if there is room for them.
+    """Write statistics, colours and keys at the right of the picture.
+
+    Lines that do not fit are omitted.
 
     Args:
         window: the window with the picture.
         left: the first column to the right of the picture.
-        figures: the figures, one for each line.
+        figures: the statistics, one per line.
         look: the appearance of the picture.
     """
     columns, lines = window.size
@@ -85,7 +93,7 @@ def write_side(
 
 
 def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
-    """Write the known figures into the last line, if there is room for them."""
+    """Write the known statistics into the last line; omit those that do not fit."""
     columns, lines = window.size
     row = lines - 1
     column = 1
@@ -101,7 +109,7 @@ def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
 
 
 def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) -> None:
-    """Write the colour ramp, with the values at its ends below."""
+    """Write the colour ramp, and below it the column and the values at both ends."""
     for step in range(RAMP_STEPS):
         window.write(row, column + step, "━", FIRST_STEP + step)
     low, high = look.ends
@@ -111,7 +119,7 @@ def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) 
 
 
 def draw_keys(columns: int, lines: int) -> CellGrid:
-    """Draw the list of keys for a window of this size."""
+    """Draw the list of keys, for a window with `columns` and `lines`."""
     width = min(max(len(text) for _, text in KEYS) + KEY_COLUMNS, columns)
     page = CellGrid.blank(width, min(len(KEYS) + 4, lines))
     page.write(0, 0, "─" * width, FAINT)
@@ -124,7 +132,7 @@ def draw_keys(columns: int, lines: int) -> CellGrid:
 
 
 def draw_message(columns: int, text: str) -> CellGrid:
-    """Draw a message for the middle of a picture with this width."""
+    """Draw a box with a message, for a picture with a width of `columns`."""
     lines = textwrap.wrap(text, max(columns - 4, 1))
     width = min(max(map(len, lines)) + 4, columns)
     box = CellGrid.blank(width, len(lines) + 2)

@@ -172,7 +172,7 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
         in ran("convert", log, out, code=2).stderr
     )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
-    assert "data frames are found with answer=node" in told
+    assert "its data frames require answer=node" in told
     following = next(line for line in told.splitlines() if "next: " in line).split(
         "next: lidarspec "
     )[1]
@@ -296,7 +296,7 @@ def test_files_for_each_scan_are_overwritten_only_with_force(tmp_path: Path) -> 
     source.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     before = source.read_bytes()
     assert (
-        f"{source} is the input: it would be overwritten"
+        f"{source} is the input, and would be overwritten"
         in ran("convert", "--force", source, target, "-s", "ldrobot-stl27l", code=2).stderr
     )
     assert source.read_bytes() == before
@@ -373,7 +373,7 @@ def test_packet_files_need_a_packet_source(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "drive.lsr", "-t", "100ms")
     out = tmp_path / "out.pcapng"
     assert (
-        "selected by --slice only"
+        "selected only by --slice"
         in ran("convert", tmp_path / "drive.lsr", out, "--scans", "1:2", code=2).stderr
     )
     assert (

@@ -149,7 +149,9 @@ def test_explain_can_show_damaged_frames_only(tmp_path: Path) -> None:
         *(
             line
             for line in result.stdout.splitlines()
-            if line.startswith("note: one lost byte explains the damage")
+            if line.startswith(
+                ("note: one lost byte explains", "note: a single lost byte explains")
+            )
         ),
     ]
     assert result.stderr == "29 frames, 1 damaged, 0 bytes outside frames\n"
@@ -174,7 +176,8 @@ def test_explain_can_show_some_bytes_only(tmp_path: Path) -> None:
     ] == [0, 47, 94]
     assert len(run_json("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
     assert (
-        "14100 bytes: no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
+        "14100 bytes, so no byte 14100"
+        in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
     )
     for words in (
         ("--bytes", "9"),
@@ -284,7 +287,7 @@ def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> 
     ]
     frame = sensor.parse(bytes.fromhex(ran("build", sensor.id, "data", *common, *ones).stdout))
     assert (frame.lsn, [sample.intensity for sample in frame.samples]) == (2, [6, 6])
-    assert "is not known" in ran("build", sensor.id, "data", *common, *every, code=2).stderr
+    assert "is unknown" in ran("build", sensor.id, "data", *common, *every, code=2).stderr
 
 
 @pytest.mark.parametrize(

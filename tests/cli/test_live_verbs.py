@@ -81,7 +81,7 @@ def test_an_interrupt_ends_with_130(words: tuple[str, ...]) -> None:
         rest, said = running.communicate(timeout=60)
     assert running.returncode == 130
     assert said == "interrupted\n"
-    assert ("whole scans" in rest) == (words == ("stats",))
+    assert ("complete scans" in rest) == (words == ("stats",))
 
 
 @pytest.mark.slow

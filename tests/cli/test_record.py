@@ -383,7 +383,7 @@ def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_pat
         in ran("replay", stream, "--to", "udp://127.0.0.1:9", code=2).stderr
     )
     assert "is a live source" in ran("replay", "udp://:2368", code=2).stderr
-    assert "not a speed" in ran("replay", stream, "--speed", "0", code=2).stderr
+    assert "expected a speed" in ran("replay", stream, "--speed", "0", code=2).stderr
     assert (
         "requires a port or socket"
         in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr

@@ -128,8 +128,8 @@ def test_an_unplugged_simulation_is_reported(tmp_path: Path) -> None:
     assert [line.partition(" s: ")[2] for line in result.stderr.splitlines() if " s: " in line][
         :2
     ] == [
-        "unplugged",
-        "plugged in again at udp://127.0.0.1:2998",
+        "disconnected",
+        "connected again at udp://127.0.0.1:2998",
     ]
 
 

@@ -80,7 +80,7 @@ def test_a_device_yields_the_packets_of_several_types(recording: Path) -> None:
 def test_verbs_that_need_points_suggest_another(verb: str, recording: Path, tmp_path: Path) -> None:
     more = ["-o", tmp_path / "plot.svg"] if verb == "plot" else []
     error = ran(verb, recording, "-s", RECEIVER, *more, code=2).stderr
-    assert "has no points; its frames are fix, warmth, rate_reply" in error
+    assert "measures no points; it sends the frames fix, warmth, rate_reply" in error
     assert f"next: lidarspec read {recording} -s shape-receiver -f fix" in error
 
 
