@@ -1,14 +1,15 @@
-"""Captures of other tools: the contents of pcap and pcapng files.
+"""Read and write captures: pcap and pcapng files.
 
-In: a capture, as a file or a pipe. Out: UDP datagrams with times and addresses, one by one or
-in batches; for a captured byte stream, its pieces. Packets without a datagram are counted. No
-content after the first four bytes raises an exception. Modules in reading order:
+In: a capture, as a file or a pipe. Out: UDP datagrams with times and addresses, singly or in
+batches; for the capture of a byte stream, its chunks. Packets without a datagram are counted. If
+the first four bytes are those of a capture, no content raises an exception. Modules in reading
+order:
 
-* `source`: the bytes of a file or pipe, in buffers that callers share.
-* `records`: the records of the two file formats, one by one and in patterns.
+* `source`: a buffered reader of a file or pipe; callers can use its buffers without a copy.
+* `records`: the records of both file formats, and the layout of similar records.
 * `ip`: the payload of a captured frame: link layers, IP, fragments.
-* `pcap`: combines both: a reader of datagrams, and a writer.
-* `containers`: the kind of a file by its first bytes; decompresses files and refuses unsupported
-  kinds.
-* `bulk`: the datagrams of a capture as arrays of offsets.
+* `pcap`: reads the datagrams of a capture with `records` and `ip`, and makes records to write.
+* `containers`: detects the kind of a file by its first bytes, decompresses files, and refuses
+unsupported kinds.
+* `bulk`: reads the datagrams of a capture in batches, as arrays of offsets.
 """

@@ -1,11 +1,11 @@
 """Read the datagrams of a capture in batches: arrays of offsets, times and senders.
 
-Consecutive datagrams of a device differ in their payloads, their times and little else. So
-`CaptureBatches` parses one record as `CaptureReader` does. The result is valid for every record of
-the same length with the same header bytes, apart from the bytes that may vary (see `RecordLayout`
-and `Headers`). `find_records` returns the offsets of the records in a buffer, and a `RecordKind`
-selects all records of its kind at once. All other records are read one by one, so that datagrams,
-their order and the statistics are those of `CaptureReader` for any file.
+The records of a device differ in their payloads and times, but hardly in their other bytes.
+`CaptureBatches` therefore parses only one record of each kind, as `CaptureReader` does. The result
+applies to all records of the same length with the same header bytes; bytes that may vary are
+ignored (see `RecordLayout` and `Headers`). `find_records` returns the offsets of the records in a
+buffer, and `RecordKind.find` selects all records of a kind. All other records are read singly.
+Datagrams, their order and the statistics are the same as those of `CaptureReader` for any file.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from lidarspec.frames.layout import gather_rows
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
-#: Maximum size of the headers of a record that are compared. Records with longer headers are read
-#: singly.
+#: Maximum number of header bytes to compare. Records with longer headers are read singly.
 MAX_HEADER_BYTES = 128
 
 #: Largest size of a buffer.
 MAX_BUFFER_BYTES = 2 * MAX_BLOCK_BYTES
 _TRAILER_BYTES = 4
-#: Number of bytes at the start of a record, in both formats, that determine its length.
+#: Number of bytes at the start of a record that contain its length, in both formats.
 _MIN_HEAD_BYTES = 16
-#: Smallest number of records of one length in a row for which a vectorized check pays.
+#: Minimum number of consecutive records of equal length that are checked together, which is then
+#: faster than single checks.
 _MIN_RUN_RECORDS = 16
-#: Largest number of kinds that are compared, and that one batch adds. It bounds the work per batch
-#: for any file.
+#: Maximum number of kinds that the records of a batch are compared with, and that a batch may add.
+#: It limits the time per batch for any file.
 MAX_KINDS = 16
 
 
@@ -53,12 +53,14 @@ class RecordKind:
 
     Attributes:
         length: length of the record, bytes.
-        start, size: offset of the payload in the record, and its length.
+        start: offset of the payload in the record.
+        size: length of the payload, bytes.
         source: address and port of the sender.
         times: the encoding of the time.
-        value, mask: the first bytes of a record as words, and the bits that have to be equal.
-        trailer: NumPy type of the word at the end that repeats the length, with the byte order;
-            None if there is none.
+        value: the first bytes of a record, as words.
+        mask: the bits of `value` that are equal in all records of the kind.
+        trailer: NumPy type of the last word of the record, which repeats the length; None for
+            records without this word.
     """
 
     length: int
@@ -73,13 +75,16 @@ class RecordKind:
     def find(
         self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Return which of n records are of this kind, and their times.
+        """Return the mask of the records of this kind, and their times.
 
         Args:
-            storage: the buffer, with at least `MAX_HEADER_BYTES` from each start on.
+            storage: the buffer, with at least `MAX_HEADER_BYTES` after each start.
+            starts: offsets of the records, (n,).
+            lengths: lengths of the records, (n,) bytes.
 
         Returns:
-            An (n,) mask, or None if all records match; and the times of the matching records, ns.
+            A mask, (n,) bool, or None if all records are of this kind; and the times of the records
+            of this kind, ns.
         """
         same = lengths == self.length
         if not same.all():
@@ -123,7 +128,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
     Args:
         record: all bytes of the record.
         datagram: the datagram in the record.
-        form: the reader of its file.
+        form: the reader of the records of its file.
     """
     headers = datagram.headers
     pattern = form.find_layout(record)
@@ -136,8 +141,8 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
     mask[:start] = 0xFF
-    # If the packet has headers, they determine the length of the payload; the original length of
-    # the packet may then vary.
+    # If the packet has headers, they give the length of the payload, so the original length of the
+    # packet may vary.
     uncut = pattern.uncut if headers.size else ()
     mask[[*pattern.free, *uncut, *(head + offset for offset in headers.variable_offsets)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
@@ -156,11 +161,11 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
 def find_records(
     storage: NDArray[np.uint8], start: int, stop: int, form: Form
 ) -> tuple[Indices, bool]:
-    """Return the offsets of the whole records from `start` to `stop`.
+    """Return the offsets of the complete records between `start` and `stop`.
 
     Returns:
-        The start of each record, followed by the end of the last one; and whether the next record
-        has to be read by `form.read`.
+        The start of each record, followed by the end of the last record; and whether `form.read`
+        must read the next record.
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -193,17 +198,17 @@ def find_records(
 def _count_equal_lengths(
     storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form
 ) -> int:
-    """Return the number of consecutive records of one length, at most `count`."""
-    place, kind, claim = form.length_field(length)
-    claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
-    others = claims != claim
+    """Return the number of consecutive records with this length, at most `count`."""
+    field_offset, kind, value = form.length_field(length)
+    values: NDArray[Any] = np.ndarray((count,), kind, storage, at + field_offset, (length,))
+    others = values != value
     if others.any():
         return int(others.argmax())
     return count
 
 
 def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
-    """Return the bytes from each start on, (n, width)."""
+    """Return the `width` bytes after each start, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray(
         (len(storage) - width + 1,), f"V{width}", storage, 0, (1,)
     )
@@ -212,12 +217,13 @@ def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray
 
 @dataclass(frozen=True, eq=False)
 class CapturedDatagrams:
-    """n datagrams in the order of their arrival.
+    """A batch of n datagrams in the order of their arrival.
 
     Attributes:
-        buffer: the bytes that contain the payloads. The buffer is reused for later batches unless
-            it or a view of it is still referenced.
-        starts, sizes: (n,) offset and length of each payload in the buffer.
+        buffer: an array that contains the payloads. Later batches overwrite it unless the array, or
+            a view of it, is still referenced.
+        starts: (n,) offset of each payload in the buffer.
+        sizes: (n,) length of each payload, bytes.
         at: (n,) int64 arrival times, ns since 1970; -1 if unknown.
         senders: (n,) indices into `names`.
         names: address and port of each sender.
@@ -282,9 +288,9 @@ class CapturedDatagrams:
             start = stop
 
     def sent(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
-        """Yield the type and sender of the frames found in these datagrams.
+        """Yield (frame type, sender) of the frames that were found in these datagrams.
 
-        A type is repeated each time its sender changes.
+        A type is yielded again each time its sender changes.
         """
         if len(self.names) == 1:
             yield from (
@@ -305,13 +311,14 @@ class CapturedDatagrams:
 class CaptureBatches(CaptureReader):
     """Reads the datagrams of a capture in batches of arrays.
 
-    Iteration yields single datagrams as in `CaptureReader`. Use only one of both ways.
+    Iterating over a reader yields single datagrams, like `CaptureReader`. Use either iteration or
+    `batches`, not both.
     """
 
     largest = MAX_BUFFER_BYTES
 
     def batches(self) -> Iterator[CapturedDatagrams]:
-        """Yield the datagrams of the file, one batch for each buffer that was read."""
+        """Yield the datagrams of the file, in one batch for each filled buffer."""
         kinds: list[RecordKind] = []
         with self._count_end():
             form = self._form = self._form or make_record_reader(self._source)
@@ -325,11 +332,11 @@ class CaptureBatches(CaptureReader):
                     starts = np.array([self._source.at])
                 block = _RecordBlock(self, self._source, form, starts, kinds)
                 ended = block.read()
-                place = self._source.offset
+                before = self._source.offset
                 if len(batch := block.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
-                if self._source.offset != place:
+                if self._source.offset != before:
                     continue  # the consumer of the batch called `skip_until`
                 if isinstance(ended, DamagedRecordError):
                     self._skip_damage(form)
@@ -339,11 +346,11 @@ class CaptureBatches(CaptureReader):
 
 
 class StreamBatches(StreamReader, CaptureBatches):
-    """Reads the packets of a capture of a byte stream in batches."""
+    """Reads the packets in the capture of a byte stream, in batches."""
 
 
 class _RecordBlock:
-    """The complete records in the buffer; if it has none, only the next record."""
+    """The complete records in the buffer, or the next record if none is complete."""
 
     def __init__(
         self,
@@ -364,21 +371,21 @@ class _RecordBlock:
         self._kinds = np.full(number, -1, np.intp)  # indices into `_known`
         self._at = np.zeros(number, np.int64)
         self._singles: dict[int, Datagram] = {}
-        self._kinds_added = 0  # number of kinds that these records added
-        # Number of packets with a kind that were read singly, and so are already counted.
+        self._kinds_added = 0  # number of kinds that were added for these records
+        # Number of packets with a kind that were read singly, so that they are already counted.
         self._matched_singles = 0
         self._only: RecordKind | None = None  # the kind of all records, if there is only one
         self._section = form.sections
         self._storage = source.storage
-        # Taken now: the source may switch to another buffer when it reads ahead.
+        # Store the buffer now, because the source may switch to another buffer when it reads more.
         self._buffer = source.view()
 
     def read(self) -> Exception | None:
-        """Read the records; return the exception if one of them cannot be read."""
+        """Read the records. Return the exception if a record cannot be read, else None."""
         if not any(self._match(kind) for kind in range(len(self._known))):
             for index in np.flatnonzero(self._kinds < 0).tolist():
                 if self._kinds[index] >= 0:
-                    continue  # of a kind that an earlier record of the loop added
+                    continue  # its kind was added for an earlier record of this loop
                 self._source.at = int(self._starts[index])
                 try:
                     self._read_single(index)
@@ -395,7 +402,7 @@ class _RecordBlock:
         return None
 
     def select_known(self) -> list[RecordKind]:
-        """Return the kinds to compare the next records with, most frequent first."""
+        """Return the kinds to compare later records with, the most frequent first."""
         if self._form.sections != self._section:
             return []
         if len(self._known) == 1:
@@ -415,8 +422,8 @@ class _RecordBlock:
         names: dict[Sender, int] = {}
         facts = np.array(
             [
-                (one.start, one.size, names.setdefault(one.source, len(names)))
-                for one in self._known
+                (kind.start, kind.size, names.setdefault(kind.source, len(names)))
+                for kind in self._known
             ],
             np.intp,
         ).reshape(-1, 3)
@@ -456,10 +463,9 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Return the buffer with the datagrams of single records appended.
+        """Return the buffer followed by the datagrams that were read singly.
 
-        These are the records that were read without a kind. Their rows are inserted into `columns`
-        in the order of the records.
+        Their rows are inserted into `columns`, in the order of the records.
         """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
@@ -498,10 +504,10 @@ class _RecordBlock:
                 self._matched_singles += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Assign a kind to all records that match it, and return whether all have a kind now.
+        """Assign a kind to the records that match it; return whether all now have a kind.
 
-        Records before `since` were already read and are left out, because a record that was
-        malformed when it was read may match now.
+        Records before `since` are ignored, because they were already read. One of them may have
+        been malformed then, but match now.
         """
         template = self._known[kind]
         number = len(self._kinds)

@@ -1,11 +1,11 @@
 """Detect the kind of a file by its first bytes, and decompress it.
 
-Files without raw sensor data are refused with a message that names their kind.
+Files that cannot contain raw sensor data are refused with a message that names their kind.
 
-Nothing is decompressed as a whole: `UnpackedFile` is a file that decompresses as it is read. If the
-compressed bytes are truncated or damaged, it ends there, and `find_damage` has the reason. All data
-before the damage is read, except for at most `STEP_BYTES`, or a block of bzip2. The table of a zip
-archive is at its end, so archives can be read from files but not from pipes.
+A file is decompressed while it is read (`UnpackedFile`), never as a whole. If its bytes are
+truncated or damaged, the content ends there, and `find_damage` returns the reason. The data before
+the damage is read, except for at most `STEP_BYTES`, or one block of bzip2. A zip archive can be
+read only from a file, not from a pipe, because its list of files is at its end.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.recording.format import MAGIC
 from lidarspec.remote_files import open_stored
 
-#: bytes at the start that determine the kind of a file.
+#: number of bytes at the start of a file that its kind is detected from.
 HEAD_BYTES = 512
-#: maximum bytes decompressed in one step.
+#: maximum number of bytes to decompress in one step.
 STEP_BYTES = 1 << 13
-#: maximum bytes decompressed by one read of a file; a pipe returns the bytes that have arrived.
+#: maximum number of bytes that one read of a file decompresses. A read of a pipe returns the bytes
+#: that have arrived.
 READ_BYTES = 1 << 20
-#: maximum nesting of compression: a compressed capture in a zip archive.
+#: maximum nesting of compression: 2, for a compressed capture in a zip archive.
 MAX_NESTING = 2
-#: maximum number of files of an archive in a message.
+#: maximum number of files of an archive to list in a message.
 MAX_NAMES = 6
 
 
@@ -42,9 +43,9 @@ class Packing(NamedTuple):
     """A compression format.
 
     Attributes:
-        name: of the format.
-        module: its `open` decompresses.
-        command: the shell command that decompresses.
+        name: name of the format.
+        module: name of the Python module with the function `open` that decompresses.
+        command: shell command that decompresses a file; {} is the file.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Packing(NamedTuple):
 
 
 ZIP = Packing("zip", "zipfile", "unzip {}")
-#: first bytes of compressed files.
+#: pattern of the first bytes of a compressed file -> its compression format.
 PACKINGS = {
     rb"\x1f\x8b\x08[\x00-\x1f]": Packing("gzip", "gzip", "gunzip -k {}"),
     rb"BZh[1-9]1AY&SY": Packing("bzip2", "bz2", "bunzip2 -k {}"),
@@ -63,7 +64,8 @@ PACKINGS = {
     ),
     rb"PK\x03\x04": ZIP,
 }
-#: first bytes of unsupported files: their kind, and the command that extracts the data.
+#: pattern of the first bytes of an unsupported file -> (its kind, the command that extracts the
+#: data).
 CONTAINERS = {
     rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
     rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x {}"),
@@ -102,7 +104,7 @@ class Damage(NamedTuple):
     """The reason why decompression ended early.
 
     Attributes:
-        text: a message.
+        text: message for the user.
         unread: number of compressed bytes that were not read.
     """
 
@@ -111,15 +113,15 @@ class Damage(NamedTuple):
 
 
 class UnpackedFile(io.RawIOBase):
-    """The content of a compressed file, decompressed as it is read; never seekable.
+    """The content of a compressed file, decompressed while it is read; not seekable.
 
     Args:
-        name: of the file, for messages.
-        packed: the compressed file, which is closed with this one unless it is standard input.
+        name: name of the file, for messages.
+        packed: the compressed file. It is closed with this file, unless it is standard input.
         file: the decompressor.
 
     Attributes:
-        damage: the reason why it ended early, else None.
+        damage: the reason why decompression ended early; None if it did not.
     """
 
     def __init__(self, name: str, packed: BinaryIO, file: Any) -> None:
@@ -158,24 +160,24 @@ class UnpackedFile(io.RawIOBase):
         except EOFError:
             self.damage = Damage(f"{self.name} is truncated{self._read}", 0)
         except Exception as error:
-            # Each library raises its own for damaged bytes, and bz2 and gzip raise OSError.
+            # Each library raises its own exceptions for damaged bytes; bz2 and gzip raise OSError.
             if isinstance(error, OSError) and error.errno is not None:
                 raise
-            place = self._packed.tell() if self._packed.seekable() else 0
-            size = self._packed.seek(0, os.SEEK_END) if place else 0
-            where = f" before byte {place} of {size}" if place else ""
+            offset = self._packed.tell() if self._packed.seekable() else 0
+            size = self._packed.seek(0, os.SEEK_END) if offset else 0
+            where = f" before byte {offset} of {size}" if offset else ""
             self.damage = Damage(
-                f"{self.name} is corrupt{where} ({error}){self._read}", max(size - place, 1)
+                f"{self.name} is corrupt{where} ({error}){self._read}", max(size - offset, 1)
             )
         return b""
 
     @property
     def _read(self) -> str:
-        return f": the {self._count} bytes that could be decompressed were read"
+        return f": only the first {self._count} decompressed bytes were read"
 
 
 def find_damage(file: BinaryIO) -> Damage | None:
-    """Return the reason why a decompressed file ended early, None if it did not."""
+    """Return the reason why a decompressed file ended early; None if it did not."""
     raw = getattr(file, "raw", None)
     if isinstance(raw, UnpackedFile):
         return raw.damage
@@ -183,10 +185,11 @@ def find_damage(file: BinaryIO) -> Damage | None:
 
 
 def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
-    """Open a file, decompressed if it is compressed.
+    """Open a file; if it is compressed, return its content.
 
     Raises:
-        SourceError, UsageError: as `unpack`, and if it cannot be opened.
+        SourceError: if the file cannot be opened or decompressed, or contains no capture.
+        UsageError: for an archive with several captures, or if a library is missing.
     """
     with system_errors(os.fspath(path)), ExitStack() as undo:
         file = undo.enter_context(closing(open_stored(os.fspath(path))))
@@ -196,13 +199,13 @@ def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
 
 
 def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
-    """Return an open file, decompressed as it is read if it is compressed.
+    """Return an open file; if it is compressed, return its content.
 
     Closing the result closes the file.
 
     Args:
-        name: of the file, for messages.
-        member: the file of a zip archive; "" for the only capture or recording in it.
+        name: name of the file, for messages.
+        member: the file to read from a zip archive; "" for the only capture or recording in it.
 
     Raises:
         SourceError: for an archive that cannot be decompressed, or contains no capture.
@@ -245,7 +248,7 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
         return archive.open(_choose_member(name, archive, names, member))
     except (UsageError, SourceError):
         raise
-    except Exception as error:  # for damaged archives zipfile raises many types
+    except Exception as error:  # zipfile raises exceptions of many types for damaged archives
         if isinstance(error, zipfile.BadZipFile):
             command = f"zip -FF {quote(name)} --out repaired.zip"
         else:
@@ -256,9 +259,9 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
 
 
 def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
-    """Return the requested member, or the only one, or the only readable one.
+    """Return the name of the file to read from a zip archive.
 
-    Readable are captures and recordings.
+    This is the requested file, the only file, or the only capture or recording.
     """
     if member:
         if member not in names:
@@ -282,7 +285,7 @@ def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member
 
 
 def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
-    """Return whether a member begins like a capture, a recording or a compressed file."""
+    """Return whether a file of an archive is a capture, a recording or compressed."""
     with archive.open(member) as file:
         start = file.read(HEAD_BYTES)
     return is_capture(start) or start.startswith(MAGIC) or _packing(start) is not None
@@ -292,16 +295,16 @@ def refuse_container(path: str, start: bytes) -> None:
     """Raise SourceError for an unsupported kind of file.
 
     Args:
-        path: of the file, for the message.
+        path: name of the file, for the message.
         start: its first `HEAD_BYTES`, decompressed.
 
     Raises:
-        SourceError: with the kind of the file, and the command that extracts the data.
+        SourceError: the message has the kind of the file, and the command that extracts the data.
     """
-    for beginning, (what, command) in _REFUSED.items():
+    for beginning, (kind, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):
             error = SourceError(
-                f"{path} is {what}: expected a capture, a recording or the raw bytes of a sensor"
+                f"{path} is {kind}: expected a capture, a recording or the raw bytes of a sensor"
             )
             if command and Path(path).exists():
                 raise suggest(error, command.format(quote(path)))

@@ -1,16 +1,17 @@
 """Extract UDP payloads from captured frames, and build frames around payloads.
 
-This module handles link layers, IPv4, IPv6 and fragments; it knows nothing of files. `parse_ip`
-takes a captured frame. A fragment goes through `Reassembly.add`, and the whole packet through
-`parse_udp`. A step that cannot continue raises `NoDatagramError` with the reason.
+This module handles link layers, IPv4, IPv6 and fragments, but no files. `parse_ip` returns the IP
+packet in a captured frame. `Reassembly.add` collects the fragments of a packet. `parse_udp` returns
+the UDP header of a whole packet. These functions raise `NoDatagramError`, with the reason, if a
+packet contains no datagram.
 
-Two header fields are ignored because they are wrong in valid captures:
+Two header fields are ignored, because they can be wrong in valid captures:
 
-* Checksums. If the capturing machine sent the packet, its network card fills them in only after
-  the capture.
-* The length of an unfragmented IP packet, if it is 0 or longer than the frame. Segmentation by a
-  network card leaves 0, and a lidar in the field sends the length of its data packets, 1234, in
-  packets of 540 bytes. The length in the UDP header decides whether the payload is complete.
+* Checksums. If the capturing machine sent the packet itself, its network card computes them after
+the packet was captured.
+* The length of an unfragmented IP packet, if it is 0 or longer than the frame. It is 0 if the
+network card splits packets, and one lidar model sends the length 1234 in packets of 540 bytes. The
+length in the UDP header decides whether the payload is complete.
 
 Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946
 (atomic fragments), IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
@@ -26,19 +27,19 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 ETHERNET = 1
-#: 65,535 bytes of IPv4 packet, less 20 of its header and 8 of the UDP header.
+#: An IPv4 packet has at most 65,535 bytes, of which 20 are its header and 8 the UDP header.
 MAX_PAYLOAD_BYTES = 65_507
 _MAX_PACKET_BYTES = 65_535
 
 _LOOPBACK_LINKS = {0, 108}
 _RAW_IP_LINKS = {12, 101, 228, 229}
-#: By link type: the offset of the EtherType, and the length of the header.
+#: Link type -> (offset of the EtherType, length of the header).
 _ETHERTYPE_LINKS = {
     ETHERNET: (12, 14),
     113: (14, 16),  # Linux "cooked" capture, SLL
     276: (0, 20),  # SLL2
 }
-#: The names of common link layers that are not read.
+#: Number of a link type that is not supported -> its name.
 _UNSUPPORTED_LINKS = {
     9: "PPP",
     50: "PPP",
@@ -51,13 +52,14 @@ _VLAN_ETHERTYPES = {0x8100, 0x88A8, 0x9100}
 _VLAN_TAG_BYTES = 4
 _IPV4_ETHERTYPE = 0x0800
 _IPV6_ETHERTYPE = 0x86DD
-#: Smaller values in the place of an EtherType are lengths (802.3).
+#: Smaller values in the field of the EtherType are lengths (802.3).
 _MIN_ETHERTYPE = 0x0600
-#: AF_INET of all systems; AF_INET6 of Linux, NetBSD, FreeBSD and macOS.
+#: The values of AF_INET, the same on all systems, and of AF_INET6 on Linux, NetBSD, FreeBSD and
+#: macOS.
 _IP_FAMILIES = {2, 10, 24, 28, 30}
 _LOOPBACK_HEADER_BYTES = 4
 
-#: Names of packets that are not UDP, by EtherType and by IP protocol.
+#: EtherType -> name of a protocol that is not UDP. The next table has the names by IP protocol.
 _ETHERTYPE_NAMES = {
     0x0806: "ARP",
     0x8863: "PPPoE discovery",
@@ -85,10 +87,11 @@ _IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
 _IPV6_HEADER = struct.Struct(">4xHBx16s16s")
 _FRAGMENT_HEADER = struct.Struct(">BxHI")
 _UDP_HEADER = struct.Struct(">HHHH")
-#: Offsets within an IPv4 header: identification and header checksum.
+#: Offsets of the bytes of an IPv4 header that differ between packets: identification and header
+#: checksum.
 _IPV4_VARIABLE_OFFSETS = (4, 5, 10, 11)
 
-# Locally administered addresses, which belong to no device.
+# Locally administered addresses, which are not assigned to any device.
 _DESTINATION_MAC = bytes.fromhex("020000000001")
 _SOURCE_MAC = bytes.fromhex("020000000002")
 _DO_NOT_FRAGMENT = 0x4000
@@ -96,12 +99,12 @@ _TIME_TO_LIVE = 64
 
 
 class NoDatagramError(Exception):
-    """A packet from which no datagram can be read.
+    """No datagram can be read from a packet.
 
     Attributes:
-        reason: "other" (not UDP over IP), "link" (an unsupported link layer), "short" (fewer bytes
-            than the headers claim) or "malformed" (contradicting headers).
-        name: the protocol for "other", the link layer for "link".
+        reason: "other" (not UDP over IP), "link" (unsupported link layer), "short" (fewer bytes
+            than the headers give) or "malformed" (header fields contradict each other).
+        name: for "other", the protocol; for "link", the link layer.
     """
 
     def __init__(
@@ -116,9 +119,9 @@ class IpFragment(NamedTuple):
     """The position of a fragment in the whole packet.
 
     Attributes:
-        ident: the identification that all fragments of a packet share.
-        start: the offset of the fragment's first byte in the body of the whole packet.
-        more: whether other fragments follow it.
+        ident: the identification, which is the same in all fragments of a packet.
+        start: offset of the fragment's first byte in the body of the whole packet.
+        more: whether it is not the last fragment of the packet.
     """
 
     ident: int
@@ -127,14 +130,16 @@ class IpFragment(NamedTuple):
 
 
 class IpPacket(NamedTuple):
-    """An IP packet that carries UDP, or a fragment of one.
+    """An IP packet that contains UDP, or a fragment of such a packet.
 
     Attributes:
-        source, destination: addresses as on the wire, 4 or 16 bytes.
-        protocol: of the first header in `body`.
+        source: address of the sender, 4 or 16 bytes.
+        destination: address of the receiver, 4 or 16 bytes.
+        protocol: protocol number of the first header in `body`.
         body: the bytes after the IP header.
-        body_offset: the offset of `body` in the frame; 0 for a reassembled packet.
-        variable_offsets: as of `Headers`, those in the IP header.
+        body_offset: offset of `body` in the frame; 0 for a reassembled packet.
+        fragment: the position of the fragment; None for a whole packet.
+        variable_offsets: offsets of the bytes of the IP header that differ between packets.
     """
 
     source: bytes
@@ -147,7 +152,7 @@ class IpPacket(NamedTuple):
 
 
 class UdpPacket(NamedTuple):
-    """Ports, and the range of the payload in the body of the IP packet."""
+    """The ports, and the range of the payload in the body of the IP packet."""
 
     source: int
     destination: int
@@ -156,13 +161,13 @@ class UdpPacket(NamedTuple):
 
 
 class Headers(NamedTuple):
-    """The headers in front of the payload of an unfragmented UDP packet.
+    """The headers before the payload of an unfragmented UDP packet.
 
     Attributes:
         size: length of all headers together, which is the offset of the payload.
         payload_size: length of the payload.
-        variable_offsets: offsets of bytes that may differ between packets of one stream: checksums
-            and the identification of an unfragmented IPv4 packet.
+        variable_offsets: offsets of the header bytes that may differ between packets of the same
+            sender and size: checksums and the identification of IPv4.
     """
 
     size: int
@@ -174,11 +179,11 @@ def parse_ip(frame: bytes, link: int) -> IpPacket:
     """Return the IP packet in a captured frame, without padding.
 
     Args:
-        frame: the captured bytes, from the first one of the link layer on.
+        frame: the captured bytes, beginning with the header of the link layer.
         link: the link-layer type, as in a pcap header.
 
     Raises:
-        NoDatagramError: if the frame carries no UDP over IP, or is incomplete.
+        NoDatagramError: if the frame contains no UDP over IP, or is incomplete.
     """
     try:
         start = _find_ip(frame, link)
@@ -215,11 +220,11 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
 
 
 def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
-    """Return the extent of the headers of a UDP packet; None for a reassembled packet.
+    """Return the sizes of the headers of a UDP packet; None for a reassembled packet.
 
-    Frames of one link type and one length, with equal headers except for the variable bytes, have
-    their payload at the same offset and come from the same sender, because `parse_ip` and
-    `parse_udp` read nothing else.
+    If two frames have the same link type, length and header bytes, except for the variable bytes,
+    their payloads have the same offset and the same sender. `parse_ip` and `parse_udp` depend on no
+    other bytes.
     """
     if not packet.body_offset:
         return None
@@ -230,7 +235,7 @@ def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
 
 @lru_cache(maxsize=256)
 def format_address(packed: bytes) -> str:
-    """Return the usual text of an address of 4 or 16 bytes."""
+    """Return an IP address of 4 or 16 bytes as text."""
     return str(ipaddress.ip_address(packed))
 
 
@@ -240,8 +245,9 @@ def build_udp_frame(
     """Return an Ethernet frame with an IP header, a UDP header and the payload.
 
     Args:
-        payload: at most `MAX_PAYLOAD_BYTES`, and 20 more over IPv6.
-        source, destination: address and port; both addresses have 4 bytes, or both have 16.
+        payload: the payload: at most `MAX_PAYLOAD_BYTES`, and 20 bytes more over IPv6.
+        source: address and port of the sender.
+        destination: address and port of the receiver. Both addresses have 4 bytes, or both 16.
     """
     length = _UDP_HEADER.size + len(payload)
     if len(source[0]) == 16:
@@ -290,7 +296,7 @@ def _udp_checksum_over_ipv6(
 def _internet_checksum(words: bytes) -> int:
     """Return the ones' complement of the ones' complement sum of 16-bit words.
 
-    The sum is the number that all bytes form, modulo 0xFFFF, and 0xFFFF in the place of 0.
+    The sum is the big-endian number of all bytes modulo 0xFFFF. A sum of 0 is written as 0xFFFF.
     """
     return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 
@@ -310,15 +316,15 @@ def _find_ip(frame: bytes, link: int) -> int:
 def _skip_loopback_header(frame: bytes) -> int:
     (little,) = struct.unpack_from("<I", frame)
     (big,) = struct.unpack_from(">I", frame)
-    # The family has the byte order of the capturing machine. Families are small numbers, and the
-    # wrong order gives a large one.
+    # The family has the byte order of the capturing machine. Families are small numbers, so the
+    # smaller value is the one in the right byte order.
     if min(little, big) not in _IP_FAMILIES:
         raise NoDatagramError("other", "loopback without IP")
     return _LOOPBACK_HEADER_BYTES
 
 
 def _skip_ethertype(frame: bytes, ethertype: int, start: int) -> int:
-    """Return the offset of IP after an EtherType and VLAN tags."""
+    """Return the offset of the IP header after an EtherType and VLAN tags."""
     while ethertype in _VLAN_ETHERTYPES:
         ethertype = _ethertype_at(frame, start + 2)
         start += _VLAN_TAG_BYTES
@@ -388,10 +394,7 @@ def _parse_ipv6(frame: bytes, start: int) -> IpPacket:
 
 
 def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
-    """Return the protocol after the extension headers of IPv6, and its offset.
-
-    The offset is counted from the start of the body.
-    """
+    """Return the protocol after the IPv6 extension headers, and its offset in `body`."""
     offset = 0
     while protocol in _EXTENSION_PROTOCOLS:
         protocol, extra_units = struct.unpack_from(">BB", body, offset)
@@ -400,10 +403,10 @@ def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
 
 
 def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragment | None:
-    """Return the fragment for these header fields; None for a whole packet.
+    """Return the fragment that header fields describe; None for a whole packet.
 
     Raises:
-        NoDatagramError: if the fragment is impossible in a valid packet.
+        NoDatagramError: if no valid packet can have this fragment.
     """
     if not more and not start:
         return None
@@ -414,7 +417,7 @@ def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragme
 
 
 class _PartialPacket:
-    """The fragments of one packet that have arrived; none overlaps another."""
+    """The fragments of one packet that have arrived; they do not overlap."""
 
     __slots__ = ("arrival_ns", "parts", "protocol", "size", "starts", "total_size")
 
@@ -427,7 +430,7 @@ class _PartialPacket:
         self.protocol = _UDP_PROTOCOL
 
     def add(self, start: int, body: bytes, *, more: bool) -> bool:
-        """Add a fragment unless it contradicts the others; return whether it was added."""
+        """Add a fragment; return False if it contradicts the other fragments."""
         stop = start + len(body)
         index = bisect_left(self.starts, start)
         if self._overlaps(index, start, stop):
@@ -456,9 +459,9 @@ class _PartialPacket:
 class Reassembly:
     """Reassembles IP fragments that arrive in any order, in bounded memory.
 
-    If fragments of a packet overlap, the packet is dropped (RFC 5722), but a repeated fragment is
-    ignored. The oldest packets are dropped if more than `MAX_PACKETS` or `MAX_BYTES` wait for
-    fragments, or if they are older than `TIMEOUT_NS`.
+    If fragments of a packet overlap, the packet is dropped (RFC 5722). A repeated fragment is
+    ignored. Incomplete packets are dropped when they are older than `TIMEOUT_NS`. The oldest are
+    also dropped if there are more than `MAX_PACKETS`, or if they have more than `MAX_BYTES`.
 
     Attributes:
         dropped: the number of fragments of packets that were dropped.
@@ -466,9 +469,11 @@ class Reassembly:
 
     MAX_PACKETS = 256
     MAX_BYTES = 4 << 20
-    #: At 10,000 datagrams a second the 16-bit identification of IPv4 repeats after 6.5 s.
+    #: Shorter than 6.5 s, after which the 16-bit identification of IPv4 repeats at 10,000 datagrams
+    #: per second.
     TIMEOUT_NS = 5_000_000_000
-    #: Bytes of Python objects for each fragment, which bound the number of tiny fragments.
+    #: Size of the Python objects of a fragment. It is part of `MAX_BYTES`, so that many small
+    #: fragments do not exceed the memory limit.
     _OVERHEAD_BYTES = 160
 
     def __init__(self) -> None:
@@ -477,11 +482,12 @@ class Reassembly:
         self._held_bytes = 0
 
     def add(self, packet: IpPacket, fragment: IpFragment, arrival_ns: int) -> IpPacket | None:
-        """Add a fragment; return the whole packet if this was the last one missing.
+        """Add a fragment; return the whole packet if it is now complete, else None.
 
         Args:
-            packet: the result of `parse_ip`, with its `fragment`.
-            arrival_ns: the capture time.
+            packet: the result of `parse_ip`.
+            fragment: its attribute `fragment`.
+            arrival_ns: the capture time, ns since 1970.
         """
         self._drop_older(arrival_ns - self.TIMEOUT_NS)
         key = packet.source, packet.destination, fragment.ident

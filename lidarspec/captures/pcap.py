@@ -1,9 +1,9 @@
-"""Read the UDP datagrams of a pcap or pcapng file, and make the records of new files.
+"""Read the UDP datagrams of pcap and pcapng files, and make the records of new files.
 
-`make_record_reader` iterates over the records of the file and `ip` parses the captured frames. This
-module joins the two and counts every packet that gives no datagram in `CaptureStats`. Captures are
-untrusted input: after the first four bytes no content raises, and memory use follows the bytes
-that are present, not the lengths that they claim.
+`records` reads the records of a file, and `ip` parses the captured frames. This module joins both,
+and counts the packets that contain no datagram in `CaptureStats`. Captures are untrusted input: if
+the first four bytes are those of a capture, no content raises an exception. The memory use depends
+on the number of bytes in the file, not on length fields.
 """
 
 from __future__ import annotations
@@ -44,15 +44,16 @@ from lidarspec.captures.source import MIN_BUFFER_BYTES, BufferedInput, Truncated
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.protocol import ClosingContext
 
-#: Link types for private use. Captures of byte streams are written with the first one.
+#: Link types USER0 to USER15, for private use. Captures of byte streams are written with USER0.
 USER_LINKS = range(147, 163)
-#: Packets of further kinds are counted together.
+#: Maximum number of protocols to count separately; all others are counted together.
 MAX_COUNTED_KINDS = 16
 #: The address and port of a datagram with unknown sender or receiver.
 UNKNOWN_ENDPOINT = ("0.0.0.0", 0)
-#: The bytes in front of an IPv4 address that is written as an IPv6 address (RFC 4291).
+#: The first bytes of an IPv6 address that represents an IPv4 address (RFC 4291).
 _IPV4_MAPPED_PREFIX = bytes.fromhex("00000000000000000000ffff")
-#: A datagram over IPv6 can be longer, because the length does not count its header.
+#: A datagram over IPv6 can be this much longer, because the length field of IPv6 does not include
+#: the IP header.
 _EXTRA_PAYLOAD_BYTES_IPV6 = 20
 
 
@@ -62,11 +63,12 @@ class Datagram:
 
     Attributes:
         data: the payload.
-        at: capture time in ns since 1970, of the last fragment of a fragmented datagram; 0 if the
-            file has no times.
-        source, destination: address and port.
-        headers: the headers of the packet that it was read from; None if other packets with equal
-            headers may have their payload elsewhere.
+        at: capture time in ns since 1970; 0 if the file has no times. For a fragmented datagram,
+            the time of the fragment that completed it.
+        source: address and port of the sender.
+        destination: address and port of the receiver.
+        headers: the headers of its packet; None if the payload of a packet with equal headers may
+            be at another offset.
     """
 
     data: bytes
@@ -81,20 +83,23 @@ class CaptureStats:
     """The contents of a capture so far.
 
     Attributes:
-        packets: captured packets of all kinds.
-        datagrams: UDP datagrams that were returned.
-        other: packets that are not UDP over IP.
-        others: the number of them by protocol, such as "ARP" or "TCP".
-        unsupported: packets with a link layer that is not read, by its name, such as "802.11".
+        packets: number of captured packets of all kinds.
+        datagrams: number of UDP datagrams that were returned.
+        other: number of packets that are not UDP over IP.
+        others: the number of these packets by protocol, such as "ARP" or "TCP".
+        unsupported: number of packets with an unsupported link layer, by its name, such as
+            "802.11".
         truncated_tail: whether the file ends within a record; all records before it were read.
-        snapped: UDP packets that the snap length of the capture cut short; they are not returned.
-        fragments: UDP packets that were IP fragments.
-        incomplete_fragments: those of datagrams that stayed incomplete.
-        malformed: packets and records with contradicting fields.
-        damaged: unreadable records after which another readable one was searched.
-        lost: bytes that these searches skipped.
-        stopped_at: file offset of the truncated or malformed record that ended the reading, or
-            None.
+        snapped: number of UDP packets that were truncated by the snap length of the capture; they
+            are not returned.
+        fragments: number of IP fragments of UDP packets.
+        incomplete_fragments: number of fragments of datagrams that stayed incomplete.
+        malformed: number of packets and records with fields that contradict each other.
+        damaged: number of records that could not be read, so that the next readable record was
+            searched.
+        lost: number of bytes that these searches skipped.
+        stopped_at: file offset of the truncated or malformed record that ended the reading; None if
+            the file was read to its end.
     """
 
     packets: int = 0
@@ -117,33 +122,35 @@ class CaptureStats:
         _count_name(self.others, name)
 
     def count_unsupported(self, link_layer: str) -> None:
-        """Count a packet with a link layer that is not read."""
+        """Count a packet with an unsupported link layer."""
         _count_name(self.unsupported, link_layer)
 
 
 def _count_name(counts: Counter[str], name: str) -> None:
-    """Count a name; a hostile file cannot make the number of names grow without limit."""
+    """Count a name, or "more" if there are already `MAX_COUNTED_KINDS` names.
+
+    The limit keeps a malicious file from using much memory.
+    """
     if name not in counts and len(counts) >= MAX_COUNTED_KINDS:
         name = "more"
     counts[name] += 1
 
 
 class CaptureReader(ClosingContext):
-    """The UDP datagrams of a capture in file order, each of them once.
+    """Iterates over the UDP datagrams of a capture, in the order of the file.
 
-    A second iterator continues where the first one stopped.
+    Each datagram is yielded once: a second iterator continues where the first stopped.
 
     Args:
-        file: an open binary file or pipe, which stays open; or a path, which may be compressed and
-            is closed after the last datagram.
+        file: an open binary file or pipe, which is not closed; or the path of a file, which may be
+            compressed and is closed after the last datagram.
 
     Attributes:
-        stats: the contents so far.
-        largest: the number of bytes that are read at once, at most.
+        stats: counts of the contents that were read so far.
+        largest: maximum number of bytes to read at once.
 
     Raises:
-        SourceError: if the file cannot be read, or is not a capture. Later damage is counted and
-            does not raise.
+        SourceError: if the file cannot be read, or is not a capture. Later damage is only counted.
     """
 
     largest = MIN_BUFFER_BYTES
@@ -185,9 +192,9 @@ class CaptureReader(ClosingContext):
         return self._datagrams
 
     def skip_until(self, time_ns: int) -> bool:
-        """Seek shortly before the first datagram at or after a time.
+        """Seek to shortly before the first datagram that was captured at a time or later.
 
-        Skipped datagrams are not counted. Datagrams with fragments on both sides are lost.
+        Skipped datagrams are not counted. A datagram with a skipped fragment is lost.
 
         Args:
             time_ns: ns since 1970.
@@ -217,7 +224,7 @@ class CaptureReader(ClosingContext):
                     yield datagram
 
     def _skip_damage(self, form: Form) -> None:
-        """Continue at the next readable record or at the end, and count the lost bytes."""
+        """Continue at the next readable record or at the end; count the skipped bytes."""
         damage_start = self._source.record
         has_more = skip_damage(self._source, form)
         self.stats.malformed += 1
@@ -227,7 +234,7 @@ class CaptureReader(ClosingContext):
 
     @contextmanager
     def _count_end(self) -> Iterator[None]:
-        """Close the file after the records were read, and count how it ended."""
+        """At the end of the block, close the file and record whether it was truncated."""
         try:
             yield
         except TruncatedError:
@@ -239,7 +246,7 @@ class CaptureReader(ClosingContext):
         self.stats.incomplete_fragments = self._fragments.dropped
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Count a packet, and return the datagram that it contains or completes."""
+        """Count a packet; return the datagram that it contains or completes, else None."""
         if isinstance(packet, NoPacketReason):
             if packet is NoPacketReason.MALFORMED:
                 self.stats.malformed += 1
@@ -279,13 +286,13 @@ class CaptureReader(ClosingContext):
 
 
 class StreamReader(CaptureReader):
-    """The packets of a captured byte stream, link type USER0 to USER15, as datagrams.
+    """Iterates over the packets of a captured byte stream, as datagrams.
 
-    Their sender and receiver are `UNKNOWN_ENDPOINT`.
+    The link type of the file is USER0 to USER15. Sender and receiver are `UNKNOWN_ENDPOINT`.
     """
 
     def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
-        """Return the content of the packet; a packet of another link type is only counted."""
+        """Count a packet and return its content; None for another link type."""
         if isinstance(packet, NoPacketReason):
             return None
         self.stats.packets += 1
@@ -304,7 +311,7 @@ def datagram_record(datagram: Datagram) -> bytes:
     """Return the pcap record of one datagram.
 
     Raises:
-        UsageError: as `datagram_frame`, and for a time outside the range of a record.
+        UsageError: if `datagram_frame` raises it, or for a time outside the range of a record.
     """
     return packet_record(datagram_frame(datagram), datagram.at)
 
@@ -313,7 +320,7 @@ def datagram_frame(datagram: Datagram) -> bytes:
     """Return one datagram as an Ethernet frame with IP and UDP headers, unfragmented.
 
     Raises:
-        UsageError: for too many bytes, an invalid address or an invalid port.
+        UsageError: if the payload is too long, or an address or port is invalid.
     """
     source, destination = _pack_endpoints(datagram.source, datagram.destination)
     limit = MAX_PAYLOAD_BYTES
@@ -321,13 +328,13 @@ def datagram_frame(datagram: Datagram) -> bytes:
         limit += _EXTRA_PAYLOAD_BYTES_IPV6
     if len(datagram.data) > limit:
         raise UsageError(
-            f"a datagram has {len(datagram.data)} bytes, and UDP carries at most {limit}"
+            f"a datagram has {len(datagram.data)} bytes, but UDP supports at most {limit}"
         )
     return build_udp_frame(datagram.data, source, destination)
 
 
 def is_stream_capture(head: bytes) -> bool:
-    """Return whether a capture begins with the private link type of a byte stream.
+    """Return whether a file is a capture of a byte stream, by its link type.
 
     Only little-endian files are recognised.
 
@@ -350,13 +357,16 @@ def is_stream_capture(head: bytes) -> bool:
 
 @lru_cache(maxsize=256)
 def _pack_endpoints(*endpoints: tuple[str, int]) -> list[tuple[bytes, int]]:
-    """Return packed addresses, all of 4 or all of 16 bytes, and ports."""
+    """Return (address as bytes, port) of each endpoint.
+
+    All addresses have 4 bytes, or all have 16 bytes.
+    """
     addresses = []
     for host, port in endpoints:
         try:
             addresses.append(ipaddress.ip_address(host).packed)
         except ValueError:
-            raise UsageError(f"{host!r} is not an IP address: a capture requires one") from None
+            raise UsageError(f"a capture requires an IP address, got {host!r}") from None
         if not 0 <= port < 1 << 16:
             raise UsageError(f"{port} is not a UDP port: expected 0 to 65535")
     if len({len(address) for address in addresses}) > 1:

@@ -1,15 +1,15 @@
 """Read and write the records of pcap and pcapng files.
 
-`PcapRecords` and `PcapngBlocks` read one record at a time. They also describe a record as a
-`RecordLayout`, from which `bulk` recognizes similar records without reading each. `seek_time`
-searches a file by capture time.
+`PcapRecords` and `PcapngBlocks` read one record at a time. They also return the `RecordLayout` of a
+record, with which `bulk` recognizes similar records without reading each. `seek_time` searches a
+file by capture time.
 
-Hostile input: `source` reads in bounded steps, and each iteration of a loop either advances or ends
-the reading.
+Malicious input cannot exhaust memory or time: `source` reads in steps of limited size, and each
+iteration of a loop either advances or ends the reading.
 
-Damaged input: an implausible length is accepted unless other records begin within the range that it
-covers. After a record that cannot be read, `skip_damage` continues at the next offset at which one
-record follows another.
+In damaged input, an implausible length is accepted unless other records begin within the record.
+After a record that cannot be read, `skip_damage` continues at the next offset at which a record
+begins that is followed by another.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -40,9 +40,9 @@ _PCAP = {  # magic: byte order, nanoseconds per unit of the fraction field
     NANOSECOND_MAGIC: ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-#: Header of a pcap file that is written, little-endian.
+#: Header of a pcap file to write, little-endian.
 _HEAD = struct.Struct("<4sHHiIII")
-#: Header of a record in it.
+#: Header of a record of a pcap file to write.
 _RECORD = struct.Struct("<IIII")
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
 _SECTION_KIND = int.from_bytes(_SECTION)
@@ -53,31 +53,31 @@ _SIMPLE_PACKET = 3
 ENHANCED_PACKET = 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _LAST_KIND = 10  # the largest block type of the draft, apart from the section header
-#: Options of an interface block.
+#: Code of an option of an interface block. The next constant is another code.
 _TIME_RESOLUTION = 9
 _TIME_OFFSET = 14
 
 MAX_BLOCK_BYTES = 1 << 20  # a packet with its options; longer blocks are skipped
-#: Number of offsets that one step of the search for the next record covers.
+#: Number of offsets that are checked in one step of the search for the next record.
 _STEP_BYTES = 1 << 16
-#: Number of bytes after each of these offsets that the search needs: a packet, its options and the
-#: next header.
+#: Number of bytes after each of these offsets that the check requires: a packet, its options and
+#: the header of the next packet.
 _REACH_BYTES = MAX_PACKET_BYTES + (1 << 12)
-#: `seek_time` stops at most this many bytes before the packet.
+#: Maximum distance in bytes from the position that `seek_time` finds to the packet.
 NEAR_BYTES = 1 << 21
-#: Largest plausible difference of the times of two adjacent packets: a day.
+#: Maximum plausible difference between the times of two consecutive packets: a day.
 _MAX_RECORD_STEP_S = 86_400
-#: Largest plausible difference of the times of any two packets of a file: a year.
+#: Maximum plausible difference between the times of any two packets of a file: a year.
 _MAX_FILE_SPAN_S = 31_536_000
 _MAX_INTERFACES = 1024
 _SECOND_NS = 1_000_000_000
-#: Latest time that `TimeEncoding.ns` converts. Records with later times are read one by
-#: one, so that no int64 overflows.
+#: Latest time that `TimeEncoding.ns` converts. Records with later times are read singly, so that no
+#: int64 overflows.
 _MAX_TIME_S = 4_000_000_000
 
 
 class DamagedRecordError(Exception):
-    """A record is invalid, and the start of the next one is unknown."""
+    """A record is invalid, and the start of the next record is unknown."""
 
 
 class CapturedPacket(NamedTuple):
@@ -85,9 +85,10 @@ class CapturedPacket(NamedTuple):
 
     Attributes:
         link: link-layer type.
-        at: capture time in ns since 1970, which fits an int64; 0 if the record has none.
-        data: the bytes in the file.
-        original: the length of the packet before the snap length cut it.
+        at: capture time in ns since 1970, in the range of int64; 0 if the record has no time.
+        data: the captured bytes.
+        original: length of the packet on the network; larger than that of `data` if the packet was
+            truncated at the snap length.
     """
 
     link: int
@@ -97,7 +98,7 @@ class CapturedPacket(NamedTuple):
 
 
 class NoPacketReason(Enum):
-    """The reason why a record yields no packet."""
+    """The reason why a record gives no packet."""
 
     NO_PACKET = 0
     MALFORMED = 1
@@ -110,14 +111,15 @@ def is_capture(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class TimeEncoding:
-    """The encoding of a capture time in two words of a record.
+    """How two words of a record encode a capture time.
 
     Attributes:
         word: NumPy type of the words, with the byte order.
-        high, low: indices of the two words in the record.
-        ticks: units per second, of `low` if `is_split`, else of the 64-bit number of both words.
-        is_split: whether `high` counts seconds and `low` the fraction.
-        offset: added to each time, ns.
+        high: index of the first word in the record: seconds, or the upper half of a 64-bit number.
+        low: index of the second word in the record: the fraction, or the lower half.
+        ticks: number of units per second, in which the fraction or the 64-bit number is given.
+        is_split: whether the words are seconds and a fraction, instead of a 64-bit number.
+        offset: offset to add to each time, ns.
     """
 
     word: str
@@ -132,13 +134,14 @@ class TimeEncoding:
         return self.ticks <= 9 * _SECOND_NS and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """Return the times of n records, and which of them are valid.
+        """Return the times of n records, and a mask of the valid times.
 
         Args:
             heads: the first bytes of each record, (n, size).
 
         Returns:
-            (n,) ns since 1970, and an (n,) mask of valid times; None if all are valid.
+            Times in ns since 1970, (n,); and a mask of the valid times, (n,), or None if all are
+            valid.
         """
         words = heads.view(self.word)
         high = words[:, self.high].astype(np.int64)
@@ -153,12 +156,12 @@ class TimeEncoding:
 
 
 class RecordLayout(NamedTuple):
-    """The layout of a packet record, as defined by the file format.
+    """The layout of a record with a packet.
 
     Attributes:
         head: number of bytes before the packet.
-        free: offsets of the header bytes that differ between records: the time.
-        uncut: offsets of the original length of the packet.
+        free: offsets of the header bytes that differ between records: the bytes of the time.
+        uncut: offsets of the bytes of the packet's original length.
         times: the encoding of the time.
         trailer: NumPy type of the word at the end that repeats the length, with the byte order;
             None if there is none.
@@ -177,7 +180,7 @@ class PcapRecords:
     Attributes:
         sections: always 0; only pcapng files have sections.
         order: the byte order of the file, as in `struct`.
-        link: its link-layer type.
+        link: link-layer type of the file.
     """
 
     sections = 0
@@ -192,22 +195,26 @@ class PcapRecords:
         self._began: int | None = None
 
     def reopen(self, source: BufferedInput) -> PcapRecords:
-        """Return a reader of the same format for another position in the file."""
+        """Return a reader of the same format for another source of the same file."""
         other = copy.copy(self)
         other._source = source
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the record at an offset; 0 if it is implausible or invalid.
+        """Return the length of the record at an offset; 0 for an implausible length.
 
         Args:
-            data: at least 16 bytes from the offset on.
+            data: a buffer with at least 16 bytes after the offset.
+            at: the offset.
         """
         captured, original = self._lengths.unpack_from(data, at + 8)
         return self._head.size + captured if self._is_sure(captured, original) else 0
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return the offset, type and value of both length fields of an uncut record."""
+        """Return (offset, type, value) of the length fields of a record of this length.
+
+        Both fields are read as one number. The packet is not truncated.
+        """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
 
@@ -220,13 +227,16 @@ class PcapRecords:
         """Read the next record and return its packet.
 
         Raises:
-            TruncatedError, DamagedRecordError: if the record at `source.record` cannot be read.
+            TruncatedError: if the input ends within the record.
+            DamagedRecordError: if the record is invalid.
         """
         head = self._source.peek(self._head.size)
         if len(head) < self._head.size:
             raise TruncatedError
         seconds, fraction, captured, original = self._head.unpack(head)
-        if captured > MAX_PACKET_BYTES or not any(head):  # a hole in a file reads as zeros
+        if captured > MAX_PACKET_BYTES or not any(
+            head
+        ):  # missing parts of a file are read as zeros
             raise DamagedRecordError
         if not self._is_sure(captured, original) and self._is_false(captured, original):
             raise DamagedRecordError
@@ -240,9 +250,9 @@ class PcapRecords:
         )
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a record may begin, or None.
+        """Return the first offset below `stop` at which a record may begin; None if none.
 
-        The record has to be followed by another record, or by the end of the input.
+        Another record, or the end of the input, must follow the record.
 
         Args:
             is_end: whether the input ends with `data`.
@@ -258,13 +268,15 @@ class PcapRecords:
             & (original[:stop] <= MAX_PACKET_BYTES)
             & (captured[:stop] > 0)
         )
-        places = np.flatnonzero(likely & (fractions[:stop] < _SECOND_NS // self._unit))
+        offsets = np.flatnonzero(likely & (fractions[:stop] < _SECOND_NS // self._unit))
         if self._began is not None:
-            places = places[abs(seconds[places].astype(np.int64) - self._began) <= _MAX_FILE_SPAN_S]
-        behind = places + self._head.size + captured[places]
-        right = (behind == len(data)) & (captured[places] == original[places]) & is_end
+            offsets = offsets[
+                abs(seconds[offsets].astype(np.int64) - self._began) <= _MAX_FILE_SPAN_S
+            ]
+        behind = offsets + self._head.size + captured[offsets]
+        right = (behind == len(data)) & (captured[offsets] == original[offsets]) & is_end
         followed = behind < count
-        before = places[followed]
+        before = offsets[followed]
         after = behind[followed]
         right[followed] = (
             (captured[after] <= original[after])
@@ -275,18 +287,21 @@ class PcapRecords:
             abs(seconds[after].astype(np.int64) - seconds[before]) <= _MAX_RECORD_STEP_S
         )
         if right.any():
-            return int(places[right.argmax()])
+            return int(offsets[right.argmax()])
         return None
 
     def _is_sure(self, captured: int, original: int) -> bool:
-        """Return whether two lengths agree: the packet is whole or cut at the snap length."""
+        """Return whether two lengths of a record are plausible.
+
+        The packet must be whole, or truncated at the snap length.
+        """
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
         """Return whether the length of a record is wrong.
 
-        It is wrong if neither a record nor the end of the input follows, and another record begins
-        before the end of the original packet.
+        The length is wrong if neither a record nor the end of the input follows the record, and if
+        another record begins within the original packet.
         """
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
@@ -319,20 +334,20 @@ class PcapngBlocks:
         self.sections = 0
         self.order = "<"
         self._interfaces: list[Interface] = []
-        self._knows_all = True  # no interface of the section was lost to damage
+        self._knows_all = True  # whether no interface of the section was lost by damage
 
     def reopen(self, source: BufferedInput) -> PcapngBlocks:
-        """Return a reader with the same interfaces for another position in the file."""
+        """Return a reader with the same interfaces for another source of the same file."""
         other = copy.copy(self)
         other._source = source
         other._interfaces = list(self._interfaces)
         return other
 
     def find_length(self, data: memoryview | bytes, at: int) -> int:
-        """Return the length of the block at an offset; 0 if only `read` can handle it.
+        """Return the length of the block at an offset; 0 if `read` must read the block.
 
-        It is 0 at the start of a section, for an invalid length, and for a block longer than
-        `MAX_BLOCK_BYTES`.
+        This is the case for the start of a section, for an invalid length, and for a block longer
+        than `MAX_BLOCK_BYTES`.
         """
         kind: int
         length: int
@@ -342,11 +357,11 @@ class PcapngBlocks:
         return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return the offset, type and value of the length field of a block."""
+        """Return (offset, type, value) of the length field of a block of this length."""
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
-        """Return the layout of a block; None if blocks of its type are read singly."""
+        """Return the layout of a block; None if blocks of its type must be read singly."""
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None
@@ -391,10 +406,10 @@ class PcapngBlocks:
         return NoPacketReason.NO_PACKET
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a block may begin, or None.
+        """Return the first offset below `stop` at which a block may begin; None if none.
 
-        If an interface block was lost, only the start of a section counts. Packets refer to
-        interfaces by number, so later packets would be assigned to wrong interfaces.
+        If an interface block was lost, only the start of a section is accepted. Packets refer to
+        interfaces by number, so packets before it would be assigned to wrong interfaces.
         """
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -404,21 +419,21 @@ class PcapngBlocks:
         words = np.ndarray((count + 8,), f"{self.order}u4", data, 0, (1,))
         kinds = words[:-8][:stop]
         lengths = words[4:-4][:stop]
-        places = np.flatnonzero(
+        offsets = np.flatnonzero(
             (kinds > 0) & (kinds <= _LAST_KIND) & (lengths >= 12) & (lengths <= _REACH_BYTES)
         )
-        ends = places + lengths[places]
-        places = places[ends <= len(data)]
+        ends = offsets + lengths[offsets]
+        offsets = offsets[ends <= len(data)]
         ends = ends[ends <= len(data)]
-        right = places[words[ends - 4] == lengths[places]].tolist()
+        right = offsets[words[ends - 4] == lengths[offsets]].tolist()
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
     def _is_false(self, kind: int, length: int) -> bool:
         """Return whether the length of a block is wrong.
 
-        It is wrong if it is impossible for the type of the block, or if the end of the block does
-        not repeat it. If the end cannot be checked, it is wrong if another block begins within the
-        block.
+        The length is wrong if it is impossible for the type of the block, or if the last word of
+        the block does not repeat it. If the last word cannot be read, the length is wrong if
+        another block begins within the block.
         """
         if not _is_possible_length(length) or (
             length > MAX_BLOCK_BYTES and kind in _PACKETS | {_INTERFACE}
@@ -431,7 +446,7 @@ class PcapngBlocks:
         return self.find_next_record(data[4:], size, is_end=True) is not None
 
 
-#: The reader of either format.
+#: The reader of the records of either format.
 Form = PcapRecords | PcapngBlocks
 
 
@@ -447,10 +462,10 @@ def make_record_reader(source: BufferedInput) -> Form:
 
 
 def skip_damage(source: BufferedInput, form: Form) -> bool:
-    """Advance to the next record after a damaged one.
+    """Advance to the next readable record after a damaged record.
 
     Returns:
-        False at the end of the input, if no record was found.
+        False if the input ends without another record.
     """
     source.skip(len(source.peek(1)))
     while data := source.peek(_STEP_BYTES + _REACH_BYTES):
@@ -464,19 +479,19 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 
 
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
-    """Seek to shortly before the first packet captured at a time or later.
+    """Seek to shortly before the first packet that was captured at a time or later.
 
     The position is at most `NEAR_BYTES` before the packet. The search assumes that packets are in
     the order of their times, and that all sections of a pcapng file have the interfaces of the
-    current section. It does not skip the start of a section, nor times that are years away, because
-    another section may encode times differently.
+    current section. Because another section may encode times differently, the search does not skip
+    the start of a section, or packets with times that are more than a year away.
 
     Args:
         at: ns since 1970.
 
-    Returns:
-        False if nothing was skipped, because the packet is not ahead, or the file is a pipe or
-        compressed. The position is then unchanged.
+            Returns:
+        False if the position is unchanged, because the packet is not further ahead, or the file is
+        a pipe or compressed.
     """
     here = low = source.offset
     high = source.size
@@ -499,9 +514,9 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
 
 
 def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[int, int] | None:
-    """Return the time and offset of the next packet with a time.
+    """Return the time and the offset of the next packet with a time.
 
-    Returns None if none begins before `stop`, or before the start of another section.
+    Returns None if no such packet begins before `stop` or before another section.
     """
     section = form.sections
     form = form.reopen(source)
@@ -522,7 +537,7 @@ def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[in
 def _is_possible_length(length: int) -> bool:
     """Return whether a block can have this length.
 
-    It is a multiple of 4, and at least the size of the header and the trailer.
+    The length must be a multiple of 4, and include at least a header and a trailer.
     """
     return length >= 12 and length % 4 == 0
 
@@ -551,7 +566,7 @@ def _interface(order: str, body: bytes) -> Interface:
 def _block_packet(
     order: str, kind: int, body: bytes, interfaces: list[Interface]
 ) -> CapturedPacket | None:
-    """Return the packet of a block, None if the block is invalid.
+    """Return the packet of a block; None if the block is invalid.
 
     A block is invalid if its lengths contradict each other, or if its interface is unknown.
     """
@@ -581,7 +596,7 @@ def capture_head(link: int) -> bytes:
     """Return the header of a pcap file: little-endian, with nanoseconds.
 
     Args:
-        link: the link type: `ip.ETHERNET` for datagrams, USER0 for bytes without a protocol header.
+        link: the link type: `ip.ETHERNET` for datagrams, USER0 for a byte stream.
     """
     return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, MAX_PACKET_BYTES, link)
 
@@ -594,7 +609,7 @@ def packet_record(data: bytes, at: int) -> bytes:
         at: capture time, ns since 1970.
 
     Raises:
-        UsageError: if a record cannot hold the packet or the time.
+        UsageError: if the packet is too long, or the time is out of range.
     """
     seconds, nanoseconds = divmod(at, _SECOND_NS)
     if not 0 <= seconds < 1 << 32:
@@ -608,17 +623,18 @@ def packet_record(data: bytes, at: int) -> bytes:
 def _refuse_size(data: bytes) -> None:
     if len(data) > MAX_PACKET_BYTES:
         raise UsageError(
-            f"a packet has {len(data)} bytes, and a record holds at most {MAX_PACKET_BYTES}"
+            f"a packet has {len(data)} bytes, but a record can contain at most {MAX_PACKET_BYTES}"
         )
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record at an offset of a written file.
+    """Return the length of the record at an offset of a piece of a written file.
 
-    At offset 0 this may be the file header instead.
+    If the piece begins with the file header, returns the length of the header at offset 0.
 
     Args:
-        data: a piece of the file; the first piece begins with the file header.
+        data: the piece.
+        at: the offset in the piece.
     """
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
@@ -631,7 +647,8 @@ class CaptureFormat(NamedTuple):
     Attributes:
         head: returns the file header for a link type.
         record: returns the record of a packet and its time in ns since 1970.
-        size: returns the length of the record or file header at an offset of a piece of the file.
+        size: takes a piece of the file and an offset, and returns the length of the record or file
+            header there.
     """
 
     head: Callable[[int], bytes]
@@ -640,7 +657,7 @@ class CaptureFormat(NamedTuple):
 
 
 def _pcapng_head(link: int) -> bytes:
-    """Return a section and an interface with times in nanoseconds; little-endian."""
+    """Return a section header and an interface with times in ns, little-endian."""
     section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
     return section + _block(
         _INTERFACE,
@@ -650,7 +667,7 @@ def _pcapng_head(link: int) -> bytes:
 
 def _pcapng_record(data: bytes, at: int) -> bytes:
     if not 0 <= at < 1 << 63:
-        raise UsageError(f"capture time {at} ns is negative: times count from 1970")
+        raise UsageError(f"capture time {at} ns is before 1970")
     _refuse_size(data)
     head = struct.pack("<IIIII", 0, at >> 32, at & 0xFFFFFFFF, len(data), len(data))
     return _block(ENHANCED_PACKET, head + data + bytes(-len(data) % 4))
@@ -661,7 +678,7 @@ def _block(kind: int, body: bytes) -> bytes:
     return struct.pack("<I", kind) + size + body + size
 
 
-#: Functions that write captures, by file suffix.
+#: File suffix -> the functions that write captures of this format.
 WRITINGS = {
     ".pcap": CaptureFormat(capture_head, packet_record, record_size),
     ".pcapng": CaptureFormat(

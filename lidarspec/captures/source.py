@@ -1,10 +1,11 @@
 """Read the bytes of a capture from a file or a pipe.
 
-Reads are done in bounded steps. The buffer grows with the bytes that have been read, never with a
-length field of the file, so a corrupt length cannot cause a large allocation.
+The size of each read is limited. The size of the buffer depends on the number of bytes that have
+been read, not on length fields of the file, so that a corrupt length cannot cause a large
+allocation.
 
-Callers can use the buffer without a copy. `BufferedInput.view` returns it as a read-only array, and
-`BufferedInput` does not write to that buffer again while the array, or a view of it, is alive.
+Callers can use the buffer without a copy: `BufferedInput.view` returns it as a read-only array. The
+buffer is not overwritten while this array, or a view of it, exists.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SourceError
 
-#: initial size of a buffer, and the largest step of `skip`.
+#: initial size of a buffer, and maximum number of bytes that `skip` reads at once.
 MIN_BUFFER_BYTES = 1 << 16
-#: bytes after the filled part that callers may read, with any value, so that they can compare
-#: records in words of several bytes.
+#: number of bytes after the filled part of a buffer that callers may read, so that they can compare
+#: words of several bytes at its end. The values of these bytes are undefined.
 SLACK_BYTES = 256
-#: the number of buffers with a view that are remembered for reuse.
+#: maximum number of buffers with a view that are kept for reuse.
 MAX_VIEWED_BUFFERS = 2
 
 
@@ -39,13 +40,13 @@ class BufferedInput:
     """A buffered reader of a file or pipe.
 
     Args:
-        largest: buffer size in bytes up to which the buffer grows if the file is that long. It
-            grows further only for a record that does not fit.
+        file: the open file or pipe.
+        largest: maximum size of the buffer in bytes. Only a longer record makes the buffer larger.
 
     Attributes:
-        storage: the current buffer; its last `SLACK_BYTES` are never filled.
+        storage: the current buffer. Its last `SLACK_BYTES` are never filled.
         at: offset of the next byte in `storage`.
-        record: file offset of the current record, set by `begin_record`.
+        record: file offset of the current record, which `begin_record` sets.
         offset: file offset of the next byte.
     """
 
@@ -61,7 +62,7 @@ class BufferedInput:
         self._adopt(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the state for pickling: the copy continues at the same offset."""
+        """Return the arguments for pickling; the copy continues at the same offset."""
         return _source_at, (self._file, self._largest, self.offset)
 
     @property
@@ -73,19 +74,19 @@ class BufferedInput:
     def offset(self) -> int:
         return self._bytes_dropped + self.at
 
-    def open_at(self, place: int) -> BufferedInput:
+    def open_at(self, offset: int) -> BufferedInput:
         """Return a second source of the same file that starts at a file offset.
 
-        Both sources share the file position: call `seek` on this one before it is used again.
+        Both sources share the position of the file, so call `seek` before using this source again.
         """
-        return _source_at(self._file, MIN_BUFFER_BYTES, place)
+        return _source_at(self._file, MIN_BUFFER_BYTES, offset)
 
-    def seek(self, place: int) -> None:
+    def seek(self, offset: int) -> None:
         """Continue at an offset of a seekable file."""
-        self._file.seek(place)
-        self._last_view = None  # the new buffer has not been lent
+        self._file.seek(offset)
+        self._last_view = None  # the new buffer has no view
         self._adopt(np.empty_like(self.storage), 0)
-        self.record = self._bytes_dropped = place
+        self.record = self._bytes_dropped = offset
 
     @property
     def size(self) -> int | None:
@@ -100,7 +101,7 @@ class BufferedInput:
     def peek(self, size: int) -> memoryview:
         """Return the next `size` bytes without consuming them.
 
-        At the end of the input it returns fewer.
+        At the end of the input, returns fewer bytes.
         """
         self._has(size)
         return self._data[self.at : self.at + size]
@@ -111,7 +112,9 @@ class BufferedInput:
         return self._has(1)
 
     def take(self, size: int) -> bytes:
-        """Return the next `size` bytes and advance; the caller limits `size`.
+        """Return the next `size` bytes, and advance.
+
+        The caller must limit `size`, because the buffer grows to it.
 
         Raises:
             TruncatedError: if fewer bytes are left.
@@ -137,14 +140,14 @@ class BufferedInput:
     def read_more(self) -> bool:
         """Read at least one more byte; return False at the end of the input.
 
-        The byte is added to the buffer. This can replace `storage` and reset `at`.
+        This may replace `storage` and change `at`.
         """
         return self._has(len(self._data) - self.at + 1)
 
     def view(self) -> NDArray[np.uint8]:
         """Return the bytes in the buffer, (n,), uint8, read-only.
 
-        The buffer is not reused while this array, or a view of it, is alive.
+        The buffer is not overwritten while this array, or a view of it, exists.
         """
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
@@ -170,9 +173,9 @@ class BufferedInput:
         return have >= size
 
     def _move_unread(self, have: int) -> None:
-        """Move the unread bytes to the start of a buffer that can be written.
+        """Move the unread bytes to the start of a buffer.
 
-        The buffer is the current one unless it was lent, or is too small.
+        This is the current buffer, unless it has a view or is too small.
         """
         size = len(self.storage) - SLACK_BYTES
         tail = self.storage[self.at : self.at + have]
@@ -209,18 +212,18 @@ class BufferedInput:
         self.at = 0
 
 
-def _source_at(file: BinaryIO, largest: int, place: int) -> BufferedInput:
+def _source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
     """Return a source of a seekable file that starts at an offset."""
-    file.seek(place)
+    file.seek(offset)
     source = BufferedInput(file, largest=largest)
-    source.record = source._bytes_dropped = place
+    source.record = source._bytes_dropped = offset
     return source
 
 
 def _read_into(file: BinaryIO) -> Callable[[memoryview], int | None]:
     """Return a function that reads the available bytes into a buffer.
 
-    `readinto` of a buffered pipe would block until the buffer is full; `readinto1` does not.
+    For a buffered pipe this is `readinto1`, because `readinto` blocks until the buffer is full.
     """
     if isinstance(file, io.BufferedIOBase):
         return file.readinto1

@@ -1,6 +1,6 @@
 """Diagnose a source without data, or without valid data.
 
-Each finding has the command that fixes the problem, if there is a command for it.
+A finding suggests the command that fixes the problem, unless no command can fix it.
 """
 
 from __future__ import annotations
@@ -109,11 +109,11 @@ def _examine_file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     if os.path.exists(path):
         name = path
     else:
-        name = path.rpartition("?")[0]  # the option after it selects a sender
+        name = path.rpartition("?")[0]  # without the option that selects a sender
     if not os.path.exists(name):
         yield Diagnosis(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
-        yield Diagnosis(False, f"{path}: no permission to read it", f"sudo chmod a+r {path}")
+        yield Diagnosis(False, f"no permission to read {path}", f"sudo chmod a+r {path}")
     elif os.path.getsize(name) == 0:
         yield Diagnosis(False, f"{path} is empty")
     else:
@@ -136,7 +136,7 @@ def _examine_serial(
     if os.name == "posix" and not os.path.exists(port):
         yield Diagnosis(
             False,
-            f"{port}: no such port; check that it is plugged in, and its driver",
+            f"{port}: no such port; check that the device is connected and its driver is loaded",
             "lidarspec ports",
         )
         return
@@ -149,30 +149,30 @@ def _examine_serial(
 
 
 def _check_permission(port: str) -> Iterator[Diagnosis]:
-    """Yield a problem if this user may not open a serial port."""
+    """Yield a finding if the user has no permission to open a serial port."""
     if ports.is_allowed(port):
         return
     group = ports.find_group(port)
-    text = f"{port}: no permission to open it"
+    text = f"no permission to open {port}"
     if group:
         yield Diagnosis(
             False,
-            f"{text}; members of the group {group} have it, from their next login",
+            f"{text}; members of the group {group} may open it, after they log in again",
             f"sudo usermod -aG {group} $USER",
         )
     else:
-        yield Diagnosis(False, f"{text}; only root has it", _udev_rule_command(port))
+        yield Diagnosis(False, f"{text}; only root may open it", _udev_rule_command(port))
 
 
 def _udev_rule_command(port: str) -> str:
-    """Return a command for a udev rule that lets every user open ports of this kind."""
+    """Return a command that adds a udev rule, so that all users may open such ports."""
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
 
 
 def _check_serial_users(port: str) -> Iterator[Diagnosis]:
-    """Yield a problem for each other program that has a serial port open."""
+    """Yield a finding for each other program that has opened a serial port."""
     for user in ports.find_users(port):
         yield Diagnosis(False, f"{port} is in use by {user}", f"kill {user.pid}")
 
@@ -200,7 +200,10 @@ def _examine_udp(
 
 
 def _select_udp_ports(address: SourceAddress, sensor: Sensor | None) -> list[int]:
-    """Return the ports of a SOURCE, of the sensor, or of all installed sensors."""
+    """Return the UDP ports that a SOURCE names.
+
+    If it names none, returns the ports of the sensor, or of all installed sensors.
+    """
     port = address.host_and_port()[1]
     text = address.options.get("port", "")
     if text:
@@ -214,7 +217,7 @@ def _select_udp_ports(address: SourceAddress, sensor: Sensor | None) -> list[int
 
 
 def _check_udp_users(number: int) -> Iterator[Diagnosis]:
-    """Yield a problem for each other program that has a UDP port open."""
+    """Yield a finding for each other program that has opened a UDP port."""
     users = ports.find_udp_users(number)
     if users is None:
         return
@@ -229,7 +232,7 @@ def _check_udp_users(number: int) -> Iterator[Diagnosis]:
 
 
 def _check_buffer() -> Iterator[Diagnosis]:
-    """Yield a problem if the system limits the receive buffer too much."""
+    """Yield a finding if the system allows only a small receive buffer."""
     limit = Path("/proc/sys/net/core/rmem_max")
     try:
         granted = int(limit.read_text(encoding="ascii"))
@@ -256,7 +259,7 @@ def _check_interfaces(
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
-        text = f"this receives only packets to {host}; the sensor may send to another address"
+        text = f"only packets to {host} are received; the sensor may send to another address"
         yield Diagnosis(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
         text = (
@@ -306,7 +309,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
 
 
 def _check_single_sender(source: str, verdicts: Sequence[Verdict]) -> Iterator[Diagnosis]:
-    """Yield a problem if several senders send frames of one sensor."""
+    """Yield a finding if several senders send frames of the same sensor."""
     by_sensor: dict[str, list[str]] = {}
     for verdict in verdicts:
         if verdict.scores and verdict.sample.sender:
@@ -317,13 +320,13 @@ def _check_single_sender(source: str, verdicts: Sequence[Verdict]) -> Iterator[D
             chosen = quote(with_option(source, "src", senders[0]))
             yield Diagnosis(
                 False,
-                f"{' and '.join(senders)} all send frames of {sensor_id}: choose one",
+                f"{' and '.join(senders)} all send frames of {sensor_id}: choose one sender",
                 f"lidarspec view {chosen} -s {sensor_id}",
             )
 
 
 def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
-    """Return the finding about the data of one sender.
+    """Return the finding about the data that one sender has sent.
 
     Args:
         source: the source, for suggested commands.
@@ -332,7 +335,7 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
     """
     sample = verdict.sample
     ids = [score.sensor.id for score in verdict.scores]
-    # id of each possible sensor -> the evidence for it
+    # id of each possible sensor -> evidence
     possible = {score.sensor.id: score.why for score in verdict.candidates} or dict(verdict.others)
     quoted = quote(source)
     if not sample.size and sample.warnings:
@@ -345,22 +348,22 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
         return Diagnosis(False, verdict.fault, f"lidarspec crc {quoted}")
     if not verdict.scores:
         if sample.baud is not None and len(list_bauds()) > 1:
-            at = " at any baud rate"
+            rate = " at any baud rate"
         else:
-            at = ""
+            rate = ""
         return Diagnosis(
             False,
-            f"{sample.size} bytes received, but no frame of an installed sensor{at}",
+            f"{sample.size} bytes received, but no frame of an installed sensor{rate}",
             f"lidarspec detect {quoted}",
         )
     if sample.baud is not None:
-        at = f" at {sample.baud} baud"
+        rate = f" at {sample.baud} baud"
     else:
-        at = ""
+        rate = ""
     if sensor is not None and sensor.id not in ids:
         return Diagnosis(
             False,
-            f"received frames of {ids[0]}{at}, not of {sensor.id}",
+            f"received frames of {ids[0]}{rate}, not of {sensor.id}",
             f"lidarspec {verb_to_show(verdict.scores[0].sensor)} {quoted} -s {ids[0]}",
         )
     name = sensor.id if sensor is not None else ids[0]
@@ -370,14 +373,14 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
             command = f"lidarspec {verb_to_show(verdict.candidates[0].sensor)} {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
-        return Diagnosis(False, f"received frames of {other} ({why}){at}, not of {name}", command)
+        return Diagnosis(False, f"received frames of {other} ({why}){rate}, not of {name}", command)
     score = next(score for score in verdict.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if sample.baud is not None and link and sample.baud not in link.bauds:
         again = quote(with_option(source, "baud", sample.baud))
         return Diagnosis(
             False,
-            f"{name} sends{at}, but {link.baud} is declared",
+            f"{name} sends{rate}, but its declared rate is {link.baud} baud",
             f"lidarspec {verb_to_show(score.sensor)} {again} -s {name}",
         )
     share = score.share
@@ -388,15 +391,15 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
     if share < CLEAR_SHARE:
         return Diagnosis(
             False,
-            f"{name} sends{at}, but {1 - score.share:.0%} of the bytes are outside frames: check"
-            " cable, ground and baud rate",
+            f"{name} sends{rate}, but {1 - score.share:.0%} of the bytes are outside frames: check"
+            " the cable, the ground connection and the baud rate",
         )
     device = "".join(
         f", {role} {text}" for role, text in read_info(score.sensor, score.found).items()
     )
     return Diagnosis(
         True,
-        f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"
+        f"{name} sends{rate}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"
         f" frames{printable(device)}",
     )
 
@@ -412,8 +415,8 @@ def _diagnose_silence(source: str, sensor: Sensor | None) -> Diagnosis:
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = (
-            "no data received: start the sensor, or check its power, and that its transmit line is"
-            " connected to our receive line"
+            "no data received: start the sensor, or check its power, and that its TX line is"
+            " connected to the RX line of this computer"
         )
         return Diagnosis(False, text, f"lidarspec detect {quoted} --start", is_silence=True)
     return Diagnosis(False, "no data received within the listening time", is_silence=True)

@@ -1,16 +1,16 @@
 """Identify the installed sensor that sent some bytes.
 
-`rate_sensors` decodes the bytes with each installed sensor, and rates a sensor by the share of the
-bytes in frames with a valid checksum and plausible values. `identify_sample` selects the best
-sensor.
+`rate_sensors` decodes the bytes with each installed sensor. The score of a sensor is the share of
+the bytes that are in frames with a valid checksum and plausible values. `identify_sample` selects
+the sensor with the best score.
 
 `distinguish` decides between related models with the same frames. It uses packets that only one
-model sends, the pace of the clock in the packets, and the model name in a frame, as a text or as a
-documented value ("0x22 NAME"). If these do not decide, all related models remain possible,
-including models that are not installed.
+model sends, the clock step per packet, and the model name in a frame, which is a text or a
+documented value ("0x22 NAME"). If this evidence is not sufficient, all related models remain
+possible, including models that are not installed.
 
-For a single frame, `find_fitting_sensors` returns the sensors with a frame type that matches it
-exactly, and `find_nearest_fault` the error of the sensor that parsed most of it.
+For a single frame, `find_fitting_sensors` returns the sensors with a frame type that matches the
+bytes exactly. `find_nearest_fault` returns the error of the sensor that parsed most of the bytes.
 """
 
 from __future__ import annotations
@@ -52,21 +52,21 @@ from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, open_transport, resolve
 from lidarspec.transports.protocol import no_bytes
 
-#: Relative tolerance of the pace of a clock.
+#: Relative tolerance of the clock step per packet.
 PACE_TOLERANCE = 0.03
-#: Number of frames of a type that are searched for the name of the model.
+#: Maximum number of frames to read the model name from.
 MAX_NAMED_FRAMES = 3
-#: Number of packets that are simulated to find the pace of a sensor's clock.
+#: Number of packets to simulate, to find the clock step per packet of a sensor.
 SIMULATED_PACKETS = 64
-#: A value and its meaning in the documentation of a field.
+#: Matches a value and its meaning in the documentation of a field.
 _DOCUMENTED_VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
-#: Maximum number of bytes in an error.
+#: Maximum number of bytes to show in an error.
 MAX_SHOWN_BYTES = 16
-#: A sensor fits if at least this share of the bytes is in its frames.
+#: A sensor fits if at least this share of the bytes is in its frames, from 0 to 1.
 FITTING_SHARE = 0.2
 #: Shares that differ by at most this value are equally good.
 EQUAL_SHARE_TOLERANCE = 0.01
-#: If this share of the bytes is in a sensor's frames, the sensor is certain.
+#: A sensor is certain if at least this share of the bytes is in its frames, from 0 to 1.
 CLEAR_SHARE = 0.9
 #: Minimum number of data frames for a match without valid checksums, which may be coincidence.
 MIN_UNCHECKED_FRAMES = 3
@@ -76,10 +76,10 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        candidates: the candidates that may have sent the frames: id -> evidence; "" if there is no
+        candidates: id of each candidate that may have sent the frames -> evidence; "" for no
             evidence.
-        others: related models without an installed plugin that may have sent the frames: id ->
-            difference. If `candidates` is empty, one of these models has sent them.
+        others: id of each related model without an installed plugin that may have sent the frames
+            -> its difference. If `candidates` is empty, one of these models has sent the frames.
     """
 
     candidates: dict[str, str]
@@ -89,7 +89,8 @@ class Distinction(NamedTuple):
 def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Found]]) -> Distinction:
     """Decide which of several sensors with the same data frames sent some frames.
 
-    Packets that only one model sends decide first, then the pace of the clock, then model names.
+    The criteria are, in this order: packets that only one model sends, the clock step per packet,
+    and model names.
 
     Args:
         candidates: sensors that decode the same data frames.
@@ -126,7 +127,7 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
 
 def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return the evidence that another model sent some frames; "" if there is none."""
-    relatives = map(registry().find, sensor.relatives)  # loads only their plugins
+    relatives = map(registry().find, sensor.relatives)  # loads only the plugins of these models
     models = [sensor, *(relative for relative in relatives if relative is not None)]
     result = distinguish(models, {model.id: frames for model in models})
     if sensor.id not in result.candidates:
@@ -145,9 +146,9 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the related models that must have sent the frames: id -> difference.
+    """Return {id: difference} of the related models that must have sent the frames.
 
-    More than half of the packets have a property that only this model has.
+    More than half of the packets must have a property that only this model has.
     """
     distinct_relatives = {
         name: relative
@@ -175,7 +176,7 @@ def _keep_matching(
     match: Callable[[Sensor, Sequence[Found]], str],
     frames: Mapping[str, Sequence[Found]],
 ) -> dict[str, str]:
-    """Return the sensors that match by one criterion: id -> evidence.
+    """Return {id: evidence} of the sensors that match by one criterion.
 
     Args:
         candidates: the possible sensors.
@@ -183,7 +184,8 @@ def _keep_matching(
         frames: id of each candidate -> its frames.
 
     Returns:
-        An empty dict if no sensor matches, or if several sensors match and no sensor does not.
+        An empty dict if the criterion does not distinguish the sensors: none of them matches, or
+        all of several do.
     """
     if len(candidates) == 1 and not candidates[0].relatives:
         return {}
@@ -198,7 +200,7 @@ def _keep_matching(
 
 
 def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return a text if the clock in the frames has the pace of a sensor, else ""."""
+    """Return the evidence that the clock in the frames matches a sensor, or ""."""
     if not sensor.has_points:
         return ""
     data = [item for item in frames if item.frame == sensor.data_frame]
@@ -220,12 +222,12 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
     if expected is None:
         return ""
     if sensor.datagrams:
-        # Lost, repeated and reordered datagrams leave the median of the steps unchanged.
+        # Lost, repeated and reordered datagrams hardly change the median of the steps.
         step = float(np.median(np.diff(np.sort(packets.time_ns))))
         uncertainty = 0.0
     else:
-        # The clock may be coarse, which requires a mean. In a stream, gaps in the offsets show
-        # where frames were lost, and these steps are omitted.
+        # The clock may be coarse, so the mean of the steps is used. Steps over gaps in the stream
+        # are omitted, because frames were lost there.
         follows = np.array(
             [
                 after.offset == item.offset + len(item.data)
@@ -237,7 +239,7 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
         if len(steps) < 2:
             return ""
         step = float(steps.mean())
-        # The error of the mean, from the spread of the steps.
+        # The error of the mean, estimated from the deviations of the steps.
         uncertainty = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
     if abs(step - expected) > PACE_TOLERANCE * expected + uncertainty:
         return ""
@@ -249,7 +251,7 @@ def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
     """Return the clock step per packet of the simulated sensor, ns; None if unknown.
 
     Args:
-        sensor_id: part of the key of the cache.
+        sensor_id: id of the sensor; part of the key of the cache.
         sensor: the sensor.
     """
     try:
@@ -263,12 +265,12 @@ def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
 
 
 def _evaluate_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
-    """Return the median of the declared clock steps per packet, ns."""
+    """Return the median of the clock steps per packet that a sensor declares, ns."""
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
 def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return a text if the frames name the model of a sensor, else ""."""
+    """Return the evidence that the frames name the model of a sensor, or ""."""
     return next(
         (
             f"{sensor.info['model']} is {text}"
@@ -280,7 +282,7 @@ def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _read_model_names(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return the model names in the first frames with the model field."""
+    """Return the model names in the first frames with the field `info["model"]`."""
     frame, _, path = sensor.info.get("model", "").partition(".")
     named_frames = (item for item in frames if item.frame == frame)
     names = []
@@ -296,7 +298,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
-        Role -> text, for example "serial" -> "A1234"; numbers have a unit.
+        Role -> text, for example "serial" -> "A1234". Numbers are followed by their unit.
     """
     last = {item.frame: item for item in frames}
     texts = dict[str, str]()
@@ -324,8 +326,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
 def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
     """Return the raw value and the description of a field.
 
-    If the field is in repeated parts, the value of the first part with the field is returned; "" if
-    no part has it.
+    If the field is in repeated parts, returns the value in the first part that has it, or "".
     """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
@@ -342,7 +343,7 @@ def _get_nested(parsed: Any, path: str) -> Any:
 
 
 def _describe_value(value: Any, info: FieldInfo) -> str:
-    """Return the text in a field, or the documented meaning of its value, or ""."""
+    """Return the text in a field, or the documented meaning of its number; else ""."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
     meanings = {
@@ -363,9 +364,9 @@ class Score:
     Attributes:
         sensor: the sensor.
         share: the share of the bytes that are in frames of the sensor.
-        data_frames: number of data frames.
-        found: all frames.
-        why: further evidence for this sensor; "" if there is none.
+        data_frames: number of decoded data frames.
+        found: all decoded frames.
+        why: further evidence for this sensor; "" for none.
     """
 
     sensor: Sensor
@@ -383,9 +384,10 @@ class Verdict:
         sample: the bytes.
         scores: all sensors that fit, best first.
         candidates: the sensors that remain possible after comparing related models.
-        others: possible related models without an installed plugin: id -> difference. If
+        others: id of each possible related model without an installed plugin -> its difference. If
             `candidates` is empty, one of these models has sent the bytes.
-        fault: a text if the frames fit a sensor except for their checksums; otherwise "".
+        fault: description of the fault if frames match a sensor except for their checksums; else
+            "".
     """
 
     sample: SampleBytes
@@ -403,7 +405,7 @@ class Verdict:
 
     @property
     def is_clear(self) -> bool:
-        """Whether nearly all bytes are in frames, so that the baud rate is right."""
+        """Whether nearly all bytes are in frames, so that the baud rate is certain."""
         if not self.scores:
             return False
         best = self.scores[0]
@@ -432,10 +434,10 @@ def _list_sensors_with_frames() -> list[Sensor]:
 
 
 def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Return a text if frames fit a sensor, but all their checksums are invalid.
+    """Return a text if frames match a sensor, but all their checksums are invalid.
 
     Returns:
-        The text, with a checksum that fits; "" if the bytes are not of this kind.
+        The text, with a checksum algorithm that fits; "" for any other bytes.
     """
     unchecked = _score_each(
         _list_sensors_with_frames(),
@@ -453,12 +455,12 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     frames = [item.data for item in matches[0].found if item.frame == name]
     ids = " or ".join(score.sensor.id for score in matches)
     text = (
-        f"{len(frames)} {name} frames match {ids} in constants, lengths and rhythm, but all their"
+        f"{len(frames)} {name} frames match {ids} in constants and lengths, but all their"
         " checksums are wrong"
     )
     match = next(iter(search(frames, quick=True)), None)
     if match is None:
-        return f"{text}; no other checksum found at the usual places"
+        return f"{text}; no other checksum algorithm was found"
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     where = (
@@ -472,22 +474,22 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the stored instead of the computed checksums, so that all are valid."""
+    """Return the stored checksums as the computed checksums, so that all are valid."""
     return seal.load_stored(rows)
 
 
 def _score_each(
     candidates: Sequence[Sensor], rate: Callable[[Sensor], Score | None]
 ) -> list[Score]:
-    """Return the scores of the sensors that have one.
+    """Return the scores of the sensors that fit.
 
-    Sensors with identical frames are decoded only once.
+    If several sensors have identical frames, the bytes are decoded only once.
 
     Args:
         candidates: the sensors.
-        rate: returns the score of a sensor; None if it does not fit.
+        rate: returns the score of a sensor; None if the sensor does not fit.
     """
-    shared: dict[object, Score | None] = {}  # by identity of the frames, and by id of the sensor
+    shared: dict[object, Score | None] = {}  # key: identity of the frames, and id of the sensor
     for sensor in candidates:
         frames = (
             sensor.fillers,
@@ -512,7 +514,7 @@ def _score(
     """Return the score of a sensor; None if the bytes contain no data frame.
 
     Args:
-        sums: computes checksums; None for the declared algorithms.
+        sums: computes checksums; None to use the declared algorithms.
     """
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
@@ -531,10 +533,10 @@ def _score(
 
 
 def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """Return the score of a sensor as if the frame before its data had been received.
+    """Return the score of a sensor as if the reply before its data had been received.
 
-    Some data frames are valid only after another frame, for example a reply. If there are several,
-    the best score is returned. None if the sensor has no data frame of this kind, or none fits.
+    Some data frames are valid only after another frame, such as a reply. If the sensor has several
+    such data frames, returns the best score. Returns None if it has none, or if none fits.
     """
     names = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scores = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in names]
@@ -546,7 +548,11 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
 
 
 def identify_sample(sample: SampleBytes) -> Verdict:
-    """Identify the sensor by frames, then by related models, then by the baud rate."""
+    """Identify the sensor that sent some bytes.
+
+    The criteria are, in this order: valid frames, differences between related models, and the baud
+    rate.
+    """
     fitting = [
         score
         for score in rate_sensors(sample.chunks, datagrams=sample.datagrams)
@@ -579,7 +585,7 @@ def identify_sample(sample: SampleBytes) -> Verdict:
         )
         for score in possible
     ]
-    # List the vendor of most of these sensors first, because it is the most likely vendor.
+    # Sensors of the vendor with the most candidates are first, because it is the likeliest vendor.
     vendors = [score.sensor.vendor for score in possible]
     possible.sort(key=lambda score: (-vendors.count(score.sensor.vendor), score.sensor.id))
     possible_ids = {score.sensor.id for score in possible}
@@ -593,9 +599,9 @@ def identify_senders(
     seconds: float = LISTEN_S,
     on_progress: Callable[[str], None] = ignore_progress,
 ) -> list[Verdict]:
-    """Identify the sensors that send to a source; return one verdict for each sender.
+    """Identify the sensors of a source; return one verdict for each sender.
 
-    For a serial port, only the verdict of the baud rate that fits best is returned.
+    For a serial port, returns only the verdict for the baud rate that fits best.
 
     Args:
         source: the source.
@@ -628,7 +634,8 @@ def select_best(verdicts: Sequence[Verdict]) -> Verdict:
 def detect(source: str | Path) -> Sensor:
     """Return the installed sensor that sends to a source.
 
-    If the source declares its sensor, as a recording does, its bytes are not examined.
+    If the source declares its sensor, for example in the header of a recording, its bytes are not
+    examined.
 
     Raises:
         CommandError: if a live source sends nothing.
@@ -655,12 +662,13 @@ def detect(source: str | Path) -> Sensor:
             if verdict.sensor
         )
         raise UsageError(
-            f"{source}: several sensors send: {listed}; choose one with ?src=ADDRESS and -s"
+            f"{source}: received data from several sensors: {listed}; choose one with ?src=ADDRESS"
+            " and -s"
         )
     if fitting[0].sensor is None:
         example = format_sensor_options(fitting[0].candidates[0].sensor)
         raise UsageError(
-            f"{source}: {', '.join(list_candidates(fitting[0]))} send the same frames; name one,"
+            f"{source}: {', '.join(list_candidates(fitting[0]))} send the same frames; choose one,"
             f" such as {example}"
         )
     return fitting[0].sensor
@@ -684,7 +692,7 @@ def verb_to_show(sensor: Sensor) -> str:
 
 
 def list_candidates(verdict: Verdict) -> list[str]:
-    """Return the ids of all possible sensors; ids without a plugin are marked."""
+    """Return the ids of all possible sensors, marked if they are not installed."""
     return [
         *(score.sensor.id for score in verdict.candidates),
         *(f"{name} (not installed)" for name in verdict.others),
@@ -692,7 +700,7 @@ def list_candidates(verdict: Verdict) -> list[str]:
 
 
 def describe_unsupported_models(verdict: Verdict) -> str:
-    """Return a message for frames of related models without an installed plugin."""
+    """Return a message for frames of models without an installed plugin."""
     return (
         " or ".join(f"these are frames of {name} ({why})" for name, why in verdict.others.items())
         + ", which no installed plugin supports"
@@ -700,9 +708,9 @@ def describe_unsupported_models(verdict: Verdict) -> str:
 
 
 def find_declared_sensor(source: str | Path) -> Sensor | None:
-    """Return the sensor that a source declares; None if it declares none.
+    """Return the sensor that a source declares; None if it declares no sensor.
 
-    Devices of `lidarspec.toml`, recordings and simulated sources can declare a sensor.
+    A device of `lidarspec.toml`, a recording and a simulated source can declare one.
 
     Raises:
         UsageError: for standard input.
@@ -730,7 +738,7 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
 
 
 def find_simulated_sensor(source: str | Path) -> Sensor | None:
-    """Return the sensor of a source "sim:ID"; None for all other sources."""
+    """Return the sensor of a source "sim:ID"; None for any other source."""
     address = live_address(source)
     if address is None or address.scheme != "sim" or not address.location:
         return None
@@ -738,7 +746,7 @@ def find_simulated_sensor(source: str | Path) -> Sensor | None:
 
 
 def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:
-    """Return the error for a source if no sensor fits."""
+    """Return the error for a source that no installed sensor fits."""
     largest = max(
         (verdict.sample for verdict in verdicts),
         key=lambda sample: sample.size,
@@ -762,14 +770,14 @@ def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 
-#: Bytes resemble a frame type if at least this number of constant bits is equal.
+#: Minimum number of equal constant bits for bytes to resemble a frame type.
 MIN_CONSTANT_BITS = 8
 
 
 def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     """Return the installed sensors that fit some bytes, best first.
 
-    If all bytes together are exactly one frame, only the sensors with this frame are returned.
+    If all bytes together are exactly one frame, returns only the sensors with this frame.
     """
     installed = list(sensors().values())
     data = b"".join(chunks)
@@ -791,7 +799,7 @@ def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Se
 def find_nearest_fault(data: bytes) -> WireError | None:
     """Return the error of the installed sensor that parsed most of an invalid frame.
 
-    None if no sensor has a frame that begins with the same bytes.
+    Returns None if no sensor has a frame that begins like the bytes.
     """
     errors = []
     for sensor in sensors().values():
@@ -824,9 +832,10 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
 
 
 def _begins_like_frame(fault: WireError) -> bool:
-    """Return whether invalid bytes have the constant bits at the start of a frame.
+    """Return whether invalid bytes begin with the constant bits of a frame type.
 
-    At least `MIN_CONSTANT_BITS` are required, because fewer bits may be equal by coincidence.
+    The frame type must have at least `MIN_CONSTANT_BITS` there, because fewer bits may be equal by
+    coincidence.
     """
     if not fault.frame:
         return False

@@ -1,8 +1,8 @@
 """Read sample bytes from a source, to identify the sensor that sent them.
 
-`read_samples` reads the beginning of a file, or listens to a live source for about a second. Some
-sensors send nothing until they are started: `probe` sends their start commands and records the
-replies.
+`read_samples` reads the beginning of a file, or listens to a live source for about a second. For
+sensors that send nothing until they are started, `probe` sends the start commands and reads the
+data that follows.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, open_live, open_transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
-#: maximum number of datagrams that are read from a file.
+#: maximum number of datagrams to read from a file.
 MAX_FILE_DATAGRAMS = 400
-#: listening to a live source stops after this number of bytes.
+#: number of bytes after which listening to a live source stops.
 ENOUGH_BYTES = 1 << 14
 #: time to listen to a live source.
 LISTEN_S = 1.2
 #: maximum duration of one read while listening.
 LISTEN_READ_S = 0.1
-#: time to wait for data after a device has replied; its motor may have to start.
+#: time to wait for data after a device has replied to a start command. Its motor may need time.
 DATA_TIMEOUT_S = 4.0
 #: time to wait for data if a device has not replied.
 UNCONFIRMED_DATA_TIMEOUT_S = 1.0
-#: maximum duration of one read while probing; the line is idle if nothing arrives.
+#: maximum duration of one read while probing. If nothing arrives in this time, the line is idle.
 PROBE_READ_S = 0.05
 #: time to wait for replies to the stop commands.
 STOP_TIMEOUT_S = 2.0
-#: baud rate for a pseudo-terminal, which ignores it, and for examples.
+#: baud rate for a pseudo-terminal, which ignores it, and for examples in messages.
 ANY_BAUD = 115_200
-#: UDP port for an example.
+#: UDP port for examples in messages.
 EXAMPLE_PORT = 2368
 
 
@@ -67,7 +67,7 @@ def list_udp_ports() -> list[int]:
 
 
 def ignore_progress(_: str) -> None:
-    """Do nothing; the default of `read_samples(on_progress=...)`."""
+    """Do nothing. This is the default of `read_samples(on_progress=...)`."""
 
 
 def read_samples(
@@ -78,9 +78,9 @@ def read_samples(
 ) -> Iterator[SampleBytes]:
     """Yield the bytes of each sender of a source.
 
-    A serial port without a baud rate is tried at each rate that installed sensors declare. If it
-    is silent at the most common, the lowest and the highest rate, the other rates are not tried,
-    because data that is sent at another rate arrives as invalid bytes, not as silence.
+    If the source is a serial port without a baud rate, each rate that installed sensors declare is
+    tried. If nothing is received at the most common, the lowest and the highest rate, the other
+    rates are not tried: data that is sent at another rate is received as invalid bytes.
 
     Args:
         source: the source.
@@ -88,7 +88,7 @@ def read_samples(
         on_progress: called with a description of the source before each attempt.
 
     Raises:
-        SourceError: if the source cannot be opened, or if it needs a baud rate or port and no
+        SourceError: if the source cannot be opened, or if it has no baud rate or port and no
             installed sensor declares one.
     """
     text = str(source)
@@ -102,7 +102,7 @@ def read_samples(
         if not rates:
             example = with_option(text, "baud", ANY_BAUD)
             raise SourceError(
-                f"{text}: no installed sensor declares a baud rate; name one: {example}"
+                f"{text}: no installed sensor declares a baud rate; add one: {example}"
             )
         first_rates = list(dict.fromkeys([rates[0], min(rates), max(rates)]))
         other_rates = [baud for baud in rates if baud not in first_rates]
@@ -123,7 +123,7 @@ def read_samples(
         ports = ",".join(map(str, list_udp_ports()))
         if not ports:
             example = with_option(text, "port", EXAMPLE_PORT)
-            raise SourceError(f"{text}: no installed sensor declares a port; name one: {example}")
+            raise SourceError(f"{text}: no installed sensor declares a port; add one: {example}")
         yield from _read_sample(with_option(text, "port", ports), seconds, None, text)
     else:
         baud = None
@@ -154,7 +154,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
 
 
 def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a warning if datagrams arrived from other senders only."""
+    """Return a warning if all datagrams came from other senders; empty otherwise."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)
@@ -165,7 +165,7 @@ def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
 def _split_by_sender(sample: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
     """Yield a copy of `sample` for each sender, with the chunks of this sender.
 
-    If there is only one sender, `sender` is "".
+    With only one sender, the attribute `sender` is "".
     """
     names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
     by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
@@ -212,7 +212,7 @@ def _read_chunks(opened: LiveTransport, seconds: float) -> list[Chunk]:
 
 
 def list_start_required() -> list[Sensor]:
-    """Return the installed serial sensors that send nothing before a start command."""
+    """Return the installed serial sensors that send no data before a start command."""
     started = [
         sensor
         for sensor in sensors().values()
@@ -222,10 +222,10 @@ def list_start_required() -> list[Sensor]:
 
 
 def probe(source: str | Path) -> Iterator[SampleBytes]:
-    """Start each sensor that needs a start command, and yield the bytes that arrive.
+    """Start each sensor that needs a start command, and yield the received bytes.
 
-    Each baud rate of the sensor is tried, and its stop commands are sent afterwards. Only serial
-    sources are probed.
+    Each baud rate of a sensor is tried. The stop commands of the sensor are sent afterwards. Only
+    serial ports are probed; for any other source, nothing is yielded.
 
     Raises:
         SourceError: if the port cannot be opened.
@@ -263,7 +263,7 @@ class _StartProbe:
         self._sample: list[bytes] = []
 
     def run(self) -> list[bytes]:
-        """Start and stop the sensor; return all bytes that arrived in between."""
+        """Start the sensor, stop it again, and return all bytes that were received."""
         try:
             started = self._request(self._sensor.on_open)
             self._exchange(lambda: all(pending.done for pending in started), DATA_TIMEOUT_S)
@@ -280,7 +280,7 @@ class _StartProbe:
         return sample
 
     def _request(self, names: tuple[str, ...]) -> list[PendingReply]:
-        self._session.abandon("asked for something else")
+        self._session.abandon("another command was sent")
         return [self._session.request(name, time.monotonic_ns()) for name in names]
 
     def _exchange(self, is_done: Callable[[], bool], timeout: float) -> None:

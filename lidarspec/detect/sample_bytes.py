@@ -1,6 +1,6 @@
-"""The bytes of one sender that are examined to identify the sensor.
+"""The bytes of one sender, from which its sensor is identified.
 
-Also reads the beginning of a file.
+The module also has functions that read the beginning of a file.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from dataclasses import dataclass, field, replace
 from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: number of bytes of a file that are examined; the last chunk may exceed it.
+#: number of bytes of a file to examine. The last chunk may exceed this number.
 MAX_SAMPLE_BYTES = 1 << 17
-#: number of bytes that are examined to recognise text.
+#: maximum number of bytes to examine to recognise text.
 MAX_TEXT_BYTES = 1 << 12
-#: minimum number of bytes to recognise text.
+#: minimum number of bytes that can be recognised as text.
 MIN_TEXT_BYTES = 16
 
 
 @dataclass(frozen=True)
 class SampleBytes:
-    """The examined bytes of one sender.
+    """The bytes of one sender, and how they were received.
 
     Attributes:
         source: the SOURCE, to open it again.
@@ -58,7 +58,7 @@ class SampleBytes:
 
     @property
     def is_text(self) -> bool:
-        """Whether the first bytes are printable text; some sensors send text."""
+        """Whether the first bytes are printable ASCII text. Some sensors send text."""
         head = self.data[:MAX_TEXT_BYTES]
         return (
             len(head) >= MIN_TEXT_BYTES

@@ -1,9 +1,9 @@
 """Recognize bytes of sensors that are not installed, with the table of known sensors.
 
-The frames cannot be parsed without the plugin, so the evidence is weaker than in `identification`:
-the constant bytes at the start of a data frame and the frame size, then the UDP ports. Several
-sensors of a vendor often share them. The result is good enough to name the distributions to
-install.
+Without the plugin, frames cannot be parsed. The evidence is therefore weaker than in
+`identification`: the constant bytes at the start of a data frame, the frame size, and the UDP
+ports. They are often the same for several sensors of a vendor, but sufficient to name the
+distribution to install.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from lidarspec.known_sensors import KnownSensor, Signature, install_command, kno
 from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
 
-#: maximum number of bytes at the start of a frame that a signature contains.
+#: maximum number of bytes at the start of a frame to put into a signature.
 MAX_SYNC_BYTES = 16
 #: minimum number of constant bytes of a signature.
 MIN_SYNC_BYTES = 2
-#: share of the datagrams, or of the bytes of a stream, that has to match.
+#: minimum share of the datagrams, or of the bytes of a stream, that must match.
 MIN_MATCHING_SHARE = 0.2
-#: minimum number of consecutive frames in a stream.
+#: minimum number of consecutive frames in a stream, for frames of fixed size.
 MIN_CONSECUTIVE_FRAMES = 3
 #: minimum number of sync bytes in a stream, for frames of variable size.
 MIN_SYNC_COUNT = 8
-#: minimum ratio of this number to the number that is expected by chance.
+#: minimum ratio of the number of sync bytes to the number that is expected by coincidence.
 MIN_RATIO_TO_CHANCE = 20
 #: maximum number of sensors in a message.
 MAX_LISTED_SENSORS = 6
 
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
-    """Return the signatures of a sensor's main frames, if they have enough constants."""
+    """Return the signatures of a sensor's data frames that have enough constants."""
     signatures = []
     for name in sensor.main_frames:
         engine = get_codec(sensor.frames[name])
@@ -51,7 +51,7 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
 
 
 def _format_sync(constant: dict[int, int]) -> str:
-    """Return constant bytes (offset -> value) in hexadecimal, with ".." for others."""
+    """Return constant bytes, offset -> value, in hexadecimal; other bytes are ".."."""
     length = max(constant, default=-1) + 1
     return " ".join(
         f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)
@@ -61,7 +61,7 @@ def _format_sync(constant: dict[int, int]) -> str:
 def recognize(sample: SampleBytes) -> list[KnownSensor]:
     """Return the known sensors without a plugin that may have sent the bytes.
 
-    If no frame matches, all sensors that use the destination port are returned.
+    If no frame matches, returns all sensors that use the destination port.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
@@ -91,7 +91,7 @@ def _measure_share(row: KnownSensor, sample: SampleBytes) -> float:
 
 
 def _make_pattern(sync: str) -> bytes:
-    """Return the regular expression for sync bytes as hexadecimal text."""
+    """Return a regular expression that matches sync bytes, given as hexadecimal text."""
     return b"".join(
         b"." if byte == ".." else re.escape(bytes.fromhex(byte)) for byte in sync.split()
     )
@@ -132,7 +132,7 @@ def _share_of_stream(signature: Signature, sample: SampleBytes) -> float:
 
 
 def describe(sensors: Sequence[KnownSensor]) -> str:
-    """Return the sentence that names the sensors and their distributions."""
+    """Return a message with the sensors and the distributions to install."""
     ids = [row.id for row in sensors[:MAX_LISTED_SENSORS]]
     more = len(sensors) - len(ids)
     if more:
@@ -145,7 +145,7 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Add the distributions to install, if known, to the error for unknown bytes."""
+    """Add the distributions to install to the error for unknown bytes, if known."""
     missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))

@@ -1,11 +1,12 @@
-"""Recordings: all data of a link, with arrival times.
+"""Write and read recordings: all data of a source, with arrival times.
 
-In: chunks as they arrive. Out: a file that stays valid after a crash, and the records of a
-file. Modules in reading order:
+In: chunks as they arrive; or a file. Out: a file that stays valid after a crash; or the records of
+a file. Modules in reading order:
 
-* `format`: reads and writes the bytes of .lsr files, also of damaged ones.
-* `recorders`: `Recorder` and others, by the suffix of the file: all data, packets for Wireshark,
-  raw bytes.
-* `recorder_switch`: a recorder that is switched on and off while a source is read.
-* `background_writer`: the thread that writes whole records, so that a slow disk delays nothing.
+* `format`: reads and writes the bytes of .lsr files; damaged files can be read as well.
+* `recorders`: a recorder for each suffix: .lsr for all data, .pcap and .pcapng for Wireshark, .bin
+for raw bytes.
+* `recorder_switch`: a recorder that can be switched on and off while a source is read.
+* `background_writer`: writes complete records in a thread, so that a slow disk does not delay
+reading.
 """

@@ -1,9 +1,8 @@
-"""Write whole records to a file in a thread, so that a slow disk does not delay the capture.
+"""Write records to a file in a thread.
 
-A file that is overwritten is kept until the new file has its first record.
-
-Records wait in memory. The thread writes them every 0.2 s or 64 KiB, and calls fsync every second.
-Incomplete writes are continued. If the disk is full, a partly written record is removed again.
+A slow disk therefore does not delay the capture. Records wait in memory. The thread writes them every 0.2 s, or when there are 64 KiB, and calls
+fsync every second. An existing file is kept until the new file has its first record. If the disk is
+full, a partly written record is removed, so that the file ends after a complete record.
 """
 
 from __future__ import annotations
@@ -23,32 +22,34 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: the limits after which records are written to the file.
+#: records are written when they have this size. The next constant is the maximum time between
+#: writes.
 FLUSH_BYTES = 1 << 16
 FLUSH_PERIOD_S = 0.2
-#: the time after which fsync is called.
+#: time between two calls of fsync.
 SYNC_PERIOD_S = 1.0
-#: how many bytes may wait for a slow disk; further records are dropped and counted.
+#: maximum size of the records that wait for a slow disk. Further records are dropped and counted.
 MAX_WAITING_BYTES = 1 << 26
-#: how long `sync` and `close` wait for the disk.
+#: maximum time that `sync` and `close` wait for the disk.
 DISK_TIMEOUT_S = 60.0
 
-#: (bytes, offset) -> length of the record at this offset; 0 or less without a complete record.
+#: Takes bytes and an offset, and returns the length of the record at this offset; 0 or less if the
+#: record is not complete.
 Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
-    """A new file; a file that it replaces is kept until `settle`.
+    """A new file. An existing file with the same path is kept until `settle`.
 
     Args:
         path: the path of the file.
-        size_at: returns the length of a record, so that a partial write is cut after the last
-            complete record; None if it may be cut anywhere.
-        overwrite: whether the file may exist.
+        size_at: returns the length of a record. After a partial write, the file is truncated after
+            the last complete record. None if records have no borders.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
-        UsageError: if it exists and must not be overwritten.
-        SourceError: if it cannot be created.
+        UsageError: if the file exists and `overwrite` is false.
+        SourceError: if the file cannot be created.
     """
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
@@ -69,10 +70,10 @@ class RecordFile:
         self._size_at = size_at
 
     def append(self, records: bytes | bytearray) -> None:
-        """Write whole records.
+        """Write complete records.
 
         Raises:
-            OSError: if a record could not be written; the file then ends after the last complete
+            OSError: if a record could not be written. The file then ends after the last complete
                 record.
         """
         written = 0
@@ -91,7 +92,7 @@ class RecordFile:
         self.size += written
 
     def _whole(self, records: bytes | bytearray, limit: int) -> int:
-        """Return the total size of the records that end within a limit."""
+        """Return the total size of the records that end within the first `limit` bytes."""
         if self._size_at is None:
             return limit
         end = 0
@@ -105,7 +106,7 @@ class RecordFile:
         return self._opened == self._place
 
     def settle(self) -> None:
-        """Replace the old file, if there is one and it still exists.
+        """Give the file its final name, which replaces an existing file.
 
         Raises:
             OSError: if the replacement fails.
@@ -115,7 +116,7 @@ class RecordFile:
             self._opened = self._place
 
     def keep(self) -> None:
-        """Wait until all data is on the disk; does nothing for pipes and devices."""
+        """Wait until all data is on the disk. For pipes and devices, this does nothing."""
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -125,7 +126,7 @@ class RecordFile:
     def close(self) -> None:
         """Close the file.
 
-        Without `settle`, the old file is kept and the new one is removed.
+        If `settle` was not called, the existing file is kept and the new file is removed.
         """
         with contextlib.suppress(OSError):
             self._file.close()
@@ -134,10 +135,10 @@ class RecordFile:
 
 
 class TrafficLog(Protocol):
-    """A recorder of all data that arrives and is sent: a file or a substitute.
+    """Interface of recorders: records the data that is received and sent.
 
     Attributes:
-        error: the failure of the recording; None if there was none.
+        error: the error that ended the recording; None if there is no error.
     """
 
     @property
@@ -157,24 +158,27 @@ class TrafficLog(Protocol):
         """End the recording.
 
         Raises:
-            SourceError: if it could not be written.
+            SourceError: if the file could not be written.
         """
 
 
 class BackgroundWriter:
-    """Base of recorders: collects records from any thread for a file.
+    """Base class of recorders, a context manager; any thread may add records.
 
-    It is a context manager. Errors of the file are not raised while records are added, so that the
-    capture continues. The error is kept in `error`, and raised once, by the next `sync` or by
-    `close`. The file is then valid up to its last whole record.
+    If the file cannot be written, the capture continues: adding a record raises no error. The error
+    is stored in `error`, and raised once, by the next `sync` or by `close`. The file is then valid
+    up to its last complete record.
 
     Args:
-        path, size_at, overwrite: as in `RecordFile`.
+        path: the path of the file.
+        size_at: returns the length of a record, as in `RecordFile`.
+        overwrite: whether an existing file may be replaced.
 
     Attributes:
-        records, bytes: the number of records so far, and of the data bytes in them.
-        dropped: the number of records dropped while the disk was too slow, or after it failed.
-        error: the failure of the file; None if there was none.
+        records: number of records so far.
+        bytes: number of data bytes in these records.
+        dropped: number of records that were dropped because the disk was too slow or failed.
+        error: the error of the file; None if there is no error.
     """
 
     def __init__(self, path: str | Path, size_at: Size | None, *, overwrite: bool) -> None:
@@ -188,7 +192,7 @@ class BackgroundWriter:
         self._unreported_drops = 0
         self._has_raised = False
         self._closing = False
-        # counts of records added, requested to be on the disk, and on the disk
+        # Numbers of records that were added, that `sync` waits for, and that are on the disk.
         self._records_added = 0
         self._records_requested = 0
         self._records_synced = 0
@@ -205,10 +209,10 @@ class BackgroundWriter:
         """Record an event of the line, if the format supports events."""
 
     def sync(self) -> None:
-        """Wait until everything recorded so far is on the disk.
+        """Wait until all records so far are on the disk.
 
         Raises:
-            SourceError: if that is not possible.
+            SourceError: if the file cannot be written, or the disk is too slow.
         """
         with self._changed:
             target = self._records_requested = self._records_added
@@ -224,16 +228,16 @@ class BackgroundWriter:
         self._raise_failure()
 
     def wait_for_room(self) -> None:
-        """Wait until there is room for more records; for sources that can wait.
+        """Wait until more records can be added; for sources that can wait.
 
         Raises:
-            SourceError: as `sync`.
+            SourceError: if the file cannot be written, or the disk is too slow.
         """
         if len(self._waiting) > MAX_WAITING_BYTES // 4 or self.error:
             self.sync()
 
     def close(self) -> None:
-        """Write the waiting records and close the file; a second call does nothing.
+        """Write the waiting records, and close the file. A second call does nothing.
 
         Raises:
             SourceError: if the file could not be written, unless `sync` has raised it already.
@@ -242,10 +246,10 @@ class BackgroundWriter:
         self._raise_failure()
 
     def discard(self) -> bool:
-        """Remove a closed file without records.
+        """Remove a closed file that contains no records.
 
         Returns:
-            False if a file that it would have replaced was kept.
+            False if an existing file had the same path; this file was kept.
         """
         if not self._file.replaces:
             with contextlib.suppress(OSError):
@@ -275,7 +279,8 @@ class BackgroundWriter:
         """Queue a record for the thread.
 
         Args:
-            size: the number of data bytes in it; None if it is not counted as a record.
+            record: the bytes of the record.
+            size: number of data bytes in the record; None if it is not counted as a record.
         """
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > MAX_WAITING_BYTES:
@@ -295,7 +300,7 @@ class BackgroundWriter:
                 self._changed.notify_all()
 
     def _make_drop_record(self, dropped: int) -> bytes:
-        """Return the record of an event of dropped records, if the format has one."""
+        """Return the record that reports dropped records; b"" if the format has none."""
         return b""
 
     def _raise_failure(self) -> None:
@@ -311,7 +316,10 @@ class BackgroundWriter:
         atexit.unregister(self._finish)
 
     def _work(self) -> None:
-        """Write the waiting records until the end or a failure; runs in the thread."""
+        """Write the waiting records until the recorder is closed or an error occurs.
+
+        This runs in the thread.
+        """
         try:
             due = time.monotonic() + SYNC_PERIOD_S
             while not (

@@ -1,6 +1,6 @@
 """Encode and decode the bytes of an .lsr recording.
 
-A recording is a sequence of records, each complete in itself. The first one describes it in JSON.
+A recording is a sequence of independent records. The first is the header, in JSON.
 
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
@@ -15,17 +15,20 @@ A recording is a sequence of records, each complete in itself. The first one des
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 
-An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" ("records"
-has their number), or "clock": the wall clock was set, and is "ahead_ns" ahead of the arrival times,
-which continue evenly. Readers skip unknown kinds of records.
+An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "dropped" or "clock". For
+"dropped", the entry "records" is the number of dropped records. "clock" means that the wall clock
+was set; "ahead_ns" is the wall clock minus the arrival times, which continue without a jump.
+Readers skip unknown kinds of records.
 
-Theory of operation: a length has one or two bytes, so no record is longer than 66 kB, and a record
-is only used if its checksum is valid. The reader keeps a window of the file with one record and the
-rest of the last block. It stops at the first damaged record, or salvages the records after it. A
-killed process leaves whole records and at most one incomplete one. A time is found by bisection
-(`Recording.seek`): arrival times do not go back, and from any offset the next mark with a valid
-checksum is a record. So there is no index that a crash could destroy, and every recording can be
-searched.
+Theory of operation: A length field has one or two bytes, so no record is longer than 66 kB. A
+record is used only if its checksum is valid. The reader keeps a part of the file in memory: one
+record and the rest of the last block. It stops at the first damaged record, or continues with the
+next valid record (`salvage`). If the recording process is killed, the file ends with at most one
+incomplete record.
+
+`Recording.seek` finds a time by bisection, without an index that a crash could destroy. This is
+possible because arrival times never decrease, and because a record can be found from any offset: it
+begins at the next mark with a valid checksum.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ HEADER, RECEIVED, SENT, EVENT = range(4)
 DATAGRAM = 1
 GAP = 2
 QUIET = 4
-#: maximum data bytes in one record.
+#: maximum number of data bytes in a record.
 MAX_DATA_BYTES = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
 _CRC = struct.Struct("<I")
@@ -74,17 +77,19 @@ DIRECTIONS: dict[int, Direction] = {RECEIVED: "in", SENT: "out", EVENT: "event"}
 
 @dataclass(frozen=True)
 class Header:
-    """The description of a recording, in its first record.
+    """The header of a recording, its first record.
 
     Attributes:
-        sensor, options: id and options of the sensor; "" for a raw recording.
+        sensor: id of the sensor; "" for a recording without a sensor.
+        options: the options of the sensor, by name.
         source: the SOURCE that was recorded.
-        datagrams: whether the link carried datagrams.
-        baud: of a serial port.
-        versions: of lidarspec and of the sensor's distribution.
-        created: date and time with the zone, ISO 8601.
-        wall_ns, monotonic_ns: the same moment on both clocks of the recording machine.
-        version: of the format.
+        datagrams: whether the data consists of datagrams.
+        baud: baud rate of a serial port; None for other sources.
+        versions: name of a distribution -> its version, for lidarspec and the sensor's plugin.
+        created: date and time with the time zone, ISO 8601.
+        wall_ns: wall clock of the recording computer at the start, ns since 1970.
+        monotonic_ns: monotonic clock of the recording computer at the start, ns.
+        version: version of the format.
     """
 
     sensor: str = ""
@@ -99,24 +104,24 @@ class Header:
     version: int = VERSION
 
     def to_json(self) -> bytes:
-        """Return the header as JSON; options that JSON does not support become text."""
+        """Return the header as JSON. Options that JSON does not support become text."""
         return json.dumps(
             {item.name: getattr(self, item.name) for item in fields(self)}, default=_plain
         ).encode()
 
     def known_sensor(self, folder: Path) -> Sensor:
-        """Return the installed sensor that it names, with the recorded options.
+        """Return the installed sensor that the header names, with the recorded options.
 
         Args:
-            folder: of the recording; only files in this folder are opened as options.
+            folder: folder of the recording. Only files in this folder are opened for options.
 
         Raises:
-            UsageError: if it names no sensor, or if an option has to be given by the caller, such
-                as a file in another folder.
+            UsageError: if the header names no sensor, or if the caller must pass an option again,
+                such as a file in another folder.
             UnknownSensor: if the sensor is not installed.
         """
         if not self.sensor:
-            raise UsageError("it does not name a sensor")
+            raise UsageError("it names no sensor")
         if not _ID.fullmatch(self.sensor):
             raise UsageError(f"its header contains the invalid sensor id {self.sensor[:40]!r}")
         installed = named_sensor(self.sensor)
@@ -137,7 +142,7 @@ _BLANK = Header()
 
 
 def read_header(data: bytes) -> Header:
-    """Parse a header; unknown names are ignored.
+    """Parse a header. Unknown entries are ignored.
 
     Raises:
         WireError: for an invalid header.
@@ -148,16 +153,18 @@ def read_header(data: bytes) -> Header:
         values = None
     if not isinstance(values, dict):
         raise WireError("the header of the recording is not a JSON object", data=data[:16])
-    known = {
+    entries = {
         item.name: values.get(item.name, getattr(_BLANK, item.name)) for item in fields(Header)
     }
-    for name, value in known.items():
+    for name, value in entries.items():
         kind = (int, type(None)) if name == "baud" else type(getattr(_BLANK, name))
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise WireError(
-                f"the header of the recording has {name} = {shown(value)}", path=name, got=value
+                f"the header of the recording is invalid: {name} is {shown(value)}",
+                path=name,
+                got=value,
             )
-    return Header(**known)
+    return Header(**entries)
 
 
 def _plain(value: Any) -> Any:
@@ -170,16 +177,17 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One entry of a recording.
+    """One record of a recording.
 
     Attributes:
-        direction: "in" received, "out" sent, "event" an event of the line.
+        direction: "in" for received data, "out" for sent data, "event" for an event of the line.
         data: the bytes; JSON for an event.
         at: arrival time, ns since 1970; None if unknown.
-        sender, receiver: addresses and ports of a datagram, None if unknown.
+        sender: address and port of the sender of a datagram; None if unknown.
+        receiver: address and port of the receiver of a datagram; None if unknown.
         datagram: whether `data` is a whole datagram.
-        gap: whether the line was interrupted before it.
-        quiet: whether the line was silent before it.
+        gap: whether the line was interrupted before this record.
+        quiet: whether the line was silent before this record.
     """
 
     direction: Direction
@@ -204,7 +212,7 @@ def pack_record(
     """Return the bytes of a record.
 
     Raises:
-        UsageError: for data or an address that is too long, or an invalid port or time.
+        UsageError: if the data or an address is too long, or a port or time is invalid.
     """
     if sender or receiver:
         addresses = _endpoint(sender) + _endpoint(receiver)
@@ -224,10 +232,10 @@ def pack_record(
 
 
 def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
-    """Return the length of a record from its first bytes.
+    """Return the length of the record at an offset, from its first bytes.
 
     Returns:
-        0 if these bytes are incomplete, -1 if they are not a record.
+        0 if the buffer ends within these bytes; -1 if the bytes are not the start of a record.
     """
     mark = bytes(buffer[start : start + len(MARK)])
     if mark != MARK[: len(mark)]:
@@ -239,24 +247,24 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
 
 
 class Recording(ClosingContext):
-    """A recording, read in order; a context manager.
+    """Reads the records of a recording in order; a context manager.
 
-    It is an iterable of `Record`s, which continues after the last one read. Memory is limited to a
-    block and a record.
+    Iterating yields `Record`s. A second iteration continues after the last record that was read.
+    Only one block and one record of the file are in memory.
 
     Args:
         path: the file; "-" is standard input.
         file: the open or decompressed file; it is closed with the recording.
-        salvage: continue with the next valid record after damage, even of the header, instead of
-            stopping.
+        salvage: whether to continue with the next valid record after damage, even if the header is
+            damaged, instead of ending there.
 
     Attributes:
         header: the header.
         records: number of valid records so far, including the header and events.
-        damaged: number of damaged places so far, including an incomplete record at the end.
-        leftover: number of bytes in damaged places; without `salvage`, all bytes after the last
+        damaged: number of damaged parts so far, including an incomplete record at the end.
+        leftover: number of bytes in damaged parts; without `salvage`, of all bytes after the last
             valid record.
-        is_cut: whether the last damaged place is an incomplete record at the end of the file.
+        is_cut: whether the last damaged part is an incomplete record at the end of the file.
         offset: file offset of the next record, or of the damage that ended the reading.
 
     Raises:
@@ -291,16 +299,17 @@ class Recording(ClosingContext):
         return self._records
 
     def seek(self, at: int) -> bool:
-        """Continue shortly before the first record received at a time or later.
+        """Seek to shortly before the first record that was received at a time or later.
 
-        At most a few blocks before it are read. Damage in skipped data is not counted.
+        The position is at most a few blocks before this record. Damage in skipped data is not
+        counted.
 
         Args:
             at: ns since 1970.
 
         Returns:
-            False, without moving, if that record is before the current position, if arrival times
-            are unknown, or for a pipe.
+            False if the position is unchanged, because this record is not further ahead, arrival
+            times are unknown, or the file is a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -374,7 +383,7 @@ class Recording(ClosingContext):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
     def _pairs(self) -> Iterator[tuple[int, Record]]:
-        """Yield kind and content of every valid record."""
+        """Yield (kind, record) of every valid record."""
         while self._holds(1):
             if (size := self._find_valid_length()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
@@ -389,7 +398,7 @@ class Recording(ClosingContext):
             self.leftover += self._next_mark()
 
     def _find_valid_length(self) -> int:
-        """Return the length of the current record, 0 if it is damaged or incomplete."""
+        """Return the length of the current record; 0 if it is damaged or incomplete."""
         self._holds(_HEAD.size)
         size = size_at(self._window, self._place)
         self.is_cut = size == 0 or (size > 0 and not self._holds(size))
@@ -405,7 +414,7 @@ class Recording(ClosingContext):
         return 0
 
     def _holds(self, number: int) -> bool:
-        """Return whether the window has a number of bytes, after reading more if needed."""
+        """Read until `number` bytes are in memory; return False if the file is too short."""
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
             if not block:
@@ -419,7 +428,7 @@ class Recording(ClosingContext):
         self.offset += number
 
     def _next_mark(self) -> int:
-        """Go to the next mark or the end, and return the number of skipped bytes."""
+        """Move to the next mark or the end, and return the number of skipped bytes."""
         before = self.offset
         self._skip(1)
         while (position := self._window.find(MARK, self._place)) < 0:
@@ -433,7 +442,7 @@ class Recording(ClosingContext):
         return self.offset - before
 
     def _rest(self) -> int:
-        """Return the number of bytes up to the end of the file."""
+        """Return the number of bytes from the current offset to the end of the file."""
         if self._file.seekable():
             return self._file.seek(0, os.SEEK_END) - self.offset
         left = len(self._window) - self._place
@@ -473,18 +482,18 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
         None unless the bytes contain exactly two addresses.
     """
     addresses: list[Address | None] = []
-    place = 0
-    while len(addresses) < 2 and place < len(data):
-        length = data[place]
-        place += 1
+    offset = 0
+    while len(addresses) < 2 and offset < len(data):
+        length = data[offset]
+        offset += 1
         if not length:
             addresses.append(None)
             continue
-        host = data[place : place + length].decode("utf-8", "replace")
-        place += length
-        port = data[place : place + _PORT.size]
+        host = data[offset : offset + length].decode("utf-8", "replace")
+        offset += length
+        port = data[offset : offset + _PORT.size]
         addresses.append((host, int.from_bytes(port, "little")))
-        place += _PORT.size
-    if place == len(data) and len(addresses) != 1:
+        offset += _PORT.size
+    if offset == len(data) and len(addresses) != 1:
         return addresses or [None, None]
     return None

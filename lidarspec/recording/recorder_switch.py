@@ -1,4 +1,4 @@
-"""The recorder of a live source that is switched on and off while the source is read."""
+"""A recorder of a live source that can be switched on and off."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 
 class RecordingSwitch:
-    """The recorder of a source, which starts a new file each time that it is switched on.
+    """A recorder that starts a new file each time it is switched on.
 
-    Any thread may switch: one change at a time is made.
+    Any thread may switch it.
 
     Args:
-        source: as the user typed it.
-        folder: for the files.
+        source: the SOURCE as the user typed it.
+        folder: the folder of the files.
 
     Attributes:
-        trouble: the failure of the last change, "" if it succeeded.
-        written: closed files, and the number of data bytes in them.
+        trouble: description of the error when it was last switched; "" for no error.
+        written: (path, number of data bytes) of each closed file.
     """
 
     def __init__(self, source: str, folder: Path) -> None:
@@ -39,7 +39,7 @@ class RecordingSwitch:
         self.written: list[tuple[str, int]] = []
 
     def attach(self, opened: Transport) -> TrafficLog:
-        """Return itself, as the recorder of an open transport, for `open(record=...)`."""
+        """Set the transport to record, and return this recorder, for `open(record=...)`."""
         self._opened = opened
         return self
 
@@ -52,14 +52,14 @@ class RecordingSwitch:
             self._change(on=self._recorder is None)
 
     def set(self, *, on: bool) -> None:
-        """Start or end a file; does nothing if it is in that state already."""
+        """Start or end a file. Does nothing if the recorder is already on or off."""
         with self._changing:
             if on == (self._recorder is None):
                 self._change(on=on)
 
     @property
     def recording(self) -> tuple[str, int] | None:
-        """The name of the current file and the number of data bytes in it, or None."""
+        """(name, number of data bytes) of the current file; None if there is no file."""
         current = self._recorder
         if current is None:
             return None
@@ -67,7 +67,7 @@ class RecordingSwitch:
 
     @property
     def error(self) -> SourceError | None:
-        """The failure of the current file; None if there is none."""
+        """The error of the current file; None if there is no error."""
         if self._recorder is not None:
             return self._recorder.error
         return None
@@ -86,7 +86,7 @@ class RecordingSwitch:
         """End the current file.
 
         Raises:
-            SourceError: if it could not be written.
+            SourceError: if the file could not be written.
         """
         with self._changing:
             self._end()
@@ -128,6 +128,6 @@ class RecordingSwitch:
                 current.discard()
         if not current.records:
             self.trouble = (
-                f"no data arrived while {Path(current.path).name} was recorded: the file was"
+                f"no data arrived for the recording {Path(current.path).name}, so the file was"
                 " removed"
             )

@@ -1,7 +1,7 @@
 """Recorders: write received and sent data to a file while it is captured.
 
-The suffix selects the format: .lsr for all data, .pcap and .pcapng for packets that Wireshark
-opens, .bin for raw bytes. All of them grow by whole records, written by a thread
+The suffix of the file selects the format: .lsr for all data, .pcap and .pcapng for packets that
+Wireshark can open, .bin for raw bytes. A thread appends complete records to the file
 (`background_writer`).
 """
 
@@ -43,49 +43,53 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")
-#: maximum bytes between frames in one packet.
+#: maximum size of a packet with bytes that are not in a frame.
 MAX_GAP_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class RecorderFactory:
-    """A factory of a recorder, called with the open transport and the sensor.
+    """Makes a recorder when the sensor of a source is known.
 
-    The sensor is configured with the options that it reported.
+    Attributes:
+        make: takes the open transport, and the sensor with the options that it reported, and
+            returns the recorder.
     """
 
     make: Callable[[Transport, Sensor | str | None], TrafficLog]
 
 
-#: a file, a recorder, or a factory that is called when the source is open.
+#: the target of a recording: a file, a recorder, or a function that makes the recorder when the
+#: source is open.
 RecordTo = str | Path | BackgroundWriter | Callable[[Transport], TrafficLog] | RecorderFactory
 
 
 class Recorder(BackgroundWriter):
-    """Writes an .lsr recording, from any thread; a context manager.
+    """Writes an .lsr recording; a context manager. Any thread may call `write`.
 
-    `write` does not raise errors of the file, so that the capture continues. The error is kept in
-    `error`, and raised once, by the next `sync` or by `close`. The file is then valid up to its
-    last whole record.
+    If the file cannot be written, the capture continues: `write` raises no error. The error is
+    stored in `error`, and raised once, by the next `sync` or by `close`. The file is then valid up
+    to its last complete record.
 
     Args:
-        path: the file, new unless `overwrite`.
-        sensor: the sensor, or its id; left out for a raw recording.
+        path: the file.
+        sensor: the sensor, or its id; None to record without a sensor.
         source: the SOURCE that is recorded.
-        datagrams: whether each chunk is a datagram; by default as the sensor's link declares.
-        baud: of a serial port.
+        datagrams: whether each chunk is a datagram; by default, the sensor's data link decides.
+        baud: baud rate of a serial port.
+        overwrite: whether an existing file may be replaced.
 
     Attributes:
         header: the header of the recording.
-        records, bytes: the number of records so far, and of the data bytes in them.
-        dropped: the number of records and events dropped while the disk was too slow, or after it
-            failed.
-        error: the failure of the file; None if there was none.
+        records: number of records so far.
+        bytes: number of data bytes in these records.
+        dropped: number of records that were dropped because the disk was too slow or failed.
+        error: the error of the file; None if there is no error.
 
     Raises:
-        UsageError: if the file exists, or if the sensor is not installed and `datagrams` is not
-            given.
-        SourceError: if it cannot be made.
+        UsageError: if the file exists and `overwrite` is false, or if the sensor is not installed
+            and `datagrams` is None.
+        SourceError: if the file cannot be created.
     """
 
     def __init__(
@@ -110,7 +114,7 @@ class Recorder(BackgroundWriter):
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record received or sent data with its time.
 
-        More than 65,535 bytes of a stream become several records.
+        A chunk of a stream with more than 65,535 bytes becomes several records.
         """
         kind = RECEIVED if direction == "in" else SENT
         for start in range(0, len(chunk.data) or 1, MAX_DATA_BYTES):
@@ -140,11 +144,12 @@ class Recorder(BackgroundWriter):
 
 
 class PcapRecorder(BackgroundWriter):
-    """Writes received datagrams as a capture that Wireshark opens.
+    """Writes received datagrams to a capture that Wireshark can open.
 
     Args:
-        path: the file, new unless `overwrite`.
-        port: the destination port of datagrams without a known one.
+        path: the file.
+        port: the destination port of datagrams with an unknown destination.
+        overwrite: whether an existing file may be replaced.
     """
 
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
@@ -154,7 +159,7 @@ class PcapRecorder(BackgroundWriter):
         self._put(self._writing.head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record a received datagram; sent ones are left out.
+        """Record a received datagram. Sent datagrams are ignored.
 
         Raises:
             UsageError: for invalid addresses.
@@ -170,13 +175,15 @@ class PcapRecorder(BackgroundWriter):
 
 
 class FrameRecorder(BackgroundWriter):
-    """Writes a byte stream as a capture with one packet for each frame, link type USER0.
+    """Writes a byte stream as a capture with a packet for each frame, link type USER0.
 
-    Bytes outside of frames become packets too, so that the file has all received bytes in order.
+    Bytes outside frames become packets as well, so that the file contains all received bytes in
+    order.
 
     Args:
-        path: the file, new unless `overwrite`.
-        sensor: the sensor whose frames are found.
+        path: the file.
+        sensor: the sensor that declares the frames.
+        overwrite: whether an existing file may be replaced.
     """
 
     def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
@@ -198,9 +205,9 @@ class FrameRecorder(BackgroundWriter):
             self._cut(self._decoder.feed(chunk.data, self._at))
 
     def _cut(self, frames: list[Found]) -> None:
-        """Write the frames found and the skipped bytes before them.
+        """Write frames, and the bytes outside frames before them.
 
-        Bytes that may still become a frame are kept.
+        Bytes that may become a part of a later frame are kept.
         """
         for item in frames:
             self._skip(item.offset - self._base)
@@ -225,7 +232,7 @@ class FrameRecorder(BackgroundWriter):
 
 
 class RawRecorder(BackgroundWriter):
-    """Writes the received bytes, and nothing else."""
+    """Writes only the received bytes."""
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         super().__init__(path, None, overwrite=overwrite)
@@ -237,7 +244,7 @@ class RawRecorder(BackgroundWriter):
 
 
 def declared_port(sensor: Sensor | None) -> int:
-    """Return the first declared port of a sensor's datagrams, 0 if there is none."""
+    """Return the first UDP port that a sensor declares; 0 if it declares none."""
     links = sensor.links.values() if sensor is not None else ()
     return next((port for link in links if isinstance(link, Udp) for port in link.ports), 0)
 
@@ -263,27 +270,28 @@ def open_recorder(
     baud: int | None = None,
     overwrite: bool = False,
 ) -> BackgroundWriter:
-    """Open the recorder for a file, by its suffix: .lsr, .pcap, .pcapng or .bin.
+    """Open the recorder for a file; its suffix is .lsr, .pcap, .pcapng or .bin.
 
     Args:
-        path: the new file.
-        sensor: the sensor, if known; a capture of a byte stream requires it.
-        source: the source of the data, for the header of an .lsr.
-        datagrams: whether chunks are datagrams, or pieces of a stream.
-        baud: of a serial line, for the header of an .lsr.
-        overwrite: replace an existing file.
+        path: the file.
+        sensor: the sensor if it is known. A capture of a byte stream requires it.
+        source: the source of the data, for the header of an .lsr file.
+        datagrams: whether chunks are datagrams, not pieces of a stream.
+        baud: baud rate of a serial line, for the header of an .lsr file.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
         UnknownFormat: for another suffix.
-        UsageError: if the file exists, or cannot contain the data of the source.
-        SourceError: if it cannot be made.
+        UsageError: if the file exists and `overwrite` is false, or if the format cannot store the
+            data of the source.
+        SourceError: if the file cannot be created.
     """
     suffix = check_suffix(path)
     if suffix in WRITINGS and not datagrams:
         if not sensor:
             raise UsageError(
-                f"{path}: a capture of a byte stream requires frames: name the sensor with -s,"
-                " or record an .lsr"
+                f"{path}: to record a byte stream as a capture, name the sensor with -s; or record"
+                " to an .lsr file"
             )
         return FrameRecorder(
             path,
@@ -292,7 +300,7 @@ def open_recorder(
         )
     if suffix == ".bin" and datagrams:
         raise UsageError(
-            f"{path}: raw bytes have no datagram borders: record datagrams in an .lsr or .pcap file"
+            f"{path}: a .bin file cannot separate datagrams: record to an .lsr or .pcap file"
         )
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
@@ -305,9 +313,9 @@ def open_recorder(
 def get_recorder(
     target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
 ) -> tuple[TrafficLog, bool]:
-    """Return the recorder for a target, and whether it was made here.
+    """Return the recorder for a target, and whether this function made it.
 
-    A recorder that was made here has to be closed by the caller of this function.
+    The caller must close a recorder that this function made.
     """
     if isinstance(target, BackgroundWriter):
         return target, False
@@ -357,7 +365,7 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
 def _record_size(data: bytes | bytearray, at: int) -> int:
     """Return the length of the record at an offset of a piece of a recording.
 
-    The first piece begins with the magic bytes, which count as a record.
+    At the start of the file, returns the length of the magic bytes.
     """
     if data.startswith(MAGIC, at):
         return len(MAGIC)

@@ -311,7 +311,8 @@ def test_unrecordable_sources_give_a_reason(stream: Path, datagrams: Path, tmp_p
         in ran("record", tmp_path / "raw.bin", "-o", tmp_path / "it.pcap", code=2).stderr
     )
     assert (
-        "no datagram borders" in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
+        "cannot separate datagrams"
+        in ran("record", datagrams, "-o", tmp_path / "it.bin", code=2).stderr
     )
     assert (
         "unknown format '.csv'" in ran("record", stream, "-o", tmp_path / "it.csv", code=2).stderr

@@ -63,7 +63,7 @@ def test_a_recording_of_nothing_is_removed_and_reported(tmp_path: Path) -> None:
     assert (size, [path.name for path in tmp_path.iterdir()]) == (0, [name])
     switch.set(on=False)
     assert (switch.recording, switch.written, list(tmp_path.iterdir())) == (None, [], [])
-    assert switch.trouble == f"no data arrived while {name} was recorded: the file was removed"
+    assert switch.trouble == f"no data arrived for the recording {name}, so the file was removed"
     switch.set(on=True)
     assert switch.trouble == ""
     switch.write(Chunk(b"data", 1))
