@@ -422,7 +422,7 @@ def test_udp_datagrams_of_two_senders_are_separated() -> None:
                 one.sample.sender: one.sensor and one.sensor.id
                 for one in identify_senders(f"udp://127.0.0.1:{target}")
             }
-            with pytest.raises(UsageError, match="several sensors send"):
+            with pytest.raises(UsageError, match="data from several sensors"):
                 detect(f"udp://127.0.0.1:{target}")
             assert detect(f"udp://127.0.0.1:{target}?src=127.0.0.2").id == "hesai-xt32"
     assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
