@@ -168,7 +168,7 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
     sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
     log.write_bytes(b"".join(simulate(sensor, 900)))
     assert (
-        "name one, such as -s slamtec-rplidar-a1 -O answer=node"
+        "choose one, such as -s slamtec-rplidar-a1 -O answer=node"
         in ran("convert", log, out, code=2).stderr
     )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
