@@ -12,6 +12,7 @@ tables or JSON; report a failure as one message and an exit code.
 * `sensors`, `frames`, `build`: list the installed sensors, print the fields of frames, build a
 frame.
 * `read`, `view`: print a live sensor's data as rows or statistics, or draw it.
+* `clock`: report what the clocks of sensors count, and their faults.
 * `recordings`: record a source into a file, and replay it.
 * `convert`, `info`, `plot`: convert files, describe their contents, draw them.
 * `sim`: simulate a sensor on a port or in a file.

@@ -61,6 +61,10 @@ GROUPS = {
         "replay": ("recordings", "Replay a recording or capture, byte for byte and in real time."),
         "sim": ("sim", "Simulate a sensor on a serial port, UDP, TCP or in a file."),
         "send": ("build", "Send a command to a sensor, and print its reply."),
+        "clock": (
+            "clock",
+            "Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.",
+        ),
         "stats": ("read", "Print speed, rates, errors, loss, jitter and queue of a sensor."),
     },
     "files": {

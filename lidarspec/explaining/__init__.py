@@ -8,6 +8,7 @@ frame.
 * `frame_rows`: one frame as rows of values.
 * `damage_search`: the flipped bit, or the lost or inserted byte, that explains damage.
 * `input_segments`: splits a stream into valid frames, damaged frames, and other bytes.
+* `clock_text`: a sensor's clock in words.
 * `formatting`: the texts for values, bits, rows, points and differences.
 * `file_contents`: the kind of a file, and its senders, sensors, times and losses.
 * `assignments`: parses values that users type.

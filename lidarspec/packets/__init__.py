@@ -18,4 +18,6 @@ that the packets need are kept with them. Modules in reading order:
 * `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
 * `clock_estimate`: offset and drift between the sensor's clock and the host's.
+* `clock_findings`: the faults of a clock as codes, and their words.
+* `clock_monitor`: what a clock counts, how it runs, and its faults.
 """

@@ -26,7 +26,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+Times = NDArray[np.int64]
 
 PART_NS = 250_000_000  # the smallest delay of each part is kept
 PARTS = 120  # kept parts: half a minute
@@ -115,19 +117,45 @@ class DeviceClock:
         """The share by which the sensor's clock is fast, in millionths."""
         return (1 / (1 + self._line.slope) - 1) * 1e6
 
-    def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> None:
-        """Update the conversion with packets.
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether the newest packets deviate from the line, so that the clock may have been set."""
+        return bool(self._outliers)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the line is reliable: ten seconds after the start or a change of the clock."""
+        return len(self._min_delays) >= SETTLED_PARTS
+
+    def delays_above_line(self, device: Times, host: Times) -> NDArray[np.float64]:
+        """Return by how much packets are later than a packet without delay, ns, (n,).
+
+        Args:
+            device, host: as for `observe`.
+        """
+        line = self._line
+        expected = line.delay + line.slope * (device - line.device)
+        return host - device - expected
+
+    def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> list[ClockJump]:
+        """Update the conversion with packets, and return the changes of the clock among them.
 
         Args:
             device_ns, host_ns: when the packets were sent by the sensor's clock, and when they
                 arrived; int64 ns, shape (n,) or a number each.
         """
+        jumps = []
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
         delays = np.asarray(host_ns, np.int64) - device
         edges = np.flatnonzero(np.diff(device // PART_NS)) + 1
         for times, late in zip(np.split(device, edges), np.split(delays, edges), strict=True):
             if len(late):
-                self._add_sample(ClockSample(times.item(late.argmin()), late.item(late.argmin())))
+                jump = self._add_sample(
+                    ClockSample(times.item(late.argmin()), late.item(late.argmin()))
+                )
+                if jump is not None:
+                    jumps.append(jump)
+        return jumps
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
         """Return the host's time of a scan, later than all stamps before.
@@ -157,8 +185,11 @@ class DeviceClock:
         limit = MAX_SLEW * step
         return unchanged + round(min(max(correction, -limit), limit))
 
-    def _add_sample(self, sample: ClockSample) -> None:
-        """Update the line, or count an outlier, with the sample of smallest delay."""
+    def _add_sample(self, sample: ClockSample) -> ClockJump | None:
+        """Update the line, or count an outlier, with the sample of smallest delay.
+
+        Returns the change of the clock if this sample shows it.
+        """
         deviation = self._deviation(sample)
         has_paused = (
             bool(self._min_delays) and sum(sample) - sum(self._min_delays[-1]) > PARTS * PART_NS
@@ -173,12 +204,13 @@ class DeviceClock:
         if not self._min_delays or -early_limit < deviation < late_limit:
             self._outliers.clear()
             self._update_line(sample)
-            return
+            return None
         if not self._outliers:
             self._first_outlier_ns = sum(sample)
         self._outliers.append(sample)
         if self._was_set(sum(sample) - self._first_outlier_ns):
-            self._restart_at_outliers()
+            return self._restart_at_outliers()
+        return None
 
     def _forget_offset(self) -> None:
         """Forget all samples, but not the drift."""
@@ -211,17 +243,22 @@ class DeviceClock:
             and min(map(self._deviation, outliers)) > 4 * spread
         )
 
-    def _restart_at_outliers(self) -> None:
-        """Restart with the newest outliers, because the clock was set; the drift remains."""
+    def _restart_at_outliers(self) -> ClockJump:
+        """Restart with the newest outliers, because the clock was set; the drift remains.
+
+        Returns the change of the clock.
+        """
         outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
         self.jumps += 1
         host_ns = sum(outliers[-1])
         delay_before = self._line.delay_at(host_ns - self._line.delay)
         delay_after = min(sample.delay for sample in outliers)
-        self.jump = ClockJump(delay_before - delay_after, self._first_outlier_ns)
+        jump = ClockJump(delay_before - delay_after, self._first_outlier_ns)
+        self.jump = jump
         self._forget_offset()
         for sample in outliers:
             self._update_line(sample)
+        return jump
 
     def _update_line(self, sample: ClockSample) -> None:
         """Keep a sample if it is the smallest of its part, and fit the line again."""

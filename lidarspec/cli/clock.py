@@ -1,0 +1,164 @@
+"""`clock`: tell what the clocks of sensors count, and how well they run."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import click
+
+from lidarspec.cli.failures import FINDINGS
+from lidarspec.cli.inputs import FirstFrameTimeout, conclude, no_scan_error
+from lidarspec.cli.options import DURATION, sensor_option
+from lidarspec.cli.terminal import say
+from lidarspec.device.device import Device, open as open_device
+from lidarspec.explaining.clock_text import iter_clock_rows
+from lidarspec.packets.clock_monitor import DRIFT_LIMIT_PPM, ClockMonitor, ClockReport
+from lidarspec.packets.packets import Packets
+from lidarspec.sensor_operations import Sensor
+from lidarspec.view.live_scans import LOOK_S
+
+DEFAULT_DURATION_S = 12.0  # the drift is known after ten seconds
+
+
+class SourceClock:
+    """The clock of one open source.
+
+    Args:
+        device: the open device; it is not closed.
+        source: the SOURCE, as the user has written it.
+        drift_limit_ppm: the drift above which the clock is at fault.
+
+    Attributes:
+        ended: whether the input has ended.
+    """
+
+    def __init__(self, device: Device, source: str, drift_limit_ppm: float) -> None:
+        self.device = device
+        self.source = source
+        self.ended = False
+        self._monitor = ClockMonitor(device.sensor, drift_limit_ppm=drift_limit_ppm)
+        self._timeout = FirstFrameTimeout(device, source)
+        self._batches = _iter_batches(device)
+
+    def read(self) -> None:
+        """Read what has arrived, or the next part of a file.
+
+        Raises:
+            LidarSpecError: if the source fails, or sends no frame for too long.
+        """
+        batch = next(self._batches, None)
+        if batch is None:
+            self.ended = True
+            return
+        for packets in batch:
+            self._monitor.add(packets)
+        self._timeout.check()
+
+    def report(self) -> ClockReport:
+        """Return what is known about the clock.
+
+        Raises:
+            LidarSpecError: if no packet has arrived.
+        """
+        report = self._monitor.report()
+        if not report.packets:
+            raise no_scan_error(self.device, self.source)
+        return report
+
+
+@click.command()
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
+@sensor_option
+@click.option(
+    "-t",
+    "--duration",
+    type=DURATION,
+    help=f"Stop after this time; default: {DEFAULT_DURATION_S:g}s, and all of a file.",
+)
+@click.option(
+    "--max-drift",
+    type=click.FloatRange(min=0),
+    default=DRIFT_LIMIT_PPM,
+    show_default=True,
+    metavar="PPM",
+    help="Drift above which a clock is at fault, in millionths.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each source.")
+def clock(
+    sources: Sequence[str],
+    sensor_id: str | Sensor | None,
+    duration: float | None,
+    max_drift: float,
+    as_json: bool,
+) -> None:
+    """Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.
+
+    Arrival times are compared with the times in the packets: of a live source with the clock of
+    this computer, of a file with that of the computer that recorded it. Several sources are read at
+    the same time, and compared with each other. The exit code is 1 if a clock is at fault.
+    """
+    with contextlib.ExitStack() as stack:
+        clocks = [
+            SourceClock(
+                stack.enter_context(open_device(source, sensor_id, period=LOOK_S)),
+                source,
+                max_drift,
+            )
+            for source in sources
+        ]
+        with contextlib.suppress(KeyboardInterrupt):
+            _read_all(clocks, duration)
+        reports = [one.report() for one in clocks]
+        for one, report in zip(clocks, reports, strict=True):
+            _print_report(one, report, reports[0], as_json=as_json)
+        for one in clocks:
+            conclude(one.device)
+    if any(finding.is_fault for report in reports for finding in report.findings):
+        raise click.exceptions.Exit(FINDINGS)
+
+
+def _read_all(clocks: Sequence[SourceClock], duration: float | None) -> None:
+    """Read all sources in turn, until the duration has passed or the input has ended."""
+    if duration is None and not all(one.device.is_live for one in clocks):
+        duration = math.inf
+    deadline = time.monotonic() + (DEFAULT_DURATION_S if duration is None else duration)
+    running = list(clocks)
+    while running and time.monotonic() < deadline:
+        for one in running:
+            one.read()
+        running = [one for one in running if not one.ended]
+
+
+def _iter_batches(device: Device) -> Iterator[Iterable[Packets]]:
+    """Yield the packets that have a time, in batches."""
+    if device.sensor.has_points:
+        for packets in device.packets(wait=LOOK_S):
+            yield [packets]
+    else:
+        for batch in device.packets_by_frame(device.sensor.main_frames, wait=LOOK_S):
+            yield batch.values()
+
+
+def _print_report(
+    one: SourceClock, report: ClockReport, first: ClockReport, *, as_json: bool
+) -> None:
+    """Print what is known about one clock, and its offset from the first one."""
+    mutual_s = math.nan
+    if report is not first:
+        mutual_s = report.error_s - first.error_s
+    if as_json:
+        facts: dict[str, Any] = {"source": one.source, "sensor": one.device.sensor.id}
+        facts["to_first_s"] = None if math.isnan(mutual_s) else mutual_s
+        say(json.dumps({**facts, **report.to_dict()}, allow_nan=False))
+        return
+    say(f"{one.source}: {one.device.sensor.id}")
+    rows = list(iter_clock_rows(report))
+    if not math.isnan(mutual_s):
+        rows.insert(2, ("", f"{mutual_s * 1e3:+.2f} ms to the first source"))
+    for label, text in rows:
+        say(f"  {label:<8}  {text}")

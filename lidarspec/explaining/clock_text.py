@@ -1,0 +1,66 @@
+"""Describe a sensor's clock in words: for `clock`, `stats`, `doctor` and the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from lidarspec.packets.clock_monitor import ClockReport
+from lidarspec.spec.timing import EPOCHS
+
+
+def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
+    """Yield the lines about a clock, each a label and a text."""
+    yield "time", describe_time_source(report)
+    if not math.isnan(report.offset_s):
+        yield "offset", describe_offset(report)
+    if not math.isnan(report.drift_ppm):
+        yield "drift", f"{report.drift_ppm:+.1f} ppm"
+    if not math.isnan(report.jitter_ms):
+        late = f"{report.late} of {report.packets} packets late"
+        yield "jitter", f"{report.jitter_ms:.2f} ms, {late}"
+    for event in report.events:
+        yield "event", f"{format_moment(event.host_ns)} {event.text}".lstrip()
+    yield "verdict", report.verdict.text
+    if report.verdict.advice:
+        yield "next", report.verdict.advice
+
+
+def describe_time_source(report: ClockReport) -> str:
+    """Return what a clock counts, and its state."""
+    parts = [EPOCHS[report.epoch]]
+    if not report.epoch:
+        parts = ["the manual does not say what it counts"]
+    if report.state:
+        parts.append(report.state)
+    return "; ".join(parts)
+
+
+def describe_offset(report: ClockReport) -> str:
+    """Return the offset from the host's clock, without the difference of the time scales."""
+    if math.isnan(report.error_s):
+        return f"{report.offset_s:+.3f} s to the host, from an arbitrary start"
+    text = f"{report.error_s * 1e3:+.2f} ms"
+    if abs(report.error_s) >= 1:
+        text = f"{report.error_s:+.3f} s"
+    return f"{text} to the host"
+
+
+def describe_clock(report: ClockReport) -> str:
+    """Return a clock in one line."""
+    parts = [describe_time_source(report)]
+    if not math.isnan(report.error_s):
+        parts.append(describe_offset(report))
+    if not math.isnan(report.drift_ppm):
+        parts.append(f"{report.drift_ppm:+.1f} ppm")
+    parts.append(report.verdict.text)
+    return ", ".join(parts)
+
+
+def format_moment(host_ns: int) -> str:
+    """Return a time in UTC with milliseconds; "" for 0, an unknown time."""
+    if not host_ns:
+        return ""
+    moment = datetime.fromtimestamp(host_ns / 1e9, UTC)
+    return moment.strftime("%Y-%m-%d %H:%M:%S.") + f"{moment.microsecond // 1000:03d}"

@@ -1,0 +1,146 @@
+"""Findings about a sensor's clock: codes, their words, and what to do about them.
+
+A `ClockFinding` is either a state, such as a clock that runs on TAI, or an event with a time, such
+as a clock that was set. Programs compare codes; only people read the words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+
+class FindingType(NamedTuple):
+    """The words of a code, with the fields of `ClockFinding` in braces.
+
+    Attributes:
+        text: what was found.
+        advice: what to do about it; "" if nothing is wrong.
+        is_fault: whether something is wrong.
+    """
+
+    text: str
+    advice: str = ""
+    is_fault: bool = True
+
+
+CHECK_MASTER = "check the source of time: its antenna, its cable, its PTP domain and profile"
+#: The codes, the most serious first: states at fault, events that were faults, and the others.
+FINDING_TYPES = MappingProxyType(
+    {
+        "not_locked": FindingType("not locked: {state}", CHECK_MASTER),
+        "tai": FindingType(
+            "runs on TAI: {value:.0f} s ahead of UTC",
+            "-O epoch=tai, or set the grandmaster's currentUtcOffset",
+        ),
+        "gps": FindingType(
+            "runs on GPS time: {value:.0f} s ahead of UTC",
+            "-O epoch=gps, or let the receiver apply the leap seconds",
+        ),
+        "utc": FindingType(
+            "runs on UTC, expected {epoch}", "-O epoch=utc, or let the grandmaster send TAI"
+        ),
+        "behind_utc": FindingType(
+            "{value:.0f} s behind UTC: it subtracts the offset of TAI from a time in UTC",
+            "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
+        ),
+        "second_off": FindingType(
+            "{value:+.3f} s off: a second, as when a pulse (PPS) has the wrong sentence",
+            "check that the NMEA sentence follows the pulse that it belongs to",
+        ),
+        "wrong_date": FindingType(
+            "its date is {days:.0f} days off: it was probably never set",
+            "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
+        ),
+        "offset": FindingType(
+            "{value:+.3f} s off the clock of this computer",
+            "synchronize both to one source; chronyc tracking shows this computer's",
+        ),
+        "drift": FindingType(
+            "runs {value:+.1f} ppm fast", "synchronize the sensor by PTP or PPS, or use --time host"
+        ),
+        "unsynchronized": FindingType(
+            "counts from power-up, expected {epoch}",
+            "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
+        ),
+        "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
+        "restart": FindingType("restarted: its time began again at 0", "check its power supply"),
+        "leap_second": FindingType(
+            "set by {value:+.3f} s at a leap second", "record such a time again, or use --time host"
+        ),
+        "second_step": FindingType(
+            "set by {value:+.3f} s: its pulse (PPS) is a second off",
+            "check that the NMEA sentence follows the pulse that it belongs to",
+        ),
+        "jump": FindingType(
+            "set by {value:+.3f} s", "use --time host for the data around this time"
+        ),
+        "free_running": FindingType(
+            "counts from power-up: no date", "use --time host for dates", is_fault=False
+        ),
+        "lock_gained": FindingType("locked: {state}", is_fault=False),
+        "state_changed": FindingType("state: {state}", is_fault=False),
+        "no_clock": FindingType("the sensor sends no time", "use --time host", is_fault=False),
+        "no_arrival_times": FindingType(
+            "the source has no arrival times to compare with", is_fault=False
+        ),
+        "too_short": FindingType("too few packets to judge", is_fault=False),
+        "ok": FindingType("in order", is_fault=False),
+    }
+)
+_SEVERITY = {code: rank for rank, code in enumerate(FINDING_TYPES)}
+
+
+@dataclass(frozen=True)
+class ClockFinding:
+    """One finding about a clock.
+
+    Attributes:
+        code: a key of `FINDING_TYPES`.
+        host_ns: the arrival time of the first packet after an event, ns since 1970; 0 for a state.
+        value: seconds, or ppm of a drift; 0 if the code has no value.
+        state: the meaning of the clock's status, in the sensor's words; "" without one.
+        epoch: the declared epoch, a key of `spec.timing.EPOCHS`.
+    """
+
+    code: str
+    host_ns: int = 0
+    value: float = 0.0
+    state: str = ""
+    epoch: str = ""
+
+    @property
+    def text(self) -> str:
+        """A few words on what was found, without a subject."""
+        value = abs(self.value) if self.code == "behind_utc" else self.value
+        text = FINDING_TYPES[self.code].text
+        days = abs(value) / 86_400
+        return text.format(value=value, days=days, state=self.state, epoch=self.epoch.upper())
+
+    @property
+    def advice(self) -> str:
+        """What to do about it; "" if nothing is wrong."""
+        return FINDING_TYPES[self.code].advice
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether something is wrong."""
+        return FINDING_TYPES[self.code].is_fault
+
+    @property
+    def severity(self) -> int:
+        """A number to sort by; the most serious finding has the lowest."""
+        return _SEVERITY[self.code]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as a JSON object."""
+        return {
+            "code": self.code,
+            "host_ns": self.host_ns,
+            "value": self.value,
+            "state": self.state,
+            "fault": self.is_fault,
+            "text": self.text,
+            "advice": self.advice,
+        }

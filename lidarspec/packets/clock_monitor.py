@@ -1,0 +1,384 @@
+"""Watch a sensor's clock: what it counts, whether it is locked, how it runs, and its faults.
+
+A `ClockMonitor` reads the packets of one sensor in turn. Their arrival times show the offset and
+the drift of the clock (`clock_estimate`); a change of the offset is an event. The status that the
+sensor sends (`clock_status`) gives further events. The offset is compared with the one that follows
+from the declared epoch, and with those of other time scales: they differ by leap seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.leap_seconds import read_leap_seconds
+from lidarspec.packets.clock_estimate import ClockJump, DeviceClock
+from lidarspec.packets.clock_findings import ClockFinding
+from lidarspec.packets.clock_status import read_clock_status
+from lidarspec.packets.clocks import clock_ns
+from lidarspec.packets.packet_type import find_clock
+from lidarspec.packets.packets import Packets
+from lidarspec.spec.sensor import SensorDescription
+from lidarspec.spec.timing import HOUR_S, ClockState
+
+Integers = NDArray[np.int64]
+
+DRIFT_LIMIT_PPM = 100.0  # crystals are within 50 ppm
+#: Offset below which a clock is in order, s: packets arrive late, a host is set by NTP, and a clock
+#: that is not locked drifts by 0.2 s in an hour.
+OFFSET_LIMIT_S = 0.5
+SCALE_TOLERANCE_S = 0.25  # of the offset from another time scale
+STEP_TOLERANCE_S = 0.05  # of a step by a second
+#: the first date that a synchronized clock can have, s: 2001. Clocks that count from power-up, or
+#: from a wrong date, are earlier.
+FIRST_DATE_S = 1e9
+LATE_NS = 50_000_000
+PIECE_NS = 250_000_000  # packets are judged in pieces of this duration
+MIN_PIECES = 4  # after which a clock can be in order
+WRONG_DATE_S = 86_400.0
+#: the time that a clock shows at most when the first packets after its restart arrive, s
+RESTART_LIMIT_S = 1.0
+#: how near to the end of a month a second is a leap second, s
+LEAP_LIMIT_S = 10.0
+DAY_S = 86_400
+KEPT_DELAYS = 4096
+KEPT_EVENTS = 1000
+KEPT_SAMPLES = 600
+SAMPLE_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class OffsetSample:
+    """The offset of the clock at one time.
+
+    Attributes:
+        host_ns: arrival time, ns since 1970.
+        offset_s: the sensor's time minus the host's, s.
+        jitter_ms: the 95th percentile of the packets' delays, ms.
+    """
+
+    host_ns: int
+    offset_s: float
+    jitter_ms: float
+
+
+@dataclass(frozen=True)
+class ClockReport:
+    """What is known about a clock.
+
+    Attributes:
+        epoch: what the clock counts, a key of `spec.timing.EPOCHS`; "" if unknown.
+        state: the meaning of its status; "" if the sensor has not sent it.
+        locked: whether it is locked; None if unknown.
+        offset_s: the sensor's time minus the host's, s; nan if unknown. A constant delay of all
+            packets makes it smaller.
+        error_s: the offset without the difference of the time scales, s; nan if the clock has no
+            date.
+        drift_ppm: the share by which the clock is fast, in millionths; nan if unknown.
+        jitter_ms: the 95th percentile of the delays of packets after the fastest, ms.
+        packets: number of packets.
+        late: number of packets that came more than 50 ms later than the fastest.
+        jumps: how often the clock was set, or restarted.
+        findings: the findings, the most serious first; at least one.
+        events: the events in order of time.
+    """
+
+    epoch: str
+    state: str
+    locked: bool | None
+    offset_s: float
+    error_s: float
+    drift_ppm: float
+    jitter_ms: float
+    packets: int
+    late: int
+    jumps: int
+    findings: tuple[ClockFinding, ...]
+    events: tuple[ClockFinding, ...]
+
+    @property
+    def verdict(self) -> ClockFinding:
+        """The most serious finding."""
+        return self.findings[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as a JSON object; unknown numbers are null."""
+        values: dict[str, Any] = {
+            name: None if isinstance(value, float) and math.isnan(value) else value
+            for name, value in vars(self).items()
+        }
+        values["findings"] = [finding.to_dict() for finding in self.findings]
+        values["events"] = [event.to_dict() for event in self.events]
+        return values
+
+
+class ClockMonitor:
+    """The clock of one sensor, watched through its packets.
+
+    Args:
+        sensor: the sensor.
+        drift_limit_ppm: the drift above which the clock is at fault.
+
+    Attributes:
+        samples: the offset over time, one sample a second, the newest ten minutes.
+    """
+
+    def __init__(
+        self, sensor: SensorDescription, *, drift_limit_ppm: float = DRIFT_LIMIT_PPM
+    ) -> None:
+        self._sensor = sensor
+        self._drift_limit_ppm = drift_limit_ppm
+        self.samples = deque[OffsetSample](maxlen=KEPT_SAMPLES)
+        self._estimate = DeviceClock()
+        self._delays: NDArray[np.float64] = np.zeros(0)
+        self._events = deque[ClockFinding](maxlen=KEPT_EVENTS)
+        self._status = math.nan
+        self._state: ClockState | None = None
+        self._device_ns = 0
+        self._host_ns = 0
+        self._readings = deque[tuple[int, int]](maxlen=64)  # arrival and reading of each piece
+        self._pieces = 0
+        self._packets = 0
+        self._late = 0
+        self._late_uncertain = 0  # late packets since the clock may have been set
+
+    def add(self, packets: Packets) -> list[ClockFinding]:
+        """Update the clock with packets, and return the events among them.
+
+        Args:
+            packets: the next packets of a frame type that uses the sensor's clock.
+        """
+        clock = self._sensor.clock
+        self._packets += len(packets)
+        if not len(packets) or clock is None:
+            return []
+        if find_clock(packets.sensor, packets.frame) is not clock:
+            return []
+        events = self._read_status(packets)
+        self._device_ns = packets.time_ns.item(-1)
+        known = packets.host_ns > 0
+        if known.any():
+            readings = clock_ns(self._sensor, packets.batch())
+            for piece in _split(packets.host_ns[known]):
+                which = np.flatnonzero(known)[piece]
+                jumps = self._observe(
+                    packets.time_ns[which], packets.host_ns[which], readings[which]
+                )
+                events += [self._name_jump(jump) for jump in jumps]
+        self._events.extend(events)
+        return events
+
+    def report(self) -> ClockReport:
+        """Return what is known now."""
+        offset_s = error_s = drift_ppm = jitter_ms = math.nan
+        if self._pieces:
+            offset_s = -self._estimate.offset_ns / 1e9
+            error_s = self._find_error_s()
+        if self._estimate.is_settled:
+            drift_ppm = self._estimate.drift_ppm
+        if len(self._delays):
+            jitter_ms = float(np.percentile(self._delays, 95)) / 1e6
+        state = self._state
+        faults = tuple(event for event in self._events if event.is_fault)
+        findings = sorted((*self._judge(), *faults), key=_rank)
+        if findings[0].is_fault:
+            findings = [finding for finding in findings if finding.code != "ok"]
+        return ClockReport(
+            epoch=self._epoch,
+            state="" if state is None else state.meaning,
+            locked=None if state is None else state.locked,
+            offset_s=offset_s,
+            error_s=error_s,
+            drift_ppm=drift_ppm,
+            jitter_ms=jitter_ms,
+            packets=self._packets,
+            late=self._late,
+            jumps=self._estimate.jumps,
+            findings=tuple(findings),
+            events=tuple(self._events),
+        )
+
+    @property
+    def _epoch(self) -> str:
+        """What the clock is declared to count now."""
+        clock = self._sensor.clock
+        if clock is None:
+            return ""
+        epoch = clock.epoch if self._state is None else clock.epoch_in(self._state)
+        if epoch == "hour" and self._has_date:
+            return "utc"  # another frame has completed the hour
+        return epoch
+
+    @property
+    def _has_date(self) -> bool:
+        return self._device_ns >= FIRST_DATE_S * 1e9
+
+    def _read_status(self, packets: Packets) -> list[ClockFinding]:
+        """Return the changes of the clock's status, and remember the last one."""
+        clock = self._sensor.clock
+        assert clock is not None
+        if clock.status is None:
+            return []
+        values = read_clock_status(packets)
+        events = []
+        for row in _find_changes(values, self._status):
+            before = self._state
+            self._status = values.item(row)
+            self._state = clock.status.state_of(self._status)
+            if before is None:
+                continue  # a state from the start is no change
+            code = "state_changed"
+            if before.locked and not self._state.locked:
+                code = "lock_lost"
+            elif self._state.locked and not before.locked:
+                code = "lock_gained"
+            host_ns = packets.host_ns.item(row)
+            events.append(ClockFinding(code, host_ns, state=self._state.meaning))
+        return events
+
+    def _observe(self, device: Integers, host: Integers, readings: Integers) -> list[ClockJump]:
+        """Update the estimate with one piece, and return the jumps that it shows."""
+        jumps = self._estimate.observe(device, host)
+        if jumps:
+            self._delays = self._delays[:0]
+            self._late_uncertain = 0
+        delays = self._estimate.delays_above_line(device, host)
+        self._late_uncertain += int(np.count_nonzero(delays > LATE_NS))
+        if not self._estimate.is_uncertain:
+            self._late += self._late_uncertain
+            self._late_uncertain = 0
+            self._delays = np.concatenate([self._delays, delays])[-KEPT_DELAYS:]
+        self._readings.append((host.item(0), readings.item(0)))
+        self._host_ns = host.item(-1)
+        self._pieces += 1
+        if len(self._delays) and (
+            not self.samples or self._host_ns - self.samples[-1].host_ns >= SAMPLE_NS
+        ):
+            offset_s = -self._estimate.offset_ns / 1e9
+            jitter_ms = float(np.percentile(self._delays, 95)) / 1e6
+            self.samples.append(OffsetSample(self._host_ns, offset_s, jitter_ms))
+        return jumps
+
+    def _name_jump(self, jump: ClockJump) -> ClockFinding:
+        """Return the event that a jump of the clock shows."""
+        change_s = jump.change_ns / 1e9
+        event = ClockFinding("jump", jump.host_ns, change_s)
+        if self._began_again(jump):
+            return replace(event, code="restart")
+        if abs(abs(change_s) - 1) < STEP_TOLERANCE_S:
+            if _is_at_month_end(jump.host_ns):
+                return replace(event, code="leap_second")
+            return replace(event, code="second_step")
+        return event
+
+    def _began_again(self, jump: ClockJump) -> bool:
+        """Return whether the clock showed a time near 0 after the jump, and did not before."""
+        after = [reading for host, reading in self._readings if host >= jump.host_ns]
+        before = [reading for host, reading in self._readings if host < jump.host_ns]
+        if not after or not before:
+            return False
+        return after[0] < RESTART_LIMIT_S * 1e9 and after[0] < before[-1]
+
+    def _find_error_s(self) -> float:
+        """Return the offset without the difference of the time scales, s; nan without a date."""
+        offset_s = -self._estimate.offset_ns / 1e9
+        epoch = self._epoch
+        if epoch == "hour" and not self._has_date:
+            offset_s = (offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2
+            return offset_s
+        if epoch == "boot" or not self._has_date:
+            return math.nan
+        return offset_s - self._scale_offsets.get(epoch, 0)
+
+    @property
+    def _scale_offsets(self) -> dict[str, int]:
+        """Seconds by which each time scale is ahead of UTC."""
+        leap_seconds = read_leap_seconds()
+        utc_s = self._host_ns / 1e9
+        return {
+            "utc": 0,
+            "tai": leap_seconds.tai_minus_utc(utc_s),
+            "gps": leap_seconds.gps_minus_utc(utc_s),
+        }
+
+    def _judge(self) -> Iterator[ClockFinding]:
+        """Yield findings about the present state; the last one says that nothing else is known."""
+        if self._sensor.clock is None:
+            yield ClockFinding("no_clock")
+            return
+        state = self._state
+        epoch = self._epoch
+        if state is not None and state.locked is False:
+            yield ClockFinding("not_locked", state=state.meaning)
+        if self._pieces == 0:
+            yield ClockFinding("no_arrival_times" if self._packets else "too_short")
+            return
+        if self._estimate.is_settled and abs(self._estimate.drift_ppm) > self._drift_limit_ppm:
+            yield ClockFinding("drift", value=self._estimate.drift_ppm)
+        offset = self._judge_offset(epoch)
+        if offset is not None:
+            yield offset
+        elif epoch == "boot" or (not epoch and not self._has_date):
+            yield ClockFinding("free_running")
+        elif epoch != "hour" and not self._has_date:
+            yield ClockFinding("unsynchronized", epoch=epoch)
+        elif self._pieces < MIN_PIECES:
+            yield ClockFinding("too_short")
+        else:
+            yield ClockFinding("ok")
+
+    def _judge_offset(self, epoch: str) -> ClockFinding | None:
+        """Return the finding about the offset; None if it fits, or there is nothing to compare."""
+        error_s = self._find_error_s()
+        if math.isnan(error_s) or abs(error_s) < OFFSET_LIMIT_S:
+            return None
+        scales = self._scale_offsets
+        ahead_s = error_s + scales.get(epoch, 0)
+        for scale, seconds in scales.items():
+            if scale != epoch and abs(ahead_s - seconds) < SCALE_TOLERANCE_S:
+                if scale == "utc" and not epoch:
+                    return None
+                return ClockFinding(scale, value=ahead_s, epoch=epoch)
+        if abs(ahead_s + scales["tai"]) < SCALE_TOLERANCE_S:
+            return ClockFinding("behind_utc", value=ahead_s)
+        if abs(abs(error_s) - 1) < SCALE_TOLERANCE_S:
+            return ClockFinding("second_off", value=error_s)
+        if abs(error_s) > WRONG_DATE_S:
+            return ClockFinding("wrong_date", value=error_s)
+        return ClockFinding("offset", value=error_s)
+
+
+def _split(host: Integers) -> list[slice]:
+    """Return slices of packets that arrived within one piece of time."""
+    edges = np.flatnonzero(np.diff(host // PIECE_NS)) + 1
+    starts = [0, *edges.tolist()]
+    ends = [*edges.tolist(), len(host)]
+    return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
+
+
+def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
+    """Return the rows with a known value that differs from the known value before it."""
+    known = np.flatnonzero(~np.isnan(values))
+    previous = np.concatenate([[before], values[known][:-1]])
+    rows: list[int] = known[values[known] != previous].tolist()
+    return rows
+
+
+def _is_at_month_end(host_ns: int) -> bool:
+    """Return whether a time is near the end of a month in UTC, where leap seconds are."""
+    moment = np.datetime64(host_ns, "ns")
+    nearest_day = (moment + np.timedelta64(DAY_S // 2, "s")).astype("datetime64[D]")
+    is_first = nearest_day == nearest_day.astype("datetime64[M]")
+    distance_s = abs((moment - nearest_day) / np.timedelta64(1, "s"))
+    return bool(is_first and distance_s < LEAP_LIMIT_S)
+
+
+def _rank(finding: ClockFinding) -> tuple[int, int]:
+    """Return the key by which findings are sorted: severity, then time."""
+    return finding.severity, finding.host_ns

@@ -1,0 +1,68 @@
+"""Tests of `clock` on recordings: its verdicts, exit codes, and several sources."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.spec import Chunk
+from tests.cli.running import ran
+
+ID = "livox-mid360"
+BEGAN_NS = 1_767_000_000 * 10**9
+PERIOD_NS = 10_000_000
+DELAY_NS = 300_000
+TAI_NS = 37 * 10**9
+
+
+def record(path: Path, *, ahead_ns: int, time_type: int = 1, seconds: int = 2) -> Path:
+    """Write a recording of a sensor whose clock is ahead of the host's, and return its path."""
+    sensor = ls.sensor(ID)
+    frame = sensor.parse(ls.simulate(sensor, 1)[0], sensor.data_frame)
+    frame.time_type = time_type
+    with ls.Recorder(path, ID, "udp://") as recorder:
+        for number in range(seconds * 10**9 // PERIOD_NS):
+            now_ns = BEGAN_NS + number * PERIOD_NS
+            frame.timestamp = now_ns + ahead_ns
+            frame.udp_cnt = number
+            data = sensor.build(sensor.data_frame, frame)
+            recorder.write(Chunk(data, now_ns + DELAY_NS, ("192.168.1.100", 56_300)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "time_type", "options", "verdict"),
+    [
+        (TAI_NS, 1, (), "ok"),
+        (0, 1, (), "utc"),
+        (0, 1, ("-s", ID, "-O", "epoch=utc"), "ok"),
+        (TAI_NS, 1, ("-s", ID, "-O", "epoch=utc"), "tai"),
+        (0, 2, (), "ok"),
+        (TAI_NS, 0, (), "not_locked"),
+    ],
+)
+def test_the_verdict_and_the_exit_code(
+    tmp_path: Path, ahead_ns: int, time_type: int, options: tuple[str, ...], verdict: str
+) -> None:
+    path = record(tmp_path / "drive.lsr", ahead_ns=ahead_ns, time_type=time_type)
+    code = 0 if verdict == "ok" else 1
+    report = json.loads(ran("clock", path, "--json", *options, code=code).stdout)
+    assert report["findings"][0]["code"] == verdict
+    assert (report["packets"], report["sensor"]) == (200, ID)
+    text = ran("clock", path, *options, code=code).stdout
+    assert report["findings"][0]["text"] in text
+    assert report["findings"][0]["advice"] in text
+
+
+def test_sources_are_compared_with_the_first(tmp_path: Path) -> None:
+    first = record(tmp_path / "first.lsr", ahead_ns=TAI_NS)
+    second = record(tmp_path / "second.lsr", ahead_ns=2_000_000, time_type=2)
+    lines = ran("clock", first, second, "--json").stdout.splitlines()
+    reports = [json.loads(line) for line in lines]
+    assert [report["source"] for report in reports] == [str(first), str(second)]
+    assert reports[0]["to_first_s"] is None
+    assert reports[1]["to_first_s"] == pytest.approx(2e-3, abs=1e-6)
+    assert "+2.00 ms to the first source" in ran("clock", first, second).stdout
