@@ -60,8 +60,8 @@ class Sensor(SensorDescription):
         turn: the slowest and the fastest number of scans a second.
         relatives: ids of related models, installed or not, with the difference: a text if the pace
             of the clock or the model in `info` shows it, a `Relative` if single packets show it.
-        info: fields with information about the device: "serial", "firmware", "model" or
-            "temperature" -> "frame.path".
+        info: fields with information about the device: name -> "frame.path", or a `Reported`. The
+            names "serial", "firmware", "model" and "temperature" have a meaning for all sensors.
         status: how it was verified: "manual", "vectors", "capture" or "hardware".
         source: the manual with its revision and sections, and the captures.
         aliases: other ids of the sensor. An installed plugin declares them as entry points, which

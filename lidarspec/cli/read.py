@@ -32,7 +32,7 @@ from lidarspec.cli.options import (
 )
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.errors import UnknownFrame, UsageError
+from lidarspec.errors import UnknownFrame, UsageError, printable
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, TimeSlice
@@ -297,7 +297,12 @@ class StatsPrinter:
         """Print the values of the whole input."""
         if self.as_json:
             self._emit(
-                {"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()}
+                {
+                    "kind": "summary",
+                    **self._figures(reading),
+                    "stats": self.device.stats.to_dict(),
+                    "info": self.device.info,
+                }
             )
             return
         if reading.seconds:
@@ -312,6 +317,8 @@ class StatsPrinter:
         for name, unit, _, text in FIGURES:
             if text(reading) != "-":
                 say(f"  {name:<8} {text(reading):>10} {unit}")
+        for fact, value in self.device.info.items():
+            say(f"  {fact}: {printable(value)}")
 
     def _figures(self, reading: MeterReading) -> dict[str, Any]:
         facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}

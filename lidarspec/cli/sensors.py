@@ -156,15 +156,12 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         f"  link    {links}\n{_format_range(sensor)}  losses  {losses}"
         f"\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
-    units = {role: _format_unit(sensor, path) for role, path in sensor.info.items()}
-    parts += (
-        [
-            "  reports "
-            f"{', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"
+    if sensor.info:
+        facts = [
+            f"{name} ({fact.paths[0]}{_format_unit(sensor, fact.paths[0])})"
+            for name, fact in sensor.reported.items()
         ]
-        if sensor.info
-        else []
-    )
+        parts.append(f"  reports {', '.join(facts)}")
     parts += [f"  command {name}{_format_command(sensor, name)}" for name in sensor.commands]
     for name, frame in sensor.frames.items():
         rows = [
@@ -290,7 +287,7 @@ def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "frames": list(sensor.frames),
         "commands": list(sensor.commands),
         **facts(sensor, "range_limits"),
-        "info": dict(sensor.info),
+        "info": {name: fact.paths[0] for name, fact in sensor.reported.items()},
     }
 
 

@@ -43,6 +43,8 @@ from lidarspec.transports.udp import (
 )
 
 LOOPBACK = "lo"
+#: the reported facts that identify a device.
+IDENTITY = ("serial", "firmware", "model", "temperature")
 
 
 @dataclass(frozen=True)
@@ -395,7 +397,9 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
             " the cable, the ground connection and the baud rate",
         )
     device = "".join(
-        f", {role} {text}" for role, text in read_info(score.sensor, score.found).items()
+        f", {name} {text}"
+        for name, text in read_info(score.sensor, score.found).items()
+        if name in IDENTITY
     )
     return Diagnosis(
         True,

@@ -33,19 +33,20 @@ from lidarspec.detect.uninstalled_sensors import suggest_installation
 from lidarspec.device.named_devices import find_device
 from lidarspec.drafting.checksum_search import search
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
-from lidarspec.expressions.columns import Fields
+from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import get_codec
-from lidarspec.framing.results import VALID, Found
+from lidarspec.framing.results import VALID, Found, Frames, pack_found
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import registry, sensor as named_sensor, sensors
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import simulate
-from lidarspec.spec.description import Relative
+from lidarspec.spec.description import Relative, Reported
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
@@ -142,7 +143,7 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     )
     if fits or not names:
         return ""
-    return f"{sensor.info['model']} is {names[0]}"
+    return f"{sensor.reported['model'].paths[0]} is {names[0]}"
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
@@ -273,7 +274,7 @@ def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return the evidence that the frames name the model of a sensor, or ""."""
     return next(
         (
-            f"{sensor.info['model']} is {text}"
+            f"{sensor.reported['model'].paths[0]} is {text}"
             for text in _read_model_names(sensor, frames)
             if _normalise(text) == _normalise(sensor.model)
         ),
@@ -283,7 +284,9 @@ def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 def _read_model_names(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
     """Return the model names in the first frames with the field `info["model"]`."""
-    frame, _, path = sensor.info.get("model", "").partition(".")
+    if "model" not in sensor.reported:
+        return []
+    frame, _, path = sensor.reported["model"].paths[0].partition(".")
     named_frames = (item for item in frames if item.frame == frame)
     names = []
     for item in itertools.islice(named_frames, MAX_NAMED_FRAMES):
@@ -300,27 +303,57 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     Returns:
         Role -> text, for example "serial" -> "A1234". Numbers are followed by their unit.
     """
-    last = {item.frame: item for item in frames}
+    items = sorted(frames, key=lambda item: item.offset)
     texts = dict[str, str]()
-    for role, path in sensor.info.items():
-        frame, _, field_path = path.partition(".")
-        if frame in last:
-            value, info = _read_field(sensor, last[frame], field_path)
-            if isinstance(value, list):
-                texts[role] = ".".join(map(str, value))  # a version
-            elif isinstance(value, bytes):
-                content = value.rstrip(b"\0 ")
-                if content.isascii() and content.decode("ascii").isprintable():
-                    texts[role] = content.decode("ascii")
-                else:
-                    texts[role] = value.hex()
-            else:
-                texts[role] = _describe_value(value, info) or (
-                    f"{info.physical(value):g} {info.unit}".rstrip()
-                    if isinstance(value, int | float)
-                    else f"{value}"
-                )
+    for role, fact in sensor.reported.items():
+        reporting = [item for item in items if _reports(sensor, fact, item)]
+        if reporting:
+            item = reporting[-1]
+            texts[role] = _describe_fact(fact, *_read_field(sensor, item, fact.path_in(item.frame)))
     return {role: text for role, text in texts.items() if text}
+
+
+def _reports(sensor: Sensor, fact: Reported, item: Found) -> bool:
+    """Return whether a frame contains a fact."""
+    if not fact.path_in(item.frame):
+        return False
+    return bool(find_reporting(sensor, fact, item.frame, pack_found([item]))[0])
+
+
+def find_reporting(
+    sensor: SensorDescription, fact: Reported, name: str, frames: Frames
+) -> NDArray[np.bool_]:
+    """Return a mask of the frames of one type that contain a fact, (n,).
+
+    Args:
+        name: the name of the frame type.
+    """
+    if fact.where is None or not len(frames):
+        return np.ones(len(frames), np.bool_)
+    table = get_codec(sensor.frames[name]).gather(frames)
+    batch = Batch(table, np.zeros(len(frames), np.bool_), {}, sensor.state)
+    with np.errstate(all="ignore"):
+        mask = np.asarray(fact.where(Fields(batch)), np.bool_)
+    return np.broadcast_to(mask.reshape(-1), (len(frames),))
+
+
+def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
+    """Return a reported value as text."""
+    if fact.text is not None:
+        return fact.text(value)
+    if isinstance(value, list):
+        return ".".join(map(str, value))  # a version
+    if isinstance(value, bytes):
+        content = value.rstrip(b"\0 ")
+        if content.isascii() and content.decode("ascii").isprintable():
+            return content.decode("ascii")
+        return value.hex()
+    meaning = _describe_value(value, info)
+    if meaning:
+        return meaning
+    if isinstance(value, int | float):
+        return f"{info.physical(value):g} {info.unit}".rstrip()
+    return f"{value}"
 
 
 def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:

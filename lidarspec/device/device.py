@@ -147,9 +147,9 @@ class Device(ClosingContext):
 
     @property
     def info(self) -> dict[str, str]:
-        """The identity that the sensor has reported so far.
+        """The facts that the sensor has reported about itself so far, by name.
 
-        Possible keys are "serial", "firmware", "model" and "temperature". Values that no frame has
+        Many sensors report "serial", "firmware", "model" or "temperature". Facts that no frame has
         reported are missing.
         """
         return read_info(self.sensor, self._input.info_frames.values())

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.captures.bulk import CapturedDatagrams
-from lidarspec.detect.identification import read_info
+from lidarspec.detect.identification import find_reporting, read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, needs_first_frames
 from lidarspec.device.sender_filter import SenderCheck, frame_senders
 from lidarspec.device.session import Reply
@@ -28,6 +28,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
+from lidarspec.spec.description import Reported
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, Transport
@@ -61,7 +62,7 @@ class DeviceInput(Protocol):
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
-        info_frames: the last frame of each type with a field of `Sensor.info`, from any link.
+        info_frames: the last frame that contained each fact of `Sensor.info`, from any link.
     """
 
     is_live: bool = False
@@ -72,22 +73,28 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Keep the latest frame of each type that has a field of `Sensor.info`.
+        """Keep the latest frame that contains each fact of `Sensor.info`.
 
         A frame that contains other frames is ignored if it lacks values of an earlier frame.
         """
         for frames in batches:
-            for name in self.sensor.info_frames:
-                if name not in frames.names:
-                    continue
-                rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
-                for item in frames.select(rows[-1:]).found():
-                    if not self._lacks_values(item):
-                        self.info_frames = {**self.info_frames, name: item}
+            for role, fact in self.sensor.reported.items():
+                for name in frames.names:
+                    if fact.path_in(name):
+                        self._store_info_frame(role, fact, name, frames)
 
-    def _lacks_values(self, item: Found) -> bool:
+    def _store_info_frame(self, role: str, fact: Reported, name: str, frames: Frames) -> None:
+        """Keep the last frame of a type that contains a fact."""
+        rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
+        if fact.where is not None:
+            rows = rows[find_reporting(self.sensor, fact, name, frames.select(rows))]
+        for item in frames.select(rows[-1:]).found():
+            if not self._lacks_values(role, item):
+                self.info_frames = {**self.info_frames, role: item}
+
+    def _lacks_values(self, role: str, item: Found) -> bool:
         """Return whether a frame with frames in it lacks values of an earlier frame."""
-        earlier = self.info_frames.get(item.frame)
+        earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False
         return not read_info(self.sensor, [earlier]).keys() <= read_info(self.sensor, [item]).keys()

@@ -88,6 +88,7 @@ class SensorContent:
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
         verb: the verb of the command line that shows the data.
+        info: the facts that the sensor reports about itself in that part, by name.
     """
 
     source: str
@@ -96,6 +97,7 @@ class SensorContent:
     options: str = ""
     reading: MeterReading | None = None
     verb: str = "view"
+    info: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def command(self) -> str:
@@ -286,9 +288,9 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
         if (declared := find_declared_sensor(contents.path)) is not None:
-            reading = _measure_rates(contents.path, declared)
+            reading, info = _measure_rates(contents.path, declared)
             verb = verb_to_show(declared)
-            return [SensorContent(contents.path, (declared.id,), None, "", reading, verb)]
+            return [SensorContent(contents.path, (declared.id,), None, "", reading, verb, info)]
     except LidarSpecError as error:
         contents.warnings.append(str(error))
     verdicts = identify_senders(contents.path)
@@ -306,29 +308,31 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
     if not verdict.candidates:
         return SensorContent(source, tuple(list_candidates(verdict)))
     best = verdict.candidates[0]
+    reading, info = _measure_rates(source, best.sensor)
     return SensorContent(
         source,
         tuple(list_candidates(verdict)),
         best.share,
         format_sensor_options(best.sensor),
-        _measure_rates(source, best.sensor),
+        reading,
         verb_to_show(best.sensor),
+        info,
     )
 
 
-def _measure_rates(source: str, sensor: Sensor) -> MeterReading | None:
-    """Return the statistics of a sensor at the beginning of a file.
+def _measure_rates(source: str, sensor: Sensor) -> tuple[MeterReading | None, dict[str, str]]:
+    """Return the statistics of a sensor at the beginning of a file, and the facts it reports.
 
-    Returns None if the frames cannot be decoded.
+    Returns None and no facts if the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:
             live = open_live(device)
             while not live.ended and device.stats.bytes_in < MAX_DECODED_BYTES:
                 live.read(0.0)
-            return live.meter.summary(device.stats)
+            return live.meter.summary(device.stats), device.info
     except LidarSpecError:
-        return None
+        return None, {}
 
 
 def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
@@ -404,4 +408,6 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
             lost = f", lost {reading.loss_rate:.3%}"
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
+    for name, text in content.info.items():
+        yield name.replace("_", " "), text
     yield "next", content.command

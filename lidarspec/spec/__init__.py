@@ -7,7 +7,7 @@ A plugin imports from here and from `lidarspec` alone. In: the facts of a manual
 `Sensor`, which is checked when it is made. All other packages are functions of its description.
 Nothing in this package reads a stream. Modules in reading order:
 
-* `description`: `Frame`, `Command`, `Simulation`, `Relative`.
+* `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
 * `sensor`: `SensorDescription`, which combines all of these; `Sensor`, in
   `lidarspec.sensor_operations`, is a description with the engines as methods.
 * `options`: the values that options of `configure` take, from their annotations.
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         Command as Command,
         Frame as Frame,
         Relative as Relative,
+        Reported as Reported,
         Simulation as Simulation,
     )
     from lidarspec.spec.fields import (
@@ -124,7 +125,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "sensor_operations": ("Sensor",),
     "spec.options": ("Learned",),
-    "spec.description": ("Frame", "Command", "Relative", "Simulation"),
+    "spec.description": ("Frame", "Command", "Relative", "Reported", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": (

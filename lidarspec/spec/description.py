@@ -315,6 +315,49 @@ class Relative:
     sends: Callable[[Any], Any]
 
 
+@dataclass(frozen=True)
+class Reported:
+    """A fact that the sensor reports about itself (`Sensor.info`).
+
+    Args:
+        paths: the field, as "frame.path". If several frame types have the fact, the last frame that
+            arrived counts.
+        where: a function of `Fields` that is True for the frames of the type that contain the fact;
+            None for all frames.
+        text: a function from the raw value to a text; by default the name of the value, or the
+            value with its unit. "" leaves the fact out.
+    """
+
+    paths: tuple[str, ...]
+    where: Callable[[Any], Any] | None = None
+    text: Callable[[Any], str] | None = None
+
+    def __init__(
+        self,
+        *paths: str,
+        where: Callable[[Any], Any] | None = None,
+        text: Callable[[Any], str] | None = None,
+    ) -> None:
+        object.__setattr__(self, "paths", paths)
+        object.__setattr__(self, "where", where)
+        object.__setattr__(self, "text", text)
+
+    @classmethod
+    def of(cls, declared: str | Reported) -> Reported:
+        """Return an entry of `Sensor.info`; a path alone is a fact in all frames of its type."""
+        if isinstance(declared, str):
+            return cls(declared)
+        return declared
+
+    def path_in(self, frame: str) -> str:
+        """Return the path of the field in a frame type; "" if the type lacks the fact."""
+        for path in self.paths:
+            name, _, field = path.partition(".")
+            if name == frame:
+                return field
+        return ""
+
+
 class FrameTypes(dict[str, Frame]):
     """The frame types of a sensor by name; a missing name raises `UnknownFrame`."""
 

@@ -34,6 +34,7 @@ from lidarspec.spec.description import (
     Frame,
     FrameTypes,
     Relative,
+    Reported,
     Simulation,
     check_simulation,
     freeze,
@@ -51,8 +52,8 @@ if TYPE_CHECKING:
 #: version of the plugin interface; the engine reads this one and the previous one.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
-#: the keys of `Sensor.info`.
-ROLES = ("serial", "firmware", "model", "temperature")
+#: a valid key of `Sensor.info`.
+_FACT = re.compile(r"[a-z][a-z0-9_]*")
 #: names of the returns of a firing; "varying" if a setting of the sensor decides.
 RETURN_NAMES = ("first", "last", "strongest", "second strongest", "varying")
 #: directions of the vendor's axes; in REP-103 x points forward, y left and z up.
@@ -100,7 +101,7 @@ class SensorDescription:
     returns: tuple[str, ...] = field(default=(), kw_only=True)
     turn: tuple[float, float] | None = field(default=None, kw_only=True)
     relatives: Mapping[str, str | Relative] = field(default_factory=dict, kw_only=True)
-    info: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    info: Mapping[str, str | Reported] = field(default_factory=dict, kw_only=True)
     status: str = field(kw_only=True)
     source: str = field(kw_only=True)
     aliases: tuple[str, ...] = field(default=(), kw_only=True)
@@ -174,9 +175,15 @@ class SensorDescription:
         return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
 
     @cached_property
+    def reported(self) -> Mapping[str, Reported]:
+        """The facts that the sensor reports about itself (`info`), by name."""
+        return {name: Reported.of(declared) for name, declared in self.info.items()}
+
+    @cached_property
     def info_frames(self) -> tuple[str, ...]:
         """The names of the frame types with information about the device (`info`)."""
-        return tuple(dict.fromkeys(path.partition(".")[0] for path in self.info.values()))
+        paths = [path for fact in self.reported.values() for path in fact.paths]
+        return tuple(dict.fromkeys(path.partition(".")[0] for path in paths))
 
     def points_of(self, frame: str) -> Callable[[Any], Points]:
         """Return the `points` function of a frame type.
@@ -348,10 +355,10 @@ def _check_facts(sensor: SensorDescription) -> None:
                 sensor=sensor.id,
                 rule=frame.endless.rule,
             )
-    unknown_roles = sorted(set(sensor.info) - set(ROLES))
-    if unknown_roles:
+    wrong_names = [name for name in sensor.info if not _FACT.fullmatch(name)]
+    if wrong_names:
         raise SpecError(
-            f"unknown name {unknown_roles[0]!r}: expected one of {', '.join(ROLES)}",
+            f"{wrong_names[0]!r} is not a valid name: use lower-case letters, digits and _",
             path="info",
             sensor=sensor.id,
         )

@@ -50,7 +50,8 @@ def _accepts(sensor: ls.Sensor, other: ls.Sensor) -> bool:
 @EACH_MODULE
 def test_device_information_is_a_field_of_an_incoming_frame(module: str) -> None:
     for sensor in sensors_in(module):
-        for role, path in sensor.info.items():
+        paths = [(role, path) for role, fact in sensor.reported.items() for path in fact.paths]
+        for role, path in paths:
             name, _, field = path.partition(".")
             assert name in sensor.incoming, f"{sensor.id} {role}: {path}"
             assert field in make_schema(sensor.frames[name].tree).scan_names, (
