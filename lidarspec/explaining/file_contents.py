@@ -23,7 +23,7 @@ from lidarspec.detect.identification import (
     verb_to_show,
 )
 from lidarspec.device.device import Device
-from lidarspec.errors import LidarSpecError, UsageError, suggest
+from lidarspec.errors import LidarSpecError, UsageError, printable, suggest
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
 from lidarspec.sensor_operations import Sensor
@@ -409,5 +409,5 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
     for name, text in content.info.items():
-        yield name.replace("_", " "), text
+        yield name.replace("_", " "), printable(text)
     yield "next", content.command

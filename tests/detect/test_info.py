@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import pytest
+
 import lidarspec as ls
+from lidarspec import SpecError
 from lidarspec.detect.doctor import examine
 from lidarspec.detect.identification import read_info
 from lidarspec.framing.results import Found
+from lidarspec.spec import Reported
 from tests.cli.running import ran
 from tests.made_captures import frame, pcap
+from tests.packets.test_returns import make_packet
+from tests.shapes import SHAPES
 
 
 def test_texts_bytes_and_numbers_with_units_are_formatted() -> None:
@@ -46,3 +53,29 @@ def test_show_prints_path_and_unit() -> None:
         "reports temperature (position.top_board_temperature, degC)"
         in ran("show", "velodyne-vlp16").stdout
     )
+
+
+def test_a_fact_is_in_the_frames_where_its_condition_holds(tmp_path: Path) -> None:
+    reported = Reported(
+        "data.number", where=lambda f: f.second == 1, text=lambda number: f"number {number}"
+    )
+    pairs = dataclasses.replace(
+        SHAPES["shape-pairs"], info={"last_second": reported, "number": "data.number"}
+    )
+    packets = [make_packet(index) for index in range(7)]
+    path = tmp_path / "a.pcap"
+    path.write_bytes(pcap(*(frame(packet) for packet in packets)))
+    with ls.open(path, pairs) as device:
+        for _ in device.scans():
+            pass
+        assert device.info == {"last_second": "number 6", "number": "7"}
+    found = [Found("data", index, packet) for index, packet in enumerate(packets)]
+    assert read_info(pairs, found) == device.info
+    assert "last_second" not in read_info(pairs, found[:1])
+
+
+def test_names_of_facts_are_checked() -> None:
+    with pytest.raises(SpecError):
+        dataclasses.replace(SHAPES["shape-pairs"], info={"Serial number": "data.number"})
+    with pytest.raises(SpecError):
+        dataclasses.replace(SHAPES["shape-pairs"], info={"serial": Reported("nothing.number")})

@@ -9,8 +9,9 @@ Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1
 Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset",
 and is the packet's timestamp plus time_offset; the offset 32768 of the angles is only on the M1P's
 next page; z of the worked example is printed as 2.17 and is 2.1647; the formula raw - 80 of
-mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept; 750 000 points per
-second do not agree with 630 packets in a frame (787 500).
+mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept unless the option
+`firmware` names the formula; 750 000 points per second do not agree with 630 packets in a frame
+(787 500).
 
 DIFOP has three layouts from byte 28 on, without a number that identifies them: that of rs_driver
 since December 2023 (`difop`), that of the driver before, with the field of view (`difop_fov`), and
@@ -21,8 +22,10 @@ is `difop_other`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from construct import (
@@ -31,6 +34,7 @@ from construct import (
     Check,
     Const,
     Construct,
+    Int8sb,
     Int8ub,
     Int16ub,
     Int24ub,
@@ -46,6 +50,7 @@ from lidarspec.spec import (
     OnRewind,
     PacketCounter,
     Polar,
+    Reported,
     Scaled,
     Sensor,
     Simulation,
@@ -63,7 +68,7 @@ BLOCK_PERIOD_S = 10e-6 / 3  # the M1P guide's capture has blocks at 0, 3, 7, 10,
 BLOCK_OFFSETS_S = np.round(np.arange(BLOCKS) * BLOCK_PERIOD_S, 6)  # rounded as by the sensor
 SIMULATED_LINE_FIRINGS = 125  # per line, which gives 126 lines 0.2 degrees apart
 
-HEADER: tuple[Construct, ...] = (
+HEADER_START: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
     "pkt_psn" / Int16ub * "packet counter within the frame; M1: 1 to 630, with dual return to 1260",
     "protocol_version" / Int16ub,
@@ -72,10 +77,16 @@ HEADER: tuple[Construct, ...] = (
     *TIME,
     "reserved" / Bytes(10),
     "lidar_type" / Int8ub * "0x10: M1",
-    "mems_tmp" / Int8ub * "degC + 80, or signed degC, by firmware",
 )
-DATA = Struct(
-    *HEADER,
+#: Firmware -> temperature of the mirror. "current": as in the M1P user guide and rs_driver; "2021":
+#: as in rs_driver of April 2021; "": unknown.
+TEMPERATURES: dict[str, Construct] = {
+    "": "mems_tmp" / Int8ub * "degC + 80, or signed degC, by firmware",
+    "current": "mems_tmp" / Scaled(Int8ub, 1, "degC", offset=-80),
+    "2021": "mems_tmp" / Scaled(Int8sb, 1, "degC"),
+}
+HEADER = (*HEADER_START, TEMPERATURES[""])
+BLOCKS_AND_TAIL: tuple[Construct, ...] = (
     "blocks"
     / Array(
         BLOCKS,
@@ -97,6 +108,7 @@ DATA = Struct(
     ),
     "tail" / Bytes(3) * "reserved",
 )
+DATA = Struct(*HEADER, *BLOCKS_AND_TAIL)
 
 #: The first 28 bytes of every DIFOP.
 DIFOP_HEAD: tuple[Construct, ...] = (
@@ -165,6 +177,15 @@ def count_returns(f: Fields) -> Any:
     return np.where(f.wave_mode == 0, 2, 1)
 
 
+def number_firings(f: Fields, blocks: int) -> Any:
+    """Return the number of the firing of each block in its frame.
+
+    With dual return, the packets of a pair have the same numbers.
+    """
+    packet = f.pkt_psn - 1
+    return np.where(f.wave_mode == 0, np.floor(packet / 2), packet) * blocks + f.blocks.index
+
+
 def pace(f: Fields) -> Any:
     """Return the seconds from a packet to the next."""
     return 1 / (FRAME_RATE_HZ * packets_per_frame(f))
@@ -179,7 +200,6 @@ def points(f: Fields) -> Polar:
     Source: M1P user guide, page 13.
     """
     channels = f.blocks.channels
-    measurement = np.where(f.wave_mode == 0, np.floor((f.pkt_psn - 1) / 2), f.pkt_psn - 1)
     return Polar(
         range=channels.radius,
         azimuth=np.deg2rad(channels.azimuth),
@@ -188,7 +208,7 @@ def points(f: Fields) -> Polar:
         time=f.blocks.time_offset,
         ring=np.arange(CHANNELS),
         return_index=np.maximum(f.blocks.return_seq - 1, 0),
-        column=measurement * BLOCKS + f.blocks.index,
+        column=number_firings(f, BLOCKS),
     )
 
 
@@ -209,8 +229,11 @@ def simulated_angles(number: int) -> tuple[Any, Any]:
     return np.repeat(elevation[:, None], CHANNELS, axis=1), azimuth
 
 
-def sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i with single return."""
+def sweep(i: int, temperature: int = 105) -> dict[str, Any]:
+    """Return the values of simulated packet i with single return.
+
+    `temperature` is the raw byte, or degC if the firmware is known.
+    """
     number = i % SINGLE_RETURN_PACKETS
     time = i / (SINGLE_RETURN_PACKETS * FRAME_RATE_HZ)
     elevation, azimuth = simulated_angles(number)
@@ -222,7 +245,7 @@ def sweep(i: int) -> dict[str, Any]:
         "seconds": int(time),
         "microseconds": time % 1,
         "lidar_type": 0x10,
-        "mems_tmp": 105,
+        "mems_tmp": temperature,
         "blocks.time_offset": BLOCK_OFFSETS_S,
         "blocks.channels.elevation": elevation,
         "blocks.channels.azimuth": azimuth,
@@ -248,6 +271,44 @@ def sweep_difop(i: int) -> dict[str, Any]:
     }
 
 
+def configure(sensor: Sensor, /, *, firmware: Literal["current", "2021"]) -> Sensor:
+    """Return the sensor with a temperature in degC.
+
+    Args:
+        firmware: "current" if the byte is degC + 80 (M1P user guide, rs_driver), "2021" if it is
+            signed degC (rs_driver of April 2021).
+    """
+    struct = Struct(*HEADER_START, TEMPERATURES[firmware], *BLOCKS_AND_TAIL)
+    data = dataclasses.replace(sensor.frames["data"], struct=struct)
+    return dataclasses.replace(
+        sensor,
+        frames={**sensor.frames, "data": data},
+        simulation=Simulation(functools.partial(sweep, temperature=25)),
+        info={**sensor.info, "temperature": "data.mems_tmp"},
+    )
+
+
+def in_each_layout(field: str, text: Callable[[Any], str] | None = None) -> Reported:
+    """Return a fact that all known layouts of DIFOP contain."""
+    return Reported(*(f"{name}.{field}" for name in LAYOUTS), text=text)
+
+
+def describe_raw(values: Any) -> str:
+    """Return measured values whose unit is not documented."""
+    numbers = ", ".join(map(str, values if isinstance(values, list) else [values]))
+    return f"{numbers} (raw, the unit is not documented)"
+
+
+def describe_faults(code: int) -> str:
+    """Return the fault status; its bits are not documented."""
+    if code == 0:
+        return "none"
+    return f"code {code:#04x} (not documented)"
+
+
+#: The known layouts of DIFOP; only the first two have the serial number, currents and voltages.
+LAYOUTS = ("difop", "difop_fov", "difop_guide")
+
 M1 = Sensor(
     "robosense-m1",
     vendor="RoboSense",
@@ -271,7 +332,19 @@ M1 = Sensor(
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
     turn=(FRAME_RATE_HZ, FRAME_RATE_HZ),
-    info={"serial": "difop.serial_number", "firmware": "difop.pl_firmware"},
+    configure=configure,
+    info={
+        "serial": Reported("difop.serial_number", "difop_fov.serial_number"),
+        "firmware": in_each_layout("pl_firmware"),
+        "ps_firmware": in_each_layout("ps_firmware"),
+        "return_mode": in_each_layout("return_mode"),
+        "sync_mode": in_each_layout("time_sync_mode"),
+        "sync_status": in_each_layout("time_sync_status"),
+        "voltages": Reported("difop.voltages", "difop_fov.voltages", text=describe_raw),
+        "currents": Reported("difop.currents", "difop_fov.currents", text=describe_raw),
+        "battery_voltage": Reported("difop_guide.battery_voltage", text=describe_raw),
+        "faults": Reported("difop_guide.faults", text=describe_faults),
+    },
     status="vectors",
     source=(
         "RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver"

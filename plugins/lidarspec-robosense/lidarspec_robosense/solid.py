@@ -43,7 +43,7 @@ from lidarspec.spec import (
     Simulation,
     stack,
 )
-from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1
+from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1, count_returns, number_firings
 from lidarspec_robosense.rotor import TIME, make_clock_status
 
 # return modes
@@ -216,7 +216,8 @@ def points(f: Fields, returns: bool = False) -> Polar:
     """Return a point of each channel.
 
     The length of the vector, 1 except for its rounding, is part of the range, as in rs_driver.
-    `returns` is whether blocks have the number of the return.
+    `returns` is whether blocks have the number of the return. Two packets then contain the returns
+    of the same firings, as assumed from the M1.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
@@ -224,6 +225,7 @@ def points(f: Fields, returns: bool = False) -> Polar:
     other_columns = {
         "intensity": channels.intensity,
         "return_index": echo,
+        "column": number_firings(f, M2_SCANNER.blocks) if returns else None,
         "extra": {"attribute": channels.attribute},
     }
     return Polar(range=channels.radius * length, **common_columns(f), **other_columns)
@@ -297,6 +299,9 @@ MX_DIFOP = Struct(
     "reserved_44" / Bytes(212),
 )
 
+M2_TIMING = make_counter(M2_SCANNER, (DUAL,))
+M2_TIMING["sequence"] = dataclasses.replace(M2_TIMING["sequence"], returns=count_returns)
+
 M2 = dataclasses.replace(
     M1,
     id="robosense-m2",
@@ -310,8 +315,9 @@ M2 = dataclasses.replace(
         ),
     },
     points=partial(points, returns=True),
-    **make_counter(M2_SCANNER, (DUAL,)),
+    **M2_TIMING,
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
+    configure=None,
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     status="manual",
     source="rs_driver (decoder_RSM2.hpp); not tested with packets of this model",
