@@ -642,10 +642,15 @@ def _summarize_link(link: Link) -> KnownLink:
     if isinstance(link, Serial):
         return KnownLink(kind, link.bauds)
     if isinstance(link, Udp):
-        return KnownLink(kind, link.ports or (link.broadcast,))
+        return KnownLink(kind, link.ports or _list_port(link.broadcast))
     if isinstance(link, Tcp | Http):
-        return KnownLink(kind, (link.port,))
+        return KnownLink(kind, _list_port(link.port))
     return KnownLink(kind)
+
+
+def _list_port(port: int) -> tuple[int, ...]:
+    """Return a port; nothing for 0."""
+    return (port,) if port else ()
 
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:

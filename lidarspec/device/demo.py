@@ -8,6 +8,7 @@ decoded and has to give the same points.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import socket
@@ -25,7 +26,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
-from lidarspec.spec.links import Serial
+from lidarspec.spec.links import Serial, Tcp
 from lidarspec.transports.base import data_link
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
@@ -124,19 +125,23 @@ def _run_live(
 ) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """Run a live session and record it; return address, replies, scans and counters."""
     if sensor.datagrams:
-        port = _free_port()
-        address = f"udp://{LOCALHOST}:{port}"
-        with (
-            open_device(address, sensor, start=False, record=path) as device,
-            Served(simulated, make_simulated_outlet(sensor, address)) as served,
-        ):
-            return address, *_read(device, served, turns)
+        outlet = make_simulated_outlet(sensor, f"udp://{LOCALHOST}:{_free_port()}")
+        with contextlib.ExitStack() as stack:
+            stack.callback(outlet.close)
+            device = stack.enter_context(
+                open_device(outlet.source, sensor, start=False, record=path)
+            )
+            served = stack.enter_context(Served(simulated, outlet))
+            return outlet.source, *_read(device, served, turns)
     if has_terminals() and data_link(sensor, Serial):
         destination = "pty"
     else:
         destination = f"tcp://{LOCALHOST}:0"
+    # A connection whose port is reported is opened only after a command.
+    link = data_link(sensor, Tcp)
+    patient = link is None or not link.reported
     with (
-        Served(simulated, make_simulated_outlet(sensor, destination), patient=True) as served,
+        Served(simulated, make_simulated_outlet(sensor, destination), patient=patient) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
         return served.path, *_read(device, served, turns)

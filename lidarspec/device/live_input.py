@@ -36,8 +36,7 @@ from lidarspec.framing.decoder import Decoder, select_backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.sensor_operations import Sensor
-from lidarspec.spec.arguments import Address
-from lidarspec.spec.links import Http, Link, Udp
+from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.transports.addresses import find_own_address
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import control_link, has_control
@@ -53,6 +52,8 @@ SENDER_TIMEOUT_S = 0.9
 MAX_CHUNKS = 4096
 #: maximum number of batches that are kept for `next` while commands are sent.
 MAX_READY_BATCHES = 4096
+#: pause before the commands for opening are sent again, if the port of the data is unknown.
+REPEAT_PAUSE_S = 1.0
 #: time limit for all commands on closing.
 SHUTDOWN_TIMEOUT_S = 4.0
 
@@ -115,7 +116,9 @@ class LiveInput(DeviceInput):
         self._decoder_lock = threading.RLock()
         self._session_lock = threading.RLock()
         self._decode_due_s = 0.0  # time of the next decoding, by `time.monotonic`
+        self._repeat_due_s = 0.0  # time of the next request for the port of the data
         self._was_opened = False  # whether the commands for opening were sent
+        self._has_begun = False  # whether `begin` has returned
         self._closed = False
         self._failure: SourceError | None = None
         self.stays_on = False
@@ -199,8 +202,11 @@ class LiveInput(DeviceInput):
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
                 self.learned |= learn_options(self.sensor, reply)
+            if self._failure is not None:
+                raise self._failure
             if self._learning_commands and name == self._learning_commands[-1]:
                 self._apply_learned_options()
+        self._has_begun = True
 
     def _apply_learned_options(self) -> None:
         """Configure the sensor with the reported options, and discard all earlier data."""
@@ -261,7 +267,7 @@ class LiveInput(DeviceInput):
                 command.timeout * (1 + command.retries) if timeout is None else timeout,
             )
         with self._session_lock:
-            self._find_own_address(name)
+            self._find_own_endpoint(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
             self._send_outgoing()
         while not pending.done:
@@ -283,12 +289,12 @@ class LiveInput(DeviceInput):
                 remarks = []
             raise type(error)("; ".join([str(error), *remarks])) from None
 
-    def _find_own_address(self, name: str) -> None:
-        """Find this computer's address and pass it to the session, if a command needs it."""
+    def _find_own_endpoint(self, name: str) -> None:
+        """Set address and port of the session, if a command contains them."""
         command = self.sensor.commands.get(name)
-        if command is not None and any(
-            isinstance(value, Address) for value in command.filled.values()
-        ):
+        if command is not None and command.has_own_port:
+            self._session.port = self._captures["data"].transport.own_port
+        if command is not None and command.has_own_address:
             peer = self._open_link(command.link).peer()
             self._session.host = find_own_address(peer) if peer else None
 
@@ -400,6 +406,8 @@ class LiveInput(DeviceInput):
                 self._send_outgoing()
         if self._restart_replies:
             self._warn_if_changed()
+        elif self._captures["data"].transport.awaits_port and self._has_begun:
+            self._request_port_again()
         elif (
             silent := list(self._session.unanswered.values())
         ) and silent != self._handled_silence:
@@ -418,6 +426,7 @@ class LiveInput(DeviceInput):
             )
             if item is LinkEvent.LOST:
                 with self._session_lock:
+                    self._session.provided.pop(self._reported_port_name, None)
                     self._session.abandon(
                         "the connection was lost", None if link == "data" else link
                     )
@@ -498,16 +507,48 @@ class LiveInput(DeviceInput):
                 at = self._clock.now() if item.at is None else item.at
                 self._session.receive([item], at, link=link)
             if awaited:
+                self._connect_to_reported_port()
                 self._send_outgoing()
         if link == "data":
             self._link_state.record_frames(batches)
             if interrupted or any(map(len, batches)):
                 self._ready.append(FrameBatch(batches, interrupted=interrupted))
 
+    @property
+    def _reported_port_name(self) -> str:
+        """The name of the value with the port of the data; "" if the port is fixed."""
+        link = self.sensor.links.get("data")
+        return link.reported if isinstance(link, Tcp) else ""
+
+    def _connect_to_reported_port(self) -> None:
+        """Connect to the port of the data, if a reply has just reported it.
+
+        The next command may start the data, so that it must not be sent before.
+        """
+        transport = self._captures["data"].transport
+        port = self._session.provided.get(self._reported_port_name)
+        if not transport.awaits_port or port is None:
+            return
+        try:
+            transport.connect_to(port)
+        except SourceError as error:
+            self._session.provided.pop(self._reported_port_name)
+            self._session.abandon(str(error))
+            if not self._has_begun:
+                self._failure = error
+
+    def _request_port_again(self) -> None:
+        """Send the opening commands again after a pause."""
+        if time.monotonic() >= self._repeat_due_s:
+            self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
+            self._restart_sensor()
+
     def _restart_sensor(self) -> None:
         """Send the opening commands again, because the sensor may have lost its settings."""
         with self._session_lock:
             names = self.sensor.on_open if self._was_opened else ()
+            for name in names:
+                self._find_own_endpoint(name)
             self._restart_replies += [
                 self._session.request(name, self._clock.now()) for name in names
             ]

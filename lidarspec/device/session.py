@@ -13,8 +13,9 @@ request is sent. A frame that arrived before a request was sent is not its reply
 timeout, only the fields in `matches` or `echoes` distinguish a late reply from the next reply.
 
 A running number (`Count`) is filled in when a request is made, so that a repeated command has the
-same number; `echoes` then distinguishes its reply from all others. The owner of the session
-configures the sensor with the options that a reply reports.
+same number; `echoes` then distinguishes its reply from all others. A value that an earlier reply
+provides is filled in when the command is sent, because that reply may still be on its way. The
+owner of the session configures the sensor with the options that a reply reports.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from lidarspec.frames.field_paths import split_path
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
-from lidarspec.spec.arguments import Address, Filled
+from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Count, Port
 from lidarspec.spec.description import Command
 from lidarspec.spec.options import Learned
 from lidarspec.spec.tree import FieldInfo
@@ -218,6 +219,8 @@ class _PendingCommand:
     """A command in progress.
 
     Attributes:
+        data: the bytes of the command; until it is sent, without values that are not known yet.
+        arguments: its arguments, and the values filled in when it was requested.
         timeout: time from the first sending until the command fails, ns.
         sent: the times of all sendings, ns.
         wrong: a description of the last frame that had the type of the reply, but other values.
@@ -226,6 +229,7 @@ class _PendingCommand:
     name: str
     command: Command
     data: bytes
+    arguments: Mapping[str, Any]
     expected: ExpectedReply | None
     timeout: int
     pending: PendingReply
@@ -319,6 +323,8 @@ class Session:
         late: number of replies that arrived after their timeout.
         unanswered: command -> error, of heartbeats without a reply.
         host: the address of this computer as seen by the sensor; None if unknown.
+        port: the port at which this computer expects the data; None if unknown.
+        provided: the values that replies have provided (`Command.provides`), by name.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -326,6 +332,8 @@ class Session:
         self.started = False
         self.late = 0
         self.host: str | None = None
+        self.port: int | None = None
+        self.provided: dict[str, Any] = {}
         self.unanswered: dict[str, CommandError] = {}
         self._count = 0
         self._lines: dict[str, _LinkQueue] = {}
@@ -349,12 +357,11 @@ class Session:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
                 is sent.
         """
-        filled = {
-            path: self._fill_value(value)
-            for path, value in self._find_filled(name).items()
-            if path not in arguments
-        }
-        data = self.sensor.command(name, **arguments, **filled)
+        if name in self.sensor.commands:
+            filled = {**self._fill_values(self.sensor.commands[name]), **arguments}
+        else:
+            filled = arguments
+        data = self.sensor.command(name, **filled)
         command = self.sensor.commands[name]
         tables = {reply: self._table(reply) for reply in command.replies}
         if command.echoes:
@@ -372,7 +379,7 @@ class Session:
         else:
             expected = None
         self._lines.setdefault(command.link, _LinkQueue()).queue.append(
-            _PendingCommand(name, command, data, expected, wait, pending)
+            _PendingCommand(name, command, data, filled, expected, wait, pending)
         )
         if command.every:
             self._heartbeats[name] = _Heartbeat(arguments, now + _to_ns(command.every), pending)
@@ -476,20 +483,45 @@ class Session:
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
-    def _find_filled(self, name: str) -> Mapping[str, Filled]:
-        if name in self.sensor.commands:
-            return self.sensor.commands[name].filled
-        return {}
+    def _fill_values(self, command: Command) -> dict[str, Any]:
+        """Return the values of a command that are known only now.
 
-    def _fill_value(self, value: Filled) -> Any:
-        """Return the address of this computer, or the next running number.
-
-        These values are known only when a command is sent.
+        They are the next numbers of the session, and the address and the port of this computer.
         """
-        if isinstance(value, Address):
-            return self.host
-        self._count += 1
-        return value.at(self._count - 1)
+        filled: dict[str, Any] = {}
+        for path, value in command.filled.items():
+            if isinstance(value, Count):
+                filled[path] = value.at(self._count)
+                self._count += 1
+            elif isinstance(value, Address):
+                filled[path] = self.host
+            elif isinstance(value, Port):
+                filled[path] = self.port
+        if OWN_ADDRESS in command.placeholders:
+            filled[OWN_ADDRESS] = self.host or "0.0.0.0"
+        if OWN_PORT in command.placeholders:
+            filled[OWN_PORT] = self.port or 0
+        return filled
+
+    def _fill_in_provided(self, request: _PendingCommand) -> None:
+        """Fill in the values that earlier replies have provided.
+
+        Raises:
+            CommandError: for a value that no reply has provided.
+        """
+        needed = request.command.needed - set(request.arguments)
+        missing = needed - set(self.provided)
+        if missing:
+            raise CommandError(
+                f"{self.sensor.id} {request.name}: {min(missing)} is unknown, because the sensor"
+                " has not reported it"
+            )
+        if needed:
+            provided = {name: self.provided[name] for name in needed}
+            try:
+                request.data = self.sensor.command(request.name, **request.arguments, **provided)
+            except UsageError as error:
+                raise CommandError(f"{error}; the sensor has reported this value") from None
 
     def _table(self, frame: str) -> Mapping[str, FieldInfo]:
         return get_codec(self.sensor.frames[frame]).schema.fields
@@ -500,6 +532,11 @@ class Session:
         line.late_replies = [late for late in line.late_replies if late.until > now]
         while (ready := line.next_sending()) is not None and now >= ready:
             request = line.queue.popleft()
+            try:
+                self._fill_in_provided(request)
+            except CommandError as error:
+                request.pending.settle(error)
+                continue
             self._send(request, now)
             if request.expected is not None:
                 line.current = request
@@ -528,8 +565,13 @@ class Session:
                 current.name, item.frame, values, True, now, item.data, self._table(item.frame)
             )
             self._free_link(line, current, reply_count=1, since=now)
-            current.pending.settle(reply)
             self.unanswered.pop(current.name, None)
+            try:
+                self.provided |= provided_values(self.sensor, reply)
+            except CommandError as error:
+                current.pending.settle(error)
+            else:
+                current.pending.settle(reply)
             return
         for late in line.late_replies:
             if not late.expected.find_differences(item.frame, values):
@@ -632,6 +674,32 @@ def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         name: Learned(value) if isinstance(value, bytes) else value
         for name, value in options.items()
     }
+
+
+def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
+    """Return the values that a reply provides for later commands, by name.
+
+    Raises:
+        CommandError: if `provides` raises, or returns something else than texts and numbers.
+    """
+    provides = sensor.commands[reply.command].provides
+    if provides is None:
+        return {}
+    place = f"{sensor.id} {reply.command}"
+    try:
+        values = dict(provides(reply.values))
+    except ValueError as error:
+        raise CommandError(f"{place}: {error}") from error
+    except Exception as error:
+        raise CommandError(
+            f"{place}: the reply could not be interpreted: {type(error).__name__}: {error}"
+        ) from error
+    for name, value in values.items():
+        if not isinstance(value, str | int | float):
+            raise CommandError(
+                f"{place}: {name} must be a number or a string, got {type(value).__name__}"
+            )
+    return values
 
 
 def _describe_labels(fields: Mapping[str, FieldInfo], values: Any) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 from lidarspec.exports import ExportedFrame, messages
 from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Command, Frame, Sensor, tree
-from lidarspec.spec.arguments import Address, Count
+from lidarspec.spec.arguments import Filled
 from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, Split
 from lidarspec.spec.wire_forms import WireForm
@@ -87,8 +87,8 @@ def _to_json(fact: Any) -> Any:
         return {name: _to_json(value) for name, value in fact.items()}
     if isinstance(fact, list | tuple):
         return [_to_json(value) for value in fact]
-    if isinstance(fact, Count | Address):
-        return {"kind": type(fact).__name__.lower(), **vars(fact)}
+    if isinstance(fact, Filled):
+        return {"kind": type(fact).__name__.lower(), **dataclasses.asdict(fact)}
     if isinstance(fact, bytes | bytearray):
         return fact.hex()
     return fact

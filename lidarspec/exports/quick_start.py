@@ -74,6 +74,8 @@ def typical_source(sensor: Sensor) -> str:
     link = sensor.links["data"]
     if isinstance(link, Serial):
         return "/dev/ttyUSB0"
+    if isinstance(link, Tcp) and link.reported:
+        return "tcp://192.168.0.10"
     if isinstance(link, Tcp):
         return f"tcp://192.168.0.10:{link.port}"
     is_found_by_broadcast = any(

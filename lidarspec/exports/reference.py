@@ -95,6 +95,8 @@ def _describe_link(link: Link) -> str:
         ] * bool(link.local)
         return ", ".join(["UDP", *ports, *details, *["a byte stream in datagrams"] * link.stream])
     kind = type(link).__name__
+    if isinstance(link, Tcp) and link.reported:
+        return f"TCP, the port that the sensor reports as {link.reported}"
     if isinstance(link, Tcp | Http):
         return f"{kind.upper()}, port {link.port}"
     return kind

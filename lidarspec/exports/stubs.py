@@ -20,7 +20,7 @@ from lidarspec.exports import ExportedFrame, ExportError, messages
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Command, Sensor
-from lidarspec.spec.arguments import Address, Octets, Range, Text
+from lidarspec.spec.arguments import Address, Octets, Port, Range, Text
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -42,7 +42,7 @@ from lidarspec.spec.tree import (
 )
 
 #: Kind of argument of a command -> its Python type.
-ARGUMENT_TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}
+ARGUMENT_TYPES = {Range: "float", Port: "float", Text: "str", Address: "str", Octets: "bytes"}
 #: The keyword parameters of `parse`.
 PARSE_OPTIONS = "verify: bool = True, units: bool = False"
 

@@ -657,7 +657,7 @@ def _list_patterns(sensor: Sensor) -> dict[str, list[int]]:
     links = sensor.links.values()
     patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],
-        "tcp.port": [link.port for link in links if isinstance(link, Tcp)],
+        "tcp.port": [link.port for link in links if isinstance(link, Tcp) and link.port],
         "wtap_encap": list(USER_LINKS),
     }
     return {table: sorted(set(numbers)) for table, numbers in patterns.items() if numbers}

@@ -20,7 +20,16 @@ from lidarspec.errors import (
 from lidarspec.frames.build import build
 from lidarspec.frames.field_paths import put_value, split_path
 from lidarspec.frames.schema import make_schema
-from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
+from lidarspec.spec.arguments import (
+    Address,
+    Argument,
+    Count,
+    Port,
+    Range,
+    Taken,
+    Template,
+    Text,
+)
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
 
@@ -30,7 +39,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
 
     Args:
         arguments: by name, in the units of their fields. A value that is known only when the
-            command is sent is given by the path of its field.
+            command is sent is given by the path of its field, a value of a template by its name.
 
     Raises:
         UnknownCommand: if the sensor has no such command.
@@ -42,13 +51,15 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
     command = sensor.commands[name]
     place = f"{sensor.id} {name}"
-    unknown = set(arguments) - set(command.args) - set(command.filled)
+    unknown = set(arguments) - set(command.args) - set(command.filled) - command.placeholders
     if unknown:
         raise UnknownField(min(unknown), command.args, place=place)
     if command.frame is None:
         return b""
     values: Any = {}
     for path, value in command.values.items():
+        if isinstance(value, Template):
+            continue
         if path in command.filled:
             filled = _resolve_filled(sensor, name, path, value, arguments.get(path))
         else:
@@ -58,12 +69,31 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         slot = argument_slot(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
+        if declared.path in command.templates:
+            raw_argument(slot, declared.kind, arguments[argument], argument, place)
+            continue
         values = put_value(
             values,
             split_path(declared.path),
             raw_argument(slot, declared.kind, arguments[argument], argument, place),
         )
+    for path, template in command.templates.items():
+        text = _fill_template(template, arguments, place)
+        values = put_value(values, split_path(path), text)
     return build(sensor, command.frame, None, values)
+
+
+def _fill_template(template: Template, arguments: Mapping[str, Any], place: str) -> bytes:
+    """Return the text of a template; a value that is not given is 0.
+
+    Raises:
+        UsageError: for a value that a template does not accept.
+    """
+    given = {name: arguments.get(name, 0) for name in template.names}
+    try:
+        return template.fill(given)
+    except ValueError as error:
+        raise UsageError(f"{place}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -71,11 +101,13 @@ class ArgumentSlot:
     """The field of a command frame that an argument is written to.
 
     `room` is the number of bytes, or of numbers in an array. It is None if it varies.
+    `in_template` is whether the argument is a part of a text.
     """
 
     info: FieldInfo
     room: int | None
     is_array: bool = False
+    in_template: bool = False
 
 
 def argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
@@ -87,6 +119,9 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     declared = sensor.commands[name].arguments[argument]
     place = f"commands.{name}.args.{argument}"
     slot = _slot(sensor, name, declared.path, place)
+    template = sensor.commands[name].templates.get(declared.path)
+    if template is not None:
+        return _template_slot(sensor, template, declared, argument, place)
     if isinstance(declared.kind, Range):
         takes = {"int", "float"}
     else:
@@ -103,6 +138,21 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
             sensor=sensor.id,
         )
     return slot
+
+
+def _template_slot(
+    sensor: SensorDescription, template: Template, declared: Argument, argument: str, place: str
+) -> ArgumentSlot:
+    """Return the place of an argument in a template."""
+    if argument not in template.names or not isinstance(declared.kind, Range | Text):
+        raise SpecError(
+            f"{template.text!r} requires {{{argument}}}, with a range or Text(size)",
+            path=place,
+            sensor=sensor.id,
+        )
+    if isinstance(declared.kind, Range):
+        return ArgumentSlot(FieldInfo(declared.path, kind="float"), None, in_template=True)
+    return ArgumentSlot(FieldInfo(declared.path, kind="bytes"), None, in_template=True)
 
 
 def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:
@@ -194,7 +244,7 @@ def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
 
 
 def _resolve_filled(
-    sensor: SensorDescription, name: str, path: str, value: Filled, given: Any
+    sensor: SensorDescription, name: str, path: str, value: Count | Address | Port, given: Any
 ) -> Any:
     """Return a value that is known only when a command is sent.
 
@@ -204,6 +254,8 @@ def _resolve_filled(
         if given is None:
             return value.first
         return given
+    if isinstance(value, Port):
+        return given or 0
     slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
         return _to_raw_value(slot, bytes(slot.room or 4))

@@ -26,8 +26,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.scenes import Scene, make_room
 from lidarspec.simulation.simulator import FrameSimulation, FramesWithoutPoints, frame_simulation
+from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
 from lidarspec.spec.description import Answer, Command, Frame
-from lidarspec.spec.links import is_datagram
+from lidarspec.spec.links import Http, is_datagram
 from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
@@ -40,6 +41,8 @@ PAUSE_FILLERS = 14
 #: Maximum delay of a device in ns. If it is polled less often, its time does not catch up.
 MAX_DELAY_NS = SECOND
 
+#: Name of the value for `answers` functions with the port at which the data is served.
+DATA_PORT = "{data_port}"
 Packet = tuple[str, bytes]
 #: Nanoseconds without input after which an incomplete request is discarded.
 REQUEST_TIMEOUT_NS = 50_000_000
@@ -47,11 +50,60 @@ REQUEST_TIMEOUT_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class ReceivedCommand:
-    """A received command with the raw values of the fields of its frame, by path."""
+    """A received command with the raw values of the fields of its frame, by path.
+
+    The values in its templates are among them as texts, by name in braces: "{handle}".
+    """
 
     name: str
     command: Command
     values: Mapping[str, Any]
+
+    @property
+    def destination(self) -> tuple[str, int] | None:
+        """The address and port to which the data goes from now on; None if it does not say.
+
+        The address is "" if the command contains only a port.
+        """
+        port = self._find(Port, OWN_PORT)
+        address = self._find(Address, OWN_ADDRESS)
+        if not port or not int(port):
+            return None
+        return _to_host(address), int(port)
+
+    def _find(self, kind: type[Port | Address], placeholder: str) -> Any:
+        """Return the value of this kind in the command; None if it has none."""
+        paths = [path for path, value in self.command.values.items() if isinstance(value, kind)]
+        paths += [one.path for one in self.command.arguments.values() if isinstance(one.kind, kind)]
+        for path in paths:
+            return _get_flat(self.values, path)
+        return self.values.get(f"{{{placeholder}}}")
+
+
+def _get_flat(values: Mapping[str, Any], path: str) -> Any:
+    """Return a value at a path that may end with an index; None if there is none."""
+    base, _, index = path.partition("[")
+    value = values.get(base)
+    if index and isinstance(value, list):
+        return value[int(index.rstrip("]"))]
+    return value
+
+
+def _to_host(address: Any) -> str:
+    """Return an address as text; "" for None and for an address of zeros."""
+    from ipaddress import ip_address  # a slow import
+
+    if isinstance(address, list):
+        address = bytes(address)
+    if not address:
+        return ""
+    try:
+        parsed = ip_address(address)
+    except ValueError:
+        return ""  # no text of an address: the simulated sensor looks up no names
+    if parsed.is_unspecified:
+        return ""
+    return str(parsed)
 
 
 class ReplyPart(NamedTuple):
@@ -70,10 +122,14 @@ class ReplyMaker:
 
     Args:
         shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
+
+    Attributes:
+        data_port: the port at which the simulated sensor serves its data; 0 for none.
     """
 
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
         self._sensor = sensor
+        self.data_port = 0
         self._frames = FramesWithoutPoints(sensor, shake)
         self._received: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
@@ -96,7 +152,7 @@ class ReplyMaker:
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
             if callable(declared):
-                chosen = declared(request.values)
+                chosen = declared({**request.values, DATA_PORT: self.data_port})
             else:
                 chosen = declared
         return [self._make_reply(answer, request) for answer in chosen]
@@ -132,14 +188,36 @@ class ReplyMaker:
             for one in self._sensor.commands.items()
             if (one[1].frame, one[1].link) == (frame, link)
         ]
-        fitting = [
-            one
-            for one in sent
-            if all(values.get(path) == value for path, value in one[1].fixed.items())
-        ]
-        if fitting:
-            return ReceivedCommand(*max(fitting, key=lambda one: len(one[1].fixed)), values)
+        best: ReceivedCommand | None = None
+        for command_name, command in sent:
+            texts = _match_command(command, values)
+            if texts is None:
+                continue
+            if best is None or _rank(command) > _rank(best.command):
+                best = ReceivedCommand(command_name, command, {**values, **texts})
+        return best
+
+
+def _match_command(command: Command, values: Mapping[str, Any]) -> dict[str, str] | None:
+    """Return the values in the templates of a command, by name in braces.
+
+    None if the values of the frame are not those of the command.
+    """
+    if any(values.get(path) != value for path, value in command.fixed.items()):
         return None
+    texts = dict[str, str]()
+    for path, template in command.templates.items():
+        matched = template.match(values.get(path))
+        if matched is None:
+            return None
+        texts |= {f"{{{name}}}": text for name, text in matched.items()}
+    return texts
+
+
+def _rank(command: Command) -> tuple[int, int]:
+    """Return how specific a command is, for a comparison with other matching commands."""
+    literal_size = sum(template.literal_size for template in command.templates.values())
+    return len(command.fixed), literal_size
 
 
 def _command_decoder(sensor: Sensor, link: str) -> Decoder:
@@ -264,6 +342,8 @@ class SimulatedDevice:
     Attributes:
         present: whether it is plugged in.
         commands_received: the names of the commands that it received.
+        destination: the address and port that a command has named for the data, ("", port) without
+            an address; None if no command did.
         sent: number of sent frames by type, before any faults.
         lines: link -> its faults.
 
@@ -286,6 +366,7 @@ class SimulatedDevice:
         self.faults = faults or Faults()
         self.present = True
         self.commands_received = list[str]()
+        self.destination: tuple[str, int] | None = None
         self.sent = Counter[str]()
         self.lines = {name: self._line(name, seed) for name in sensor.links}
         self._scene = scene or make_room(seed)
@@ -303,12 +384,12 @@ class SimulatedDevice:
     def _line(self, name: str, seed: int) -> FaultyLink:
         """Return the link of this name with its faults.
 
-        A byte stream other than the data link is TCP or HTTP, which lose nothing.
+        TCP and HTTP lose nothing; a byte stream other than the data link is TCP.
         """
-        stream = not is_datagram(self.sensor.links[name])
-        return FaultyLink(
-            Faults() if stream and name != "data" else self.faults, seed=seed, stream=stream
-        )
+        link = self.sensor.links[name]
+        stream = not is_datagram(link)
+        is_reliable = isinstance(link, Http) or (stream and name != "data")
+        return FaultyLink(Faults() if is_reliable else self.faults, seed=seed, stream=stream)
 
     def start(self, now: int) -> None:
         """Switch the device on, or off and on again."""
@@ -316,6 +397,7 @@ class SimulatedDevice:
         self._stream = None
         self._powered = now
         self._time = 0.0
+        self.destination = None
         self.present = True
         if self.faults.unplug:
             self._plug = now + int(self.faults.unplug * SECOND)
@@ -335,6 +417,10 @@ class SimulatedDevice:
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
+
+    def serve_at(self, data_port: int) -> None:
+        """Set the port at which the data is served, for replies that report it."""
+        self._replies.data_port = data_port
 
     def unplug(self) -> None:
         """Disconnect the device; `start` connects it again."""
@@ -466,6 +552,7 @@ class SimulatedDevice:
         mode = None
         if command.only_stopped and self._stream is not None:
             return
+        self.destination = request.destination or self.destination
         if command.starts or command.stops:
             self._stream = None
             self._plan = [

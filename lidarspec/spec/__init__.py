@@ -31,7 +31,13 @@ if TYPE_CHECKING:
     from lidarspec.expressions.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
     from lidarspec.sensor_operations import Sensor as Sensor
-    from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
+    from lidarspec.spec.arguments import (
+        Address as Address,
+        Count as Count,
+        Port as Port,
+        Template as Template,
+        Text as Text,
+    )
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
         Crc as Crc,
@@ -126,7 +132,7 @@ _NAMES = {
     "sensor_operations": ("Sensor",),
     "spec.options": ("Learned",),
     "spec.description": ("Frame", "Command", "Relative", "Reported", "Simulation"),
-    "spec.arguments": ("Text", "Address", "Count"),
+    "spec.arguments": ("Text", "Address", "Port", "Count", "Template"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": (
         "Checksum",

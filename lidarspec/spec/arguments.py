@@ -1,12 +1,17 @@
 """Arguments of commands, and values that are filled in when a command is sent.
 
-An argument is a number in a range, a text, an address or bytes. Each kind describes the values that
-it accepts and packs them into the bytes of the frame. `Count` and `Address` among the `values` of a
-command are filled in when it is sent: with a running number, and with this computer's address.
+An argument is a number in a range, a text, an address, a port or bytes. Each kind describes the
+values that it accepts and packs them into the bytes of the frame. `Count`, `Address`, `Port` and
+`Template` among the `values` of a command are filled in when it is sent: with a running number,
+this computer's address and port, and a text with values that are known by then.
 """
 
 from __future__ import annotations
 
+import functools
+import re
+import string
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +27,19 @@ class Range:
 
     low: float
     high: float
+
+
+@dataclass(frozen=True)
+class Port(Range):
+    """The UDP port to which the sensor sends its data.
+
+    As an argument, it is a number. Among the `values` of a command, it is the port at which this
+    computer expects the data. A simulated sensor then sends its data there, to the `Address` of the
+    same command.
+    """
+
+    low: float = 1
+    high: float = 65535
 
 
 @dataclass(frozen=True)
@@ -148,8 +166,98 @@ class Count:
         return (self.first + index) % (1 << self.bits)
 
 
+#: Names in a `Template` that need no declaration.
+OWN_ADDRESS = "own_address"
+OWN_PORT = "own_port"
+#: The values of a `Template`. A reply must not be able to add parts to a later request.
+_SAFE_VALUE = r"[\w.~:+-]*"
+
+
+@dataclass(frozen=True)
+class Template:
+    """A text in `Command.values` with names in braces, which are replaced by values.
+
+    An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is an argument
+    of the command whose path is the field of the template, or a value that an earlier reply
+    provided (`Command.provides`). `own_address` is this computer's address as seen by the sensor,
+    `own_port` the port at which it expects the data. Values consist of ASCII letters, digits and
+    ``_.~:+-``.
+
+    Raises:
+        SpecError: for a text that is not ASCII, has no names, or has other parts in braces.
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        try:
+            parts = list(string.Formatter().parse(self.text))
+        except ValueError as error:
+            raise SpecError(f"Template({self.text!r}): {error}") from None
+        names = [name for _, name, _, _ in parts if name is not None]
+        for _, name, form, conversion in parts:
+            if name is not None and (not name.isidentifier() or form or conversion):
+                raise SpecError(f"Template({self.text!r}): expected names in braces, got {name!r}")
+        if not names or len(names) != len(set(names)) or not self.text.isascii():
+            raise SpecError(
+                f"Template({self.text!r}) requires an ASCII text with names in braces, each once"
+            )
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names in braces."""
+        return tuple(
+            name for _, name, _, _ in string.Formatter().parse(self.text) if name is not None
+        )
+
+    @functools.cached_property
+    def literal_size(self) -> int:
+        """The number of characters outside of braces."""
+        return sum(len(text) for text, _, _, _ in string.Formatter().parse(self.text))
+
+    def fill(self, values: Mapping[str, Any]) -> bytes:
+        """Return the text with its values.
+
+        Args:
+            values: a text or a number for each name.
+
+        Raises:
+            ValueError: for a value with other characters than a value may have.
+        """
+        texts = {name: _format_value(values[name]) for name in self.names}
+        for name, text in texts.items():
+            if re.fullmatch(_SAFE_VALUE, text, re.ASCII) is None:
+                raise ValueError(
+                    f"{name} must consist of letters, digits and _.~:+-, got {text!r:.60}"
+                )
+        return self.text.format_map(texts).encode()
+
+    def match(self, data: Any) -> dict[str, str] | None:
+        """Return the values of a text that has this form, by name; None for another text."""
+        if not isinstance(data, bytes):
+            return None
+        matched = self._pattern.fullmatch(data.decode("latin-1"))
+        return None if matched is None else matched.groupdict()
+
+    @functools.cached_property
+    def _pattern(self) -> re.Pattern[str]:
+        pattern = ""
+        for text, name, _, _ in string.Formatter().parse(self.text):
+            pattern += re.escape(text)
+            if name is not None:
+                pattern += f"(?P<{name}>{_SAFE_VALUE})"
+        return re.compile(pattern, re.ASCII)
+
+
+def _format_value(value: Any) -> str:
+    """Return a value as text; a whole number without decimal places."""
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    return str(value)
+
+
 #: a value of a command that is not known until it is sent.
-Filled = Count | Address
+Filled = Count | Address | Port | Template
 
 
 @dataclass(frozen=True)
@@ -180,8 +288,8 @@ class Argument:
 def argument(given: Any) -> Argument:
     """Return the argument that a plugin declared as a tuple.
 
-    Examples are ("motor.speed", 5, 15), ("data.host", Address()), ("name", Text(16)) and ("key",
-    bytes).
+    Examples are ("motor.speed", 5, 15), ("data.host", Address()), ("data.port", Port()), ("name",
+    Text(16)) and ("key", bytes).
 
     Raises:
         SpecError: for an invalid declaration.
@@ -189,11 +297,11 @@ def argument(given: Any) -> Argument:
     match given:
         case (str(path), int() | float() as low, int() | float() as high):
             return Argument(path, Range(low, high))
-        case (str(path), Text() | Address() as kind):
+        case (str(path), Text() | Address() | Port() as kind):
             return Argument(path, kind)
         case (str(path), kind) if kind is bytes:
             return Argument(path, Octets())
     raise SpecError(
-        "an argument must be (path, lowest, highest), (path, Text(16)), (path, Address()) or (path,"
-        f" bytes), not {given!r:.60}"
+        "an argument must be (path, lowest, highest), (path, Text(16)), (path, Address()), (path,"
+        f" Port()) or (path, bytes), not {given!r:.60}"
     )

@@ -17,7 +17,17 @@ from typing import Any, Literal, TypeVar
 from construct import Construct
 
 from lidarspec.errors import SpecError, UnknownFrame, did_you_mean
-from lidarspec.spec.arguments import Address, Argument, Count, Filled, Text, argument
+from lidarspec.spec.arguments import (
+    OWN_ADDRESS,
+    OWN_PORT,
+    Address,
+    Argument,
+    Filled,
+    Port,
+    Template,
+    Text,
+    argument,
+)
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.syntax import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.timing import Clock
@@ -78,6 +88,8 @@ class Simulation:
         answers: command -> everything that the sensor sends for it before any data, in order: a
             frame by name, (name, physical values by path), bytes, or the seconds of a pause, in
             which it sends its fillers; or a function from the raw fields of the request to these.
+            The fields contain the values of a `Template` as texts, by name in braces: "{handle}",
+            and the port at which the simulated sensor serves its data: "{data_port}".
             The default for a command is its reply. Only for a sensor, not for a frame type.
         directions: a function of the frame number i that returns the azimuths and elevations of
             its points, radians: two arrays that broadcast to the points of a frame. Needed for
@@ -221,10 +233,12 @@ class Command:
 
     Args:
         frame: the outgoing frame; None for a command that only sets control lines.
-        values: values of its fields, by path; `Count(16)` is a running number, `Address()` this
-            computer's own address.
+        values: values of its fields, by path; `Count(16)` is a running number, `Address()` and
+            `Port()` are this computer's own address and the port at which it expects the data,
+            `Template(...)` is a text that contains arguments and values of earlier replies.
         args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)),
-            (path, Address()) or (path, bytes). A path may be an element of an array, "ports[1]".
+            (path, Address()), (path, Port()) or (path, bytes). A path may be an element of an
+            array, "ports[1]", or the field of a `Template` that has the name of the argument.
         reply: the frame that answers, or a tuple of the possible ones; None if no answer is
             documented.
         matches: values that fields of the reply must have for it to answer this command; with
@@ -244,14 +258,17 @@ class Command:
         learns: a function of the reply, as `Sensor.parse` returns it, that returns options for
             `configure`, by name: numbers, or bytes and texts, which become `Learned`. They are
             applied if the command is in `on_open`.
+        provides: a function of the reply, as `learns`, that returns numbers and texts by name.
+            Later commands use them in a `Template`, and a link may use them (`Tcp(reported=)`). The
+            command fails if it raises ValueError; the text of the error is the reason.
         every: seconds after which it is sent again, repeatedly (a heartbeat); 0: never.
     """
 
     frame: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
-    args: Mapping[str, tuple[str, float, float] | tuple[str, Text | Address | type[bytes]]] = field(
-        default_factory=dict
-    )
+    args: Mapping[
+        str, tuple[str, float, float] | tuple[str, Text | Address | Port | type[bytes]]
+    ] = field(default_factory=dict)
     reply: str | tuple[str, ...] | None = None
     matches: Mapping[str, Any] = field(default_factory=dict)
     echoes: tuple[str, ...] = ()
@@ -265,6 +282,7 @@ class Command:
     stops: bool = False
     only_stopped: bool = False
     learns: Callable[[Any], Mapping[str, Any]] | None = None
+    provides: Callable[[Any], Mapping[str, str | int | float]] | None = None
     every: float = 0.0
     arguments: Mapping[str, Argument] = field(init=False, repr=False)
 
@@ -280,9 +298,35 @@ class Command:
     @property
     def filled(self) -> Mapping[str, Filled]:
         """The values that are filled in when it is sent, by path."""
-        return {
-            path: value for path, value in self.values.items() if isinstance(value, Count | Address)
-        }
+        return {path: value for path, value in self.values.items() if isinstance(value, Filled)}
+
+    @property
+    def templates(self) -> Mapping[str, Template]:
+        """The text templates among the values, by path."""
+        return {path: value for path, value in self.values.items() if isinstance(value, Template)}
+
+    @property
+    def placeholders(self) -> frozenset[str]:
+        """The names in its templates that are not arguments."""
+        names = {name for template in self.templates.values() for name in template.names}
+        return frozenset(names - set(self.args))
+
+    @property
+    def needed(self) -> frozenset[str]:
+        """The names of the values that earlier replies must have provided."""
+        return self.placeholders - {OWN_ADDRESS, OWN_PORT}
+
+    @property
+    def has_own_port(self) -> bool:
+        """Whether it contains the port at which this computer expects the data."""
+        has_port = any(isinstance(value, Port) for value in self.values.values())
+        return has_port or OWN_PORT in self.placeholders
+
+    @property
+    def has_own_address(self) -> bool:
+        """Whether it contains this computer's address."""
+        has_address = any(isinstance(value, Address) for value in self.values.values())
+        return has_address or OWN_ADDRESS in self.placeholders
 
     @property
     def fixed(self) -> Mapping[str, Any]:

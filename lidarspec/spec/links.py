@@ -149,9 +149,20 @@ class Udp(Link):
 
 @dataclass(frozen=True)
 class Tcp(Link):
-    """A TCP byte stream from a port of the sensor."""
+    """A TCP byte stream from a port of the sensor.
 
-    port: int
+    Args:
+        port: the port; 0 if the sensor reports it.
+        reported: the name of the value with the port that a reply provides
+            (`Command.provides`), if the port is not fixed. The link is opened after that reply.
+    """
+
+    port: int = 0
+    reported: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port < 65536 or bool(self.port) == bool(self.reported):
+            raise SpecError("Tcp requires a port from 1 to 65535, or `reported`")
 
 
 @dataclass(frozen=True)

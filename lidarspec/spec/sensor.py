@@ -40,7 +40,7 @@ from lidarspec.spec.description import (
     freeze,
     reject_unknown_arguments,
 )
-from lidarspec.spec.links import Link, is_datagram
+from lidarspec.spec.links import Link, Tcp, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import EPOCHS, HOUR_S, Clock, OnChange, OnWrap, PacketCounter, Split
@@ -266,6 +266,16 @@ class SensorDescription:
         return is_datagram(self.links.get("data"))
 
     @property
+    def announces_port(self) -> bool:
+        """Whether a command on opening tells the sensor the port to which it sends its data."""
+        return any(self.commands[name].has_own_port for name in self.on_open)
+
+    @property
+    def commands_over_data(self) -> bool:
+        """Whether commands with a frame go over the data link."""
+        return any(one.frame and one.link == "data" for one in self.commands.values())
+
+    @property
     def counts_losses(self) -> bool:
         """Whether lost packets are counted, by a counter or by a clock with a declared pace."""
         if self.sequence is not None:
@@ -308,10 +318,28 @@ def _check_sensor(sensor: SensorDescription) -> None:
     _check_names(sensor, "state", sensor.state, sensor.frames)
     _check_clock(sensor)
     _check_names(sensor, "info", sensor.info_frames, sensor.frames)
+    for name, link in sensor.links.items():
+        if sensor.commands and isinstance(link, Tcp) and link.reported:
+            _check_reported(sensor, name)
     _check_names(sensor, "on_open, on_close", sensor.on_open, sensor.commands)
     _check_names(sensor, "on_open, on_close", sensor.on_close, sensor.commands)
     if sensor.data_frames:
         _check_points(sensor)
+
+
+def _check_reported(sensor: SensorDescription, name: str) -> None:
+    """Raise `SpecError` unless a reply can report the port of a link before its data."""
+    if name != "data" or not any(
+        sensor.commands[opening].provides and sensor.commands[opening].link != "data"
+        for opening in sensor.on_open
+        if opening in sensor.commands
+    ):
+        raise SpecError(
+            "`reported` requires the data link, and a command in `on_open` over another link that"
+            " provides the port",
+            path=f"links.{name}",
+            sensor=sensor.id,
+        )
 
 
 def _check_points(sensor: SensorDescription) -> None:
@@ -411,6 +439,14 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
         raise SpecError(
             "learns requires a reply, and a `configure` function that accepts the options",
             path=f"commands.{name}.learns",
+        )
+    if command.provides is not None and not command.replies:
+        raise SpecError("provides requires a reply", path=f"commands.{name}.provides")
+    if command.needed and not any(other.provides for other in sensor.commands.values()):
+        raise SpecError(
+            f"no argument is named {min(command.needed)!r}, and no command has `provides`",
+            path=f"commands.{name}.values",
+            sensor=sensor.id,
         )
     if "timeout" in command.args:
         raise SpecError(

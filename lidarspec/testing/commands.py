@@ -6,7 +6,7 @@ import math
 from ipaddress import ip_address
 from typing import Any
 
-from lidarspec.device.session import Reply, Session, get_nested, learn_options
+from lidarspec.device.session import PendingReply, Reply, Session, get_nested, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
@@ -78,6 +78,12 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
         slot = argument_slot(sensor, name, argument)
         declared = command.arguments[argument]
         read = get_nested(parsed, declared.path)
+        if declared.path in command.templates:
+            texts = command.templates[declared.path].match(read)
+            assert texts is not None, f"{declared.path} does not match its template"
+            read = texts[argument].encode()
+            if isinstance(declared.kind, Range):
+                read = float(read)
         raw = raw_argument(slot, declared.kind, value, argument, name)
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
@@ -224,18 +230,32 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     )
     if command.only_stopped and stops:
         device.receive(sensor.command(stops), 0, sensor.commands[stops].link)
-    pending = session.request(name, 0, **given)
-    decoder = sensor.decoder(stream=not is_datagram(sensor.links[command.link]))
     now = 0
+    if command.needed:
+        for earlier in sensor.on_open:
+            if earlier != name and sensor.commands[earlier].provides is not None:
+                now = _exchange(device, session, session.request(earlier, now), earlier, now)
+    pending = session.request(name, now, **given)
+    _exchange(device, session, pending, name, now)
+    return pending.result()
+
+
+def _exchange(
+    device: SimulatedDevice, session: Session, pending: PendingReply, name: str, now: int
+) -> int:
+    """Run a simulated device until a command is done, and return the time of its end, ns."""
+    sensor = session.sensor
+    link = sensor.commands[name].link
+    decoder = sensor.decoder(stream=not is_datagram(sensor.links[link]))
     while not pending.done:
         for out in session.outgoing():
             device.receive(out.data, now, out.link)
         now += STEP_NS
-        received = [data for arrived, data in device.outgoing(now) if arrived == command.link]
+        received = [data for arrived, data in device.outgoing(now) if arrived == link]
         if received:
             frames = [item for data in received for item in decoder.feed(data)]
         else:
             frames = decoder.idle()
-        session.receive(frames, now, link=command.link)
+        session.receive(frames, now, link=link)
         session.tick(now)
-    return pending.result()
+    return now

@@ -102,11 +102,12 @@ def _make_data_line(sensor: Sensor, destination: str, link: str | Path | None) -
 def _make_tcp_data_line(sensor: Sensor, destination: str) -> TcpLine:
     host, port = _parse_host_and_port(destination)
     declared = sensor.links.get("data")
+    is_reported = isinstance(declared, Tcp) and bool(declared.reported)
     if port is None and isinstance(declared, Tcp):
         port = declared.port
     if port is None:
         raise UsageError(f"{sensor.id} declares no TCP port: specify one, as in tcp://{host}:2111")
-    return TcpLine(host, port)
+    return TcpLine(host, port, is_reported=is_reported)
 
 
 def _make_udp_data_line(sensor: Sensor, destination: str) -> UdpLine:
@@ -117,9 +118,11 @@ def _make_udp_data_line(sensor: Sensor, destination: str) -> UdpLine:
             f"{sensor.id} sends a byte stream, not datagrams: simulate to pty or tcp://"
         )
     ports = (port,) if port else declared.ports[:2]
-    if not ports:
+    if not ports and not sensor.announces_port and not sensor.commands_over_data:
         raise UsageError(f"{sensor.id} declares no UDP port: specify one, as in udp://{host}:2368")
-    return UdpLine.to(host, ports)
+    line = UdpLine.to(host, ports, takes_commands=sensor.commands_over_data)
+    line.waits_for_address = not ports
+    return line
 
 
 def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:

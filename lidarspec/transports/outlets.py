@@ -109,6 +109,14 @@ class OutletLine:
         """
         raise NotImplementedError
 
+    def redirect(self, host: str, port: int) -> None:
+        """Send to another address from now on, if the line sends datagrams.
+
+        Args:
+            host: the address; "" for the same address as before.
+            port: the port.
+        """
+
     def await_listener(self) -> None:
         """Wait for a new listener, so that it receives everything from the beginning.
 
@@ -169,7 +177,15 @@ class UdpLine(OutletLine):
     """UDP datagrams to one host, or to the sender of the last command.
 
     It is made by `UdpLine.to` or `UdpLine.replying`.
+
+    Attributes:
+        takes_commands: whether commands are sent to this line. Then the data goes to the sender of
+            the last command.
+        waits_for_address: whether a command names the port; before it, datagrams are lost.
     """
+
+    takes_commands = False
+    waits_for_address = False
 
     def __init__(
         self,
@@ -186,12 +202,18 @@ class UdpLine(OutletLine):
         self._ports = ports
         self._default_port = default_port
         self._last_sender: Sender | None = None
+        self._is_redirected = False
         for one in sockets:
             one.setblocking(False)
 
     @classmethod
     def to(
-        cls, host: str = LOCALHOST, ports: Sequence[int] = (), *, default_port: int = 0
+        cls,
+        host: str = LOCALHOST,
+        ports: Sequence[int] = (),
+        *,
+        default_port: int = 0,
+        takes_commands: bool = False,
     ) -> UdpLine:
         """Return a line that sends to a host, and accepts commands only from that host.
 
@@ -200,6 +222,7 @@ class UdpLine(OutletLine):
             ports: if this is a single port, all datagrams go to it; otherwise each datagram goes to
                 the port of its `receiver`.
             default_port: the port for datagrams without a receiver; 0 for none.
+            takes_commands: whether commands are sent to this line.
 
         Raises:
             SourceError: for an unknown host.
@@ -223,9 +246,12 @@ class UdpLine(OutletLine):
         with contextlib.suppress(OSError):
             sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         local_source = f"udp://{bracketed}{port_list}"
-        return cls(
+        line = cls(
             local_source, [sender], host=numeric_host, ports=ports, default_port=default_port
         )
+        if takes_commands:
+            line._listen_for_commands()
+        return line
 
     @classmethod
     def replying(cls, host: str, port: int) -> UdpLine:
@@ -273,6 +299,8 @@ class UdpLine(OutletLine):
                     commands.append(data)
                 elif sender[0] == self._host:
                     commands.append(data)
+                    if self.takes_commands:
+                        self._ports = [sender[1]]
         return commands
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
@@ -281,9 +309,22 @@ class UdpLine(OutletLine):
             if receiver is None or not self._send(chunk.data, receiver, patient=patient):
                 self.unsent_bytes += len(chunk.data)
 
+    def redirect(self, host: str, port: int) -> None:
+        self._host = host or self._host
+        self._ports = [port]
+        self._is_redirected = True
+
     def close(self) -> None:
         for one in self._sockets:
             one.close()
+
+    def _listen_for_commands(self) -> None:
+        """Choose a port, and add it to the SOURCE if the listener is on this computer."""
+        self.takes_commands = True
+        if self._host == LOCALHOST:
+            self._sockets[0].bind((LOCALHOST, 0))
+            own_port = self._sockets[0].getsockname()[1]
+            self.local_source = with_option(self.local_source, "src", f"{LOCALHOST}:{own_port}")
 
     def _find_receiver(self, chunk: Chunk) -> Sender | None:
         if not self._host:
@@ -292,6 +333,8 @@ class UdpLine(OutletLine):
             return self._host, self._ports[0]
         port = chunk.receiver[1] if chunk.receiver else 0
         port = port or self._default_port
+        if not port and self.waits_for_address:
+            return None
         if not port:
             text = "the recording has no port for the datagrams: specify one, as in"
             raise UsageError(f"{self.local_source}: {text} udp://{self._host}:2368")
@@ -314,7 +357,7 @@ class UdpLine(OutletLine):
         """Wait after a temporary error and return True; return False for other errors.
 
         Raises:
-            SourceError: for other errors, if there is only one receiver.
+            SourceError: for other errors, if the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)
@@ -324,7 +367,7 @@ class UdpLine(OutletLine):
             return True
         if error.errno == errno.ECONNREFUSED:
             return True  # an ICMP reply to an earlier datagram
-        if self._host:
+        if self._host and not self._is_redirected:
             reason = system_reason(error)
             raise SourceError(f"{self.local_source}: cannot send: {reason}") from None
         return False
@@ -337,19 +380,25 @@ class TcpLine(OutletLine):
         host: the address to listen on.
         port: the port to listen on; 0 selects any free port.
         sole: whether only one connection is accepted at a time.
+        is_reported: whether the sensor reports the port, so that the SOURCE does not contain it.
 
     Raises:
         SourceError: if the address is not available.
     """
 
-    def __init__(self, host: str, port: int, *, sole: bool = False) -> None:
+    def __init__(
+        self, host: str, port: int, *, sole: bool = False, is_reported: bool = False
+    ) -> None:
         self._sole = sole
         self._clients: dict[socket.socket, _SendBuffer] = {}
         self._listener: socket.socket | None = listen(host, port)
         self.has_listener = False
         self.port = int(self._listener.getsockname()[1])
         self._host = host
-        self.local_source = f"tcp://{host}:{self.port}"
+        if is_reported:
+            self.local_source = f"tcp://{host}"
+        else:
+            self.local_source = f"tcp://{host}:{self.port}"
 
     def readable(self) -> Collection[int | socket.socket]:
         if self._listener is None or not self._accepts():

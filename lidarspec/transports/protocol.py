@@ -265,6 +265,25 @@ class LiveTransport(Transport):
         """
         return True
 
+    @property
+    def own_port(self) -> int | None:
+        """The port of this computer at which data arrives; None if there is none."""
+        return None
+
+    @property
+    def awaits_port(self) -> bool:
+        """Whether the source is not connected, because the sensor has to report its port."""
+        return False
+
+    def connect_to(self, port: int) -> None:
+        """Connect to a port that the sensor has reported.
+
+        Sources with a fixed port do nothing.
+
+        Raises:
+            SourceError: if the connection fails.
+        """
+
     def accept(self, sender: Sender) -> None:
         """Use a sender as the destination of `write`, because it is the sensor.
 

@@ -141,6 +141,7 @@ def serve(
         early_commands += outlet.receive(POLL_S)
     start_ns = get_now()
     device.start(start_ns)
+    device.serve_at(outlet.data.port)
     for link, data in early_commands:
         device.receive(data, start_ns, link)
     if seconds is None:
@@ -169,6 +170,8 @@ def serve(
         wait = _find_wait(device, outlet) if clock is None else _MIN_PAUSE_S
         for link, data in outlet.receive(wait):
             device.receive(data, get_now(), link)
+            if device.destination is not None:
+                outlet.data.redirect(*device.destination)
             if clock is not None and device.replied_at is not None:
                 clock.advance_to(device.replied_at)
 

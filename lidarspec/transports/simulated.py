@@ -13,10 +13,11 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, parse_faults
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.spec.links import Serial, is_datagram
+from lidarspec.spec.links import Serial, Udp, is_datagram
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import source_error
 from lidarspec.transports.host_clock import HostClock
+from lidarspec.transports.outlets import LOCALHOST
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: options of a ``sim:`` SOURCE.
@@ -105,6 +106,15 @@ class SimulatedTransport(LiveTransport):
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         """Do nothing: control lines have no effect on a simulated device."""
+
+    @property
+    def own_port(self) -> int | None:
+        """The declared port of the data: the simulated sensor needs none."""
+        link = self.sensor.links.get("data")
+        return link.ports[0] if isinstance(link, Udp) and link.ports else None
+
+    def peer(self) -> str | None:
+        return LOCALHOST
 
     def close(self) -> None:
         with self._changed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import socket
+import threading
 from shlex import quote
 
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
@@ -36,18 +37,40 @@ SILENCE_S = 10.0
 class TcpTransport(StreamTransport):
     """A TCP connection to a sensor.
 
+    Args:
+        port: the port; None if the sensor reports it, for every connection anew. `connect_to` then
+            opens the connection.
+
     Raises:
         SourceError: if the connection fails.
     """
 
     silence = SILENCE_S
 
-    def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
+    def __init__(
+        self, label: str, host: str, port: int | None, *, sensor: Sensor | None = None
+    ) -> None:
         super().__init__(label, sensor)
-        self._address = (host, port)
-        self._socket = self._connect(CONNECT_TIMEOUT_S)
+        self._is_reported = port is None
+        self._address = (host, port or 0)
+        self._socket: socket.socket | None = None
+        self._is_connected = threading.Event()
+        if port is not None:
+            self._open(CONNECT_TIMEOUT_S)
+
+    @property
+    def awaits_port(self) -> bool:
+        return self._is_reported and self._socket is None
+
+    def connect_to(self, port: int) -> None:
+        if self.awaits_port:
+            self._address = (self._address[0], port)
+            self._open(CONNECT_TIMEOUT_S)
 
     def _receive(self, timeout: float) -> bytes:
+        if self._socket is None:
+            self._is_connected.wait(timeout)
+            return b""
         if not wait_readable(self._socket.fileno(), timeout):
             return b""
         data = self._socket.recv(MAX_READ_BYTES)
@@ -56,21 +79,38 @@ class TcpTransport(StreamTransport):
         return data
 
     def write(self, data: bytes) -> None:
+        if self._socket is None:
+            raise SourceError(f"{self.label}: the sensor has not reported the port of its data")
         try:
             self._socket.sendall(data)
         except OSError as error:
             raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
-        self._socket.close()
-        self._socket = self._connect(RECONNECT_TIMEOUT_S)
+        """Open the connection again.
+
+        If the sensor reports the port, this only closes the old connection.
+        """
+        self._close_socket()
+        if not self._is_reported:
+            self._open(RECONNECT_TIMEOUT_S)
 
     def peer(self) -> str | None:
         return self._address[0]
 
     def close(self) -> None:
         self.closed = True
-        self._socket.close()
+        self._close_socket()
+
+    def _open(self, timeout: float) -> None:
+        self._socket = self._connect(timeout)
+        self._is_connected.set()
+
+    def _close_socket(self) -> None:
+        self._is_connected.clear()
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
 
     def _connect(self, timeout: float) -> socket.socket:
         try:
@@ -107,7 +147,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
 
     Args:
         address: the SOURCE.
-        sensor: supplies the port if the SOURCE has none.
+        sensor: supplies the port if the SOURCE has none. If the sensor reports the port, the
+            connection is opened later.
 
     Raises:
         UsageError: if host or port is missing, or for an option: TCP has none.
@@ -116,7 +157,9 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
     address.check(())
     host, port = address.host_and_port()
     link = data_link(sensor, Tcp)
-    port = port or (link.port if link else None)
-    if not host or port is None:
+    if port is None and link is not None and link.port:
+        port = link.port
+    is_reported = link is not None and bool(link.reported)
+    if not host or (port is None and not is_reported):
         raise UsageError(f"{address.text}: expected host and port, as in tcp://192.168.1.200:2111")
     return TcpTransport(address.text, host, port, sensor=sensor)

@@ -43,7 +43,7 @@ from lidarspec.transports.base import (
     system_reason,
 )
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
+from lidarspec.transports.protocol import Chunk, LiveTransport, Origin, Sender
 
 #: Maximum number of datagrams that one system call fetches.
 SLOT_COUNT = 256
@@ -72,6 +72,8 @@ SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 #: Layout of the value of SO_TIMESTAMPNS: seconds and nanoseconds.
 TIMESTAMP = struct.Struct("qq")
+#: The destination of commands while the address of the sensor is unknown.
+BROADCAST_ADDRESS = "255.255.255.255"
 #: Options of a UDP SOURCE.
 OPTIONS = ("port", "group", "src")
 
@@ -242,7 +244,8 @@ class UdpTransport(LiveTransport):
         sensor: the sensor, for suggested commands in messages.
         remote: the destination of `write`. The default is `sender` if it has a port, else the
             sender passed to `accept`.
-        broadcast: whether `remote` may be a broadcast address.
+        broadcast: whether `remote` is a broadcast address, which the sender passed to `accept`
+            replaces.
 
     Attributes:
         ports: the open ports.
@@ -275,6 +278,7 @@ class UdpTransport(LiveTransport):
         self._sensor = sensor
         if self._origin is not None and self._origin.port is not None:
             self._remote = (self._origin.host, self._origin.port)
+        self._is_addressed_by_user = self._remote is not None and not broadcast
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
         self._next_read = 0.0
@@ -327,12 +331,16 @@ class UdpTransport(LiveTransport):
             raise disconnected_error(self.label, error) from None
 
     @property
+    def own_port(self) -> int | None:
+        return self.ports[0]
+
+    @property
     def addressed(self) -> bool:
         """Whether `write` has a destination: `remote` or an accepted sender."""
         return self._remote is not None
 
     def accept(self, sender: Sender) -> None:
-        if self._origin is None or self._origin.port is None:
+        if not self._is_addressed_by_user:
             self._remote = sender
 
     def reopen(self) -> None:
@@ -542,6 +550,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
     ports = _parse_ports(address) or (
         [port] if port else list(link.ports) if isinstance(link, Udp) else []
     )
+    if not ports and sensor is not None and sensor.announces_port:
+        ports = [0]  # any free port
     if not ports:
         raise UsageError(
             f"{address.text}: the port is unknown: name the sensor with -s, or use udp://:2368"
@@ -554,6 +564,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
             f"{address.text}: {group} is not a multicast group (224.0.0.0 to 239.255.255.255)"
         )
     whole = link is None or is_datagram(link)
+    remote = None
+    is_broadcast = False
+    if isinstance(link, Udp) and sensor is not None and sensor.commands_over_data:
+        remote, is_broadcast = _find_command_address(address, link)
     return UdpTransport(
         address.text,
         ports,
@@ -562,7 +576,27 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
         sender=address.options.get("src"),
         datagrams=whole,
         sensor=sensor,
+        remote=remote,
+        broadcast=is_broadcast,
     )
+
+
+def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | None, bool]:
+    """Return the address for commands over the data link, and whether it is a broadcast.
+
+    The address is None if it is unknown until the sensor sends data.
+    """
+    control = address.options.get("control", "")
+    host, port = SourceAddress(control, "", control).host_and_port()
+    if not host and "src" in address.options:
+        host = Origin.parse(address.options["src"]).host
+    port = port or (link.ports[0] if link.ports else link.broadcast)
+    if host and port:
+        return (resolve_host(host, address.text), port), False
+    if link.broadcast:
+        everyone = address.options.get("broadcast", BROADCAST_ADDRESS)
+        return (resolve_host(everyone, address.text), link.broadcast), True
+    return None, False
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:

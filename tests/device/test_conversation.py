@@ -102,7 +102,7 @@ def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]
             == f"udp://127.0.0.1:{data}?control=127.0.0.1:{port.outlet.controls['control'].port}"
         )
         assert device.send("call", name="anna").values.head == {"number": 7, "code": 3}
-        assert device.send("send_to", host="10.0.0.9", port=2000).values.head == {
+        assert device.send("send_to", host="127.0.0.1", port=data).values.head == {
             "number": 8,
             "code": 2,
         }

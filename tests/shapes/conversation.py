@@ -1,13 +1,17 @@
 """Commands with texts, addresses, bytes and array elements.
 
-Replies repeat a sequence number, and one reply contains a table that the device keeps.
+Replies repeat a sequence number, and one reply contains a table that the device keeps. The sensors
+of `make_handle_sensor` are asked for a handle over HTTP, and send their data where they are told to
+(UDP), or at a port that they report (TCP).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ub, Int16ul, Struct, this
@@ -21,11 +25,17 @@ from lidarspec.spec import (
     Crc,
     Fields,
     Frame,
+    Http,
+    HttpReply,
+    HttpRequest,
     Learned,
     OnWrap,
     Polar,
+    Port,
     Scaled,
     Simulation,
+    Tcp,
+    Template,
     Text,
     Udp,
 )
@@ -142,7 +152,7 @@ SENSOR = Sensor(
         "send_to": Command(
             "order",
             order(2),
-            args={"host": ("host", Address()), "port": ("ports[1]", 1024, 65535)},
+            args={"host": ("host", Address()), "port": ("ports[1]", Port())},
             reply="ack",
             echoes=ECHOES,
             link="control",
@@ -171,4 +181,83 @@ SENSOR = Sensor(
     range_limits=(0.05, 30.0),
     status="manual",
     source="invented for the tests: a conversation over a link of its own",
+)
+
+
+def read_page(reply: Any) -> dict[str, Any]:
+    """Return the values of a page; ValueError if the sensor refuses."""
+    page = json.loads(reply.body)
+    if page["error"]:
+        raise ValueError(f"the sensor reports {page['error']!r}")
+    return {name: value for name, value in page.items() if name != "error"}
+
+
+def page(**values: Any) -> list[Any]:
+    """Return a simulated page."""
+    return [("page", {"status": 200, "body": json.dumps({"error": "", **values}).encode()})]
+
+
+def ask(path: str, **more: Any) -> Command:
+    """Return the command for a request to the web server."""
+    return Command(
+        "ask",
+        {"method": "GET", "path": Template(path) if "{" in path else path.encode(), "body": b""},
+        reply="page",
+        matches={"status": 200},
+        link="web",
+        provides=read_page,
+        **more,
+    )
+
+
+def start_page(request: dict[str, Any]) -> list[Any]:
+    """Return the page for a start with a valid handle only."""
+    return page(error="" if request["{handle}"] == "s10" else "no such handle")
+
+
+def make_handle_sensor(data: Udp | Tcp, web_port: int = 7022) -> Sensor:
+    """Return a sensor that is started with a handle, and sends its data over this link."""
+    if isinstance(data, Udp):
+        request_handle = ask("/handle?to={own_address}&port={own_port}")
+    else:
+        request_handle = ask("/handle")
+    commands = {
+        "request_handle": request_handle,
+        "start": ask("/start?handle={handle}", starts=True, timeout=5.0),
+        "stop": ask("/stop?handle={handle}", stops=True),
+        "set_rate": ask("/rate?hz={rate}", args={"rate": ("path", 5, 20)}),
+        "set_name": ask("/set?name={name}", args={"name": ("path", Text(8))}),
+        "get_any": ask("/{what}", args={"what": ("path", Text(8))}),
+    }
+    answers = {
+        "request_handle": lambda request: page(handle="s10", data_port=request["{data_port}"]),
+        "start": start_page,
+        "stop": page(),
+        "set_rate": lambda request: page(rate=float(request["{rate}"])),
+        "set_name": page(),
+        "get_any": page(),
+    }
+    return dataclasses.replace(
+        SENSOR,
+        id="shape-handles",
+        model="Handles",
+        frames={
+            "data": SENSOR.frames["data"],
+            "page": Frame(HttpReply, max_length=4096),
+            "ask": Frame(HttpRequest, direction="out", max_length=4096),
+        },
+        links={"data": data, "web": Http(web_port)},
+        commands=commands,
+        configure=None,
+        on_open=("request_handle", "start"),
+        on_close=("stop",),
+        simulation=Simulation(sweep, rate=900, answers=answers),
+    )
+
+
+#: The sensor sends to the address and port in the request.
+TOLD = make_handle_sensor(Udp())
+#: The reply contains the port of the data.
+REPORTED = dataclasses.replace(
+    make_handle_sensor(Tcp(reported="data_port")), id="shape-reported-port", model="ReportedPort"
 )
