@@ -25,6 +25,7 @@ from lidarspec.points.appearance import choose_appearance
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
+from lidarspec.simulation.clock_faults import ClockFaults, parse_clock_faults
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
@@ -122,6 +123,12 @@ PLACES = (
     show_default=True,
     help="With --unplug: time until reconnection.",
 )
+@click.option(
+    "--clock",
+    metavar="FAULT,...",
+    help="Faults of the clock: utc, tai, gps, drift=50ppm, step=0.2s@10s, pps@10s, leap@10s,"
+    " unlock=5s@10s, restart@10s.",
+)
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @click.option(
@@ -142,6 +149,7 @@ def sim(
     absent: float,
     shake: float,
     rotor: str | None,
+    clock: str | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -152,7 +160,8 @@ def sim(
     on standard error.
     """
     sensor = named_sensor(sensor_id)
-    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
+    clock_faults = ClockFaults() if clock is None else parse_clock_faults(clock)
+    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake, clock_faults)
     simulated_scene = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(
         sensor, scene=simulated_scene, seed=seed, rate=parse_rate(rate), faults=faults

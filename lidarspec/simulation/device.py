@@ -23,9 +23,15 @@ from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.sensor_operations import Sensor
+from lidarspec.simulation.clock_faults import ClockTimeline
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.scenes import Scene, make_room
-from lidarspec.simulation.simulator import FrameSimulation, FramesWithoutPoints, frame_simulation
+from lidarspec.simulation.simulator import (
+    FrameSimulation,
+    FramesWithoutPoints,
+    check_clock_faults,
+    frame_simulation,
+)
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import Http, is_datagram
@@ -157,6 +163,10 @@ class ReplyMaker:
                 chosen = declared
         return [self._make_reply(answer, request) for answer in chosen]
 
+    def use_timeline(self, timeline: ClockTimeline) -> None:
+        """Apply the faults of a clock to the periodic frames from now on."""
+        self._frames.use_timeline(timeline)
+
     def unasked_frame(self, name: str, number: int) -> bytes:
         """Return the frame with this number of a type that the sensor sends periodically."""
         return self._frames.numbered(name, number)
@@ -272,8 +282,10 @@ class _PlannedData(NamedTuple):
 class _FrameStream:
     """The data frames of one type from a start time, in ns since power-on.
 
+    Args:
+        timeline: the faults of the sensor's clock.
+
     Attributes:
-        clock_offset: seconds that are added to the sensor's clock, starting with the next batch.
         due: the time of the next frame.
     """
 
@@ -284,12 +296,13 @@ class _FrameStream:
         scene: Scene,
         began: float,
         shake: float,
+        timeline: ClockTimeline,
     ) -> None:
         self._made = frame_simulation
         self._scene = scene
         self.frame = frame
         self._shake = shake
-        self.clock_offset = 0.0
+        self._timeline = timeline
         self._next = 0
         self._end = began
         self._frames: list[bytes] = []
@@ -320,7 +333,7 @@ class _FrameStream:
         """Make the next batch of frames."""
         count = max(min(int(MAX_BATCH_NS / max(self._made.interval, 1)), MAX_BATCH_PACKETS), 1)
         block = self._made.block(
-            self._next, count, self._scene, self._end / SECOND, self._shake, self.clock_offset
+            self._next, count, self._scene, self._end / SECOND, self._shake, self._timeline
         )
         times = (self._end + block.times).tolist()
         self._frames = block.frames
@@ -346,9 +359,11 @@ class SimulatedDevice:
             an address; None if no command did.
         sent: number of sent frames by type, before any faults.
         lines: link -> its faults.
+        utc_offset_ns: UTC minus the time that the caller passes, ns, from the next `start` on; for
+            clocks that follow UTC.
 
     Raises:
-        UsageError: if the sensor declares no `sweep`.
+        UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
         SpecError: if its packet rate is unknown.
     """
 
@@ -365,6 +380,7 @@ class SimulatedDevice:
         self.rate = rate
         self.faults = faults or Faults()
         self.present = True
+        self.utc_offset_ns = 0
         self.commands_received = list[str]()
         self.destination: tuple[str, int] | None = None
         self.sent = Counter[str]()
@@ -378,8 +394,10 @@ class SimulatedDevice:
         self._powered = 0
         self._time = 0.0
         self._plug: int | None = None
+        self._timeline = ClockTimeline(self.faults.clock)
         if sensor.has_points:
             self._simulation(sensor.data_frame)
+        check_clock_faults(sensor, self.faults.clock)
 
     def _line(self, name: str, seed: int) -> FaultyLink:
         """Return the link of this name with its faults.
@@ -398,6 +416,8 @@ class SimulatedDevice:
         self._powered = now
         self._time = 0.0
         self.destination = None
+        self._timeline = ClockTimeline(self.faults.clock, now + self.utc_offset_ns)
+        self._replies.use_timeline(self._timeline)
         self.present = True
         if self.faults.unplug:
             self._plug = now + int(self.faults.unplug * SECOND)
@@ -435,12 +455,14 @@ class SimulatedDevice:
                 the next `start`.
 
         Raises:
-            UsageError: if the clock is not a single field of the data frame, or no data is sent.
+            UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
+                sent.
         """
         if self._stream is None:
             raise UsageError(f"{self.sensor.id} sends no data, so that its clock cannot jump")
-        self._simulation(self._stream.frame).check_clock()
-        self._stream.clock_offset += seconds
+        self._simulation(self._stream.frame).clock.check(self.faults.clock)
+        self._timeline.jump_ns += round(seconds * SECOND)
+        self._replies.use_timeline(self._timeline)
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
         """Receive bytes or a datagram."""
@@ -601,7 +623,7 @@ class SimulatedDevice:
 
     def _begin(self, at: float, frame: str) -> None:
         self._stream = _FrameStream(
-            self._simulation(frame), frame, self._scene, at, self.faults.shake
+            self._simulation(frame), frame, self._scene, at, self.faults.shake, self._timeline
         )
 
     def _simulation(self, frame: str) -> FrameSimulation:

@@ -1,8 +1,8 @@
 """Inject faults into the data of a simulated sensor.
 
-The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor and IMU
-noise. The same seed causes the same faults in the same packets, however they are split into
-batches.
+The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor, IMU noise
+and faults of the clock. The same seed causes the same faults in the same packets, however they are
+split into batches.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import heapq
 import math
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UsageError
+from lidarspec.simulation.clock_faults import ClockFaults, parse_clock_faults
 from lidarspec.spec.fields import duration, share
 
 #: Fraction of datagrams that are delayed if `reorder` is set.
@@ -35,6 +36,7 @@ class Faults:
         unplug: interval between disconnections, in seconds; 0: never.
         absent: duration of each disconnection, in seconds.
         shake: standard deviation of the noise on IMU readings, in m/s2 and rad/s; 0: at rest.
+        clock: the faults of the sensor's clock.
         rotor: "blocked" if the rotor does not turn and the angles are constant; "" if it turns.
 
     Raises:
@@ -49,6 +51,7 @@ class Faults:
     absent: float = 2.0
     rotor: str = ""
     shake: float = 0.0
+    clock: ClockFaults = field(default_factory=ClockFaults)
 
     def __post_init__(self) -> None:
         for name, high in (
@@ -80,6 +83,7 @@ def parse_faults(options: Mapping[str, str]) -> Faults:
         "absent": duration,
         "shake": float,
         "rotor": str,
+        "clock": parse_clock_faults,
     }
     values = {}
     for name, text in options.items():
@@ -91,7 +95,7 @@ def parse_faults(options: Mapping[str, str]) -> Faults:
 
 
 #: The names of the faults.
-FAULTS = tuple(field.name for field in fields(Faults))
+FAULTS = tuple(one.name for one in fields(Faults))
 
 
 class FaultyLink:

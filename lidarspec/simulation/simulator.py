@@ -31,20 +31,23 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, align_points
-from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
+from lidarspec.frames.frame_table import CompiledTable, Table
 from lidarspec.framing.example_frames import example
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.points.conventions import coordinates, find_direction
 from lidarspec.points.reference_evaluator import list_parts
 from lidarspec.sensor_operations import Sensor
-from lidarspec.simulation.frame_maker import FrameMaker, seal_frames
+from lidarspec.simulation.clock_faults import ClockFaults, ClockTimeline
+from lidarspec.simulation.clock_writer import FrameClock
+from lidarspec.simulation.frame_maker import FrameMaker
+from lidarspec.simulation.raw_values import PartRows, round_raw, write_raw
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
-from lidarspec.spec.tree import FieldInfo, to_exact
+from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 #: Bits on a serial line for each byte: start, eight, stop.
@@ -55,6 +58,8 @@ CLOCK_TOLERANCE_NS = 1_000_000
 AHEAD = 1
 #: Number of packets that show which fields hold the ranges, and the packet rate.
 MAX_PROBED_PACKETS = 256
+#: Number of packets that show the fields of the clock.
+CLOCK_PROBE_PACKETS = 2
 #: Maximum bytes of these packets, and their minimum number.
 MAX_PROBED_BYTES = 1 << 21
 MIN_PROBED_PACKETS = 4
@@ -546,66 +551,6 @@ def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
     return Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
 
 
-def round_raw(info: FieldInfo, raw: Floats) -> Floats:
-    """Return raw values as a field can hold them."""
-    if info.kind == "int":
-        return np.rint(raw)
-    return raw
-
-
-class PartRows(CompiledTable):
-    """The parts of frames that have the points, with their frames.
-
-    Args:
-        frames: the frames; `put_back` writes to them.
-        path: path of the parts.
-    """
-
-    def __init__(self, frames: CompiledTable, path: str) -> None:
-        place = frames.schema.within(path)
-        if place is None or place[2]:
-            raise SpecError("the frame has no such parts", path=path)
-        self.place = place[:2]
-        self.frames = frames
-        own, self.which = frames.parts(*self.place)
-        super().__init__(
-            own.schema,
-            [LayoutRows(group.layout, group.where, group.rows.copy()) for group in own.groups],
-        )
-
-    def put_back(self) -> None:
-        """Write the parts, with their checksums, into their frames."""
-        left = iter(seal_frames(self))
-        axis, kind = self.place
-        destinations = list[tuple[int, int, NDArray[np.uint8]]]()
-        for group, buffer, walked in self.frames.walks(axis):
-            kinds = [one.node.name for one in group.layout.regions[axis].kinds]
-            for piece in (
-                piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind
-            ):
-                destinations += [
-                    (int(group.where[owner]), int(offset), buffer)
-                    for owner, offset in zip(piece.owners, piece.offsets, strict=True)
-                ]
-        for _, offset, buffer in sorted(destinations, key=lambda found: found[:2]):
-            part = next(left)
-            buffer[offset : offset + len(part)] = np.frombuffer(part, np.uint8)
-
-
-def write_raw(table: CompiledTable, path: str, values: NDArray[Any]) -> None:
-    """Write raw values, (n, ...) or a single one, into every frame that has the field."""
-    for group in table.groups:
-        leaf = group.layout.leaves.get(path)
-        if leaf is None:
-            continue
-        own = values if values.ndim == 0 else values[group.where]
-        if own.ndim:
-            own = own.reshape(own.shape[: 1 + len(leaf.shape)])[
-                (slice(None), *(slice(0, length) for length in leaf.shape))
-            ]
-        leaf.store(group.rows, own)
-
-
 def _part(array: Floats, inner: tuple[int, ...]) -> Floats:
     corner: Any = (..., *inner)
     return np.asarray(array[corner])
@@ -857,6 +802,16 @@ class FrameSimulation:
         )
         self.interval = self._pace.interval
 
+    @functools.cached_property
+    def clock(self) -> FrameClock:
+        """The clock of the frames.
+
+        Raises:
+            UsageError: if it cannot be written.
+        """
+        table = self._maker.table(self._sweep_values(range(CLOCK_PROBE_PACKETS)))
+        return FrameClock(self._sensor, self._frame, table)
+
     def block(
         self,
         start: int,
@@ -864,14 +819,14 @@ class FrameSimulation:
         scene: Scene,
         since: float = 0.0,
         shake: float = 0.0,
-        clock_offset: float = 0.0,
+        timeline: ClockTimeline | None = None,
     ) -> PacketBlock:
         """Return the packets from number `start` on.
 
         Args:
             since: seconds since the scene began at the first of them.
             shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
-            clock_offset: seconds that are added to the sensor's clock.
+            timeline: the faults of the sensor's clock; `since` then counts from power-on.
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._sweep_values(numbers))
@@ -890,38 +845,10 @@ class FrameSimulation:
             self._measurement.fill(table, numbers, scene, seconds)
         if self._rest is not None:
             self._rest.fill(table, shake, [start])
-        if clock_offset:
-            self._shift_clock(table, clock_offset)
+        if timeline is not None and not timeline.is_perfect:
+            since_ns = round(since * 1e9)
+            self.clock.apply(table, timeline, since_ns + times)
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
-
-    def check_clock(self) -> str:
-        """Return the field of the sensor's clock.
-
-        Raises:
-            UsageError: if the clock is not a single field of the frame.
-        """
-        clock = self._sensor.clock
-        path = clock.source if clock is not None else None
-        if not isinstance(path, str) or path not in self._maker.schema.fields:
-            raise UsageError(
-                f"the clock of {self._sensor.id} cannot jump: it is not a single field of"
-                f" {self._frame!r} frames"
-            )
-        return path
-
-    def _shift_clock(self, table: CompiledTable, seconds: float) -> None:
-        """Add seconds to the clock of each packet; it wraps as the sensor's clock does."""
-        path = self.check_clock()
-        assert self._sensor.clock is not None
-        info = table.schema.fields[path]
-        unit_s = float(factor(info.unit, "s") or 1)
-        times = info.physical(table.raw(path).astype(np.float64)) * unit_s + seconds
-        if self._sensor.clock.wraps_at is not None:
-            times %= float(self._sensor.clock.wraps_at)
-        raw = info.raw(times / unit_s)
-        if info.kind == "int":
-            raw = np.clip(raw, *info.limits)
-        write_raw(table, path, raw)
 
     def _with_points(self, table: CompiledTable) -> CompiledTable:
         """Return the rows that have points: frames, or the parts in them."""
@@ -969,14 +896,27 @@ class FramesWithoutPoints:
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
         self._sensor = sensor
         self._shake = shake
+        self._timeline = ClockTimeline(ClockFaults())
+        self._clocks = dict[str, FrameClock]()
         self._makers = dict[str, FrameMaker]()
         self._rests = dict[str, RestingImu]()
         #: Frame type -> the number of the first frame of a batch, and the batch.
         self._batches = dict[str, tuple[int, list[bytes]]]()
 
+    def use_timeline(self, timeline: ClockTimeline) -> None:
+        """Apply the faults of a clock to the periodic frames from now on."""
+        self._timeline = timeline
+        self._batches.clear()
+
+    def find_clock(self, name: str) -> FrameClock:
+        """Return the clock of a frame type that is sent periodically."""
+        if name not in self._clocks:
+            self._clocks[name] = FrameClock(self._sensor, name, self._fill(name, range(1), {}))
+        return self._clocks[name]
+
     def make(self, name: str, values: Mapping[str, Any]) -> bytes:
         """Return a frame with these physical values."""
-        return self._make(name, range(1), values)[0]
+        return self._get_maker(name).seal(self._fill(name, range(1), values))[0]
 
     def numbered(self, name: str, number: int) -> bytes:
         """Return the frame of this number.
@@ -985,7 +925,8 @@ class FramesWithoutPoints:
         """
         start = number - number % UNASKED_BATCH
         if self._batches.get(name, (-1, []))[0] != start:
-            self._batches[name] = start, self._make(name, range(start, start + UNASKED_BATCH), {})
+            batch = self._make_batch(name, range(start, start + UNASKED_BATCH))
+            self._batches[name] = start, batch
         return self._batches[name][1][number - start]
 
     def iter_unasked(self) -> Iterator[bytes]:
@@ -998,18 +939,31 @@ class FramesWithoutPoints:
         due = heapq.merge(*(_iter_due(name, rate) for name, rate in rates.items()))
         return (self.numbered(name, number) for _, name, number in due)
 
-    def _make(self, name: str, numbers: range, values: Mapping[str, Any]) -> list[bytes]:
-        if name not in self._makers:
-            self._makers[name] = FrameMaker(self._sensor, name)
+    def _make_batch(self, name: str, numbers: range) -> list[bytes]:
+        """Return consecutive frames of a type that is sent periodically."""
+        table = self._fill(name, numbers, {})
+        if not self._timeline.is_perfect:
+            rate = self._sensor.frames[name].simulation.rate
+            times = np.rint(np.array(numbers) * 1e9 / rate).astype(np.int64)
+            self.find_clock(name).apply(table, self._timeline, times)
+        return self._get_maker(name).seal(table)
+
+    def _fill(self, name: str, numbers: range, values: Mapping[str, Any]) -> CompiledTable:
+        """Return frames with the values of the spec, which these physical values replace."""
         declared = self._sensor.frames[name]
         state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
         given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
-        table = self._makers[name].table(given)
+        table = self._get_maker(name).table(given)
         if declared.imu is not None:
             rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))
             rest.fill(table, self._shake, [numbers.start])
-        return self._makers[name].seal(table)
+        return table
+
+    def _get_maker(self, name: str) -> FrameMaker:
+        if name not in self._makers:
+            self._makers[name] = FrameMaker(self._sensor, name)
+        return self._makers[name]
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
@@ -1024,7 +978,12 @@ def frame_simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> Fr
 
 
 def simulate(
-    sensor: Sensor, packets: int = 100, *, start: int = 0, scene: Scene | None = None
+    sensor: Sensor,
+    packets: int = 100,
+    *,
+    start: int = 0,
+    scene: Scene | None = None,
+    clock: ClockFaults | None = None,
 ) -> list[bytes]:
     """Return the data frames that a sensor in a scene sends, in order.
 
@@ -1034,19 +993,54 @@ def simulate(
         packets: number of frames.
         start: the number of the first frame since the sensor was switched on.
         scene: the surroundings, for example from `read_scene`; by default a room.
+        clock: the faults of the sensor's clock. If it follows a time scale, the sensor is switched
+            on at the start of 1970.
 
     Raises:
-        UsageError: if the sensor declares no `sweep`, or no `rate` if it has no points.
+        UsageError: if the sensor declares no `sweep`, or no `rate` if it has no points, or if its
+            clock cannot have the faults.
         SpecError: if its ranges cannot be traced back to fields.
     """
+    timeline = ClockTimeline(clock or ClockFaults())
+    check_clock_faults(sensor, timeline.faults)
     if not sensor.has_points:
-        unasked = FramesWithoutPoints(sensor).iter_unasked()
+        makers = FramesWithoutPoints(sensor)
+        makers.use_timeline(timeline)
+        unasked = makers.iter_unasked()
         frames = list(itertools.islice(unasked, start, start + packets))
         if not frames and packets:
             raise UsageError(f"{sensor.id}: it sends no frames unasked: none declares a `rate`")
         return frames
     stream = frame_simulation(sensor, sensor.data_frame)
-    return stream.block(start, packets, scene or Room(), start * stream.interval / 1e9).frames
+    since = start * stream.interval / 1e9
+    return stream.block(start, packets, scene or Room(), since, timeline=timeline).frames
+
+
+def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
+    """Raise UsageError if the frames of a simulated sensor cannot show the faults of its clock."""
+    if not faults:
+        return
+    others = FramesWithoutPoints(sensor)
+    unasked = [
+        name for name, frame in sensor.incoming.items() if frame.simulation.rate and not frame.data
+    ]
+    if sensor.has_points:
+        frame_simulation(sensor, sensor.data_frame).clock.check(faults)
+    elif not any(others.find_clock(name).has_clock for name in unasked):
+        raise UsageError(f"{sensor.id} sends no frames with a clock, so that it cannot have faults")
+    if not faults.unlocked:
+        return
+    clock = sensor.clock
+    frame = clock.status.frame if clock is not None and clock.status is not None else ""
+    if not frame:
+        frame_simulation(sensor, sensor.data_frame).clock.check_status()
+    elif frame in unasked:
+        others.find_clock(frame).check_status()
+    else:
+        raise UsageError(
+            f"{sensor.id} cannot lose its lock: its status is in {frame!r} frames, and the"
+            " simulated sensor does not send them by itself"
+        )
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:

@@ -140,6 +140,7 @@ def serve(
     while patient and not outlet.has_listener and not stop.is_set():
         early_commands += outlet.receive(POLL_S)
     start_ns = get_now()
+    device.utc_offset_ns = time.time_ns() - start_ns
     device.start(start_ns)
     device.serve_at(outlet.data.port)
     for link, data in early_commands:
@@ -297,7 +298,8 @@ class Served(ClosingContext):
             seconds: how far, forward or back.
 
         Raises:
-            UsageError: if the clock is not a single field of the data frame, or no data is sent.
+            UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
+                sent.
         """
         failures = list[UsageError]()
 

@@ -85,6 +85,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
     start_ns = time.time_ns()
     opening = _commands_on_open(sensor)
     now = 0
+    device.utc_offset_ns = start_ns
     device.start(now)
     while now < seconds * SECOND:
         if opening:

@@ -10,10 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lidarspec as ls
 from lidarspec.cli.options import DURATION
+from lidarspec.simulation.clock_faults import parse_clock_faults
 from lidarspec.simulation.faults import parse_faults
 from lidarspec.spec.fields import duration
 from lidarspec.transports.addresses import SourceAddress
@@ -110,6 +112,22 @@ def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
         assert device.stats.bad_checksum > 0
     assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
     ran("sim", STL, "--to", path, "-t", "1s", "--force")
+
+
+def test_the_clock_has_faults(tmp_path: Path) -> None:
+    path = tmp_path / "made.lsr"
+    ran("sim", "robosense-m1", "--to", path, "-t", "1s", "--clock", "step=5s@500ms,unlock@0.2s")
+    with ls.open(path, "robosense-m1") as device:
+        times = np.concatenate([packets.time_ns for packets in device.packets()])
+    steps = np.diff(times) * 1e-9
+    assert steps.max() == pytest.approx(5.0, abs=0.01)
+    assert times[0] < 1e9 <= times[-1] - 4.9e9
+    refused = ran("sim", "cspc-m1c1-mini", "--to", path, "--force", "--clock", "drift=1ppm", code=2)
+    assert "has no clock" in refused.stderr
+    ran("sim", STL, "--to", path, "--force", "--clock", "unlock@1s", code=2)
+    simulated = connect(SourceAddress.parse("sim:ldrobot-stl27l?clock=drift=50ppm,step=1s@2s"))
+    assert simulated.device.faults.clock == parse_clock_faults("drift=50ppm,step=1s@2s")
+    simulated.close()
 
 
 def test_an_unplugged_simulation_is_reported(tmp_path: Path) -> None:

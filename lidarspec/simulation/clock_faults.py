@@ -1,0 +1,216 @@
+"""Faults of a simulated sensor's clock.
+
+`ClockFaults` is the value that a user gives, also as text: ``drift=50ppm,step=0.2s@10s``. A
+`ClockTimeline` applies it to the readings of one power cycle.
+
+| text | fault |
+|---|---|
+| `utc`, `tai`, `gps` | the clock follows the time of the computer in this time scale |
+| `drift=50ppm` | it is fast by 50 millionths of the time since power-on |
+| `step=0.2s@10s` | it jumps forward by 0.2 s, 10 s after power-on; negative: back |
+| `pps@10s` | it counts a pulse twice: one second ahead |
+| `leap@10s` | it repeats a second, as UTC does in a leap second |
+| `unlock=5s@10s` | its status is "not locked" for 5 s; without a duration, for ever |
+| `restart@10s` | it starts again as after power-on, not locked |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError, did_you_mean
+from lidarspec.leap_seconds import read_leap_seconds
+from lidarspec.spec.fields import duration
+
+Times = NDArray[np.int64]
+SECOND_NS = 1_000_000_000
+#: The time scales that a clock can follow.
+SCALES = ("utc", "tai", "gps")
+#: The state of a clock: locked; it keeps its time without a source; or it has restarted.
+LOCKED = 0
+LOST = 1
+RESTARTED = 2
+#: The fastest drift, 2 %; a clock without a crystal is better.
+MAX_DRIFT_PPM = 20_000.0
+
+
+@dataclass(frozen=True)
+class ClockFaults:
+    """The faults of a clock; all times are seconds since power-on.
+
+    Args:
+        follows: "utc", "tai" or "gps": the clock is set to the time of the computer in this time
+            scale; "" if it keeps the times that the simulated sensor declares.
+        drift_ppm: the share by which the clock is fast, in millionths.
+        steps: pairs of a time and the seconds by which the clock jumps forward.
+        unlocked: pairs of the times when the clock loses its lock, and when it has it again.
+        restarts: the times when the clock starts again as after power-on. From then on it follows
+            nothing and is not locked.
+
+    Raises:
+        UsageError: for an unknown time scale, or a drift of more than 2 %.
+    """
+
+    follows: str = ""
+    drift_ppm: float = 0.0
+    steps: tuple[tuple[float, float], ...] = ()
+    unlocked: tuple[tuple[float, float], ...] = ()
+    restarts: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.follows not in ("", *SCALES):
+            raise UsageError(
+                f"a clock cannot follow {self.follows!r}: expected {', '.join(SCALES)}"
+            )
+        if not abs(self.drift_ppm) <= MAX_DRIFT_PPM:
+            raise UsageError(f"drift must be at most {MAX_DRIFT_PPM:g} ppm, not {self.drift_ppm:g}")
+
+    def __bool__(self) -> bool:
+        return self != ClockFaults()
+
+    @property
+    def sets_status(self) -> bool:
+        """Whether the sensor reports whether its clock is locked, other than by default."""
+        return bool(self.follows or self.unlocked or self.restarts)
+
+
+def parse_clock_faults(text: str) -> ClockFaults:
+    """Return the faults in a text, for example "utc,drift=50ppm,step=0.2s@10s".
+
+    Raises:
+        UsageError: for an unknown fault, or a value that cannot be parsed.
+    """
+    faults = ClockFaults()
+    for part in text.split(","):
+        fault, mark, when = part.strip().partition("@")
+        name, _, value = fault.partition("=")
+        start_s = duration(when) if mark else 0.0
+        if name in SCALES and part.strip() == name:
+            faults = replace(faults, follows=name)
+        elif name in _READERS:
+            faults = _READERS[name](faults, value, start_s)
+        else:
+            known = (*SCALES, *_READERS)
+            raise UsageError(
+                f"invalid clock fault {part.strip()!r}: expected {', '.join(known)}"
+                f"{did_you_mean(name, known)}"
+            )
+    return faults
+
+
+def _add_drift(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    try:
+        drift_ppm = float(value.removesuffix("ppm"))
+    except ValueError:
+        drift_ppm = math.nan
+    if not math.isfinite(drift_ppm) or start_s:
+        raise UsageError(f"invalid drift {value!r}: expected millionths since power-on, as 50ppm")
+    return replace(faults, drift_ppm=drift_ppm)
+
+
+def _add_step(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    size = duration(value.lstrip("+-"))
+    if value.startswith("-"):
+        size = -size
+    return replace(faults, steps=(*faults.steps, (start_s, size)))
+
+
+def _add_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    return _add_step(faults, value or "1s", start_s)
+
+
+def _repeat_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    return _add_step(faults, value or "-1s", start_s)
+
+
+def _unlock(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    end_s = start_s + duration(value) if value else math.inf
+    return replace(faults, unlocked=(*faults.unlocked, (start_s, end_s)))
+
+
+def _restart(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
+    if value:
+        raise UsageError(f"invalid restart={value}: expected a time only, as restart@10s")
+    return replace(faults, restarts=(*faults.restarts, start_s))
+
+
+_READERS: dict[str, Callable[[ClockFaults, str, float], ClockFaults]] = {
+    "drift": _add_drift,
+    "step": _add_step,
+    "pps": _add_second,
+    "leap": _repeat_second,
+    "unlock": _unlock,
+    "restart": _restart,
+}
+
+
+class ClockTimeline:
+    """The readings of a faulty clock since power-on.
+
+    Args:
+        faults: the faults.
+        power_on_ns: the time of the computer at power-on, ns since 1970 in UTC.
+
+    Attributes:
+        jump_ns: the sum of the jumps that were made while the sensor runs.
+    """
+
+    def __init__(self, faults: ClockFaults, power_on_ns: int = 0) -> None:
+        self.faults = faults
+        self.jump_ns = 0
+        self._power_on_ns = power_on_ns
+
+    @property
+    def is_perfect(self) -> bool:
+        """Whether the clock has no faults and has not jumped."""
+        return not self.faults and not self.jump_ns
+
+    def shift(self, readings: Times, times: Times, first_reading: int) -> Times:
+        """Return the readings with the faults, (n,) ns, not wrapped.
+
+        Args:
+            readings: the readings without faults, (n,) ns.
+            times: the times since power-on, (n,) ns.
+            first_reading: the reading at power-on, ns.
+        """
+        faults = self.faults
+        shifted: Times = readings
+        if faults.follows:
+            shifted = times + (self._power_on_ns + self._scale_offset_ns())
+        start = np.zeros(len(times), np.int64)
+        for restart in sorted(faults.restarts):
+            restart_ns = round(restart * SECOND_NS)
+            has_restarted = times >= restart_ns
+            start[has_restarted] = restart_ns
+            shifted = np.where(has_restarted, first_reading + times - restart_ns, shifted)
+        drifted = np.rint(faults.drift_ppm * 1e-6 * (times - start)).astype(np.int64)
+        shifted = shifted + drifted + self.jump_ns
+        for at, size in faults.steps:
+            at_ns = round(at * SECOND_NS)
+            has_jumped = (times >= at_ns) & (at_ns >= start)
+            shifted = shifted + np.where(has_jumped, round(size * SECOND_NS), 0)
+        return shifted
+
+    def lock_states(self, times: Times) -> NDArray[np.int64]:
+        """Return LOCKED, LOST or RESTARTED at some times since power-on, (n,) ns."""
+        states = np.full(len(times), LOCKED)
+        for begin, end in self.faults.unlocked:
+            is_lost = times >= round(begin * SECOND_NS)
+            if math.isfinite(end):
+                is_lost &= times < round(end * SECOND_NS)
+            states[is_lost] = LOST
+        if self.faults.restarts:
+            states[times >= round(min(self.faults.restarts) * SECOND_NS)] = RESTARTED
+        return states
+
+    def _scale_offset_ns(self) -> int:
+        """Return the followed time scale minus UTC, ns."""
+        table = read_leap_seconds()
+        now_s = self._power_on_ns / SECOND_NS
+        offsets_s = {"utc": 0, "tai": table.tai_minus_utc(now_s), "gps": table.gps_minus_utc(now_s)}
+        return offsets_s[self.faults.follows] * SECOND_NS
