@@ -90,6 +90,7 @@ FACES = ("lidarspec", "lidarspec.spec")
 PAGE_MAY_IMPORT = {
     "errors",
     "explaining.assignments",
+    "explaining.clock_text",
     "explaining.file_contents",
     "explaining.explanation",
     "explaining.input_segments",
@@ -98,6 +99,7 @@ PAGE_MAY_IMPORT = {
     "formats",
     "frames.commands",
     "framing.results",
+    "packets.clock_monitor",
     "points.conventions",
     "points.appearance",
     "recording.recorder_switch",

@@ -15,13 +15,16 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import FirstFrameTimeout, conclude, no_scan_error
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.terminal import say
+from lidarspec.detect.doctor import Diagnosis
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.explaining.clock_text import iter_clock_rows
+from lidarspec.errors import LidarSpecError
+from lidarspec.explaining.clock_text import describe_clock, iter_clock_rows
 from lidarspec.packets.clock_monitor import DRIFT_LIMIT_PPM, ClockMonitor, ClockReport
 from lidarspec.packets.packets import Packets
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.live_scans import LOOK_S
 
+UNSYNCHRONIZED = ("not_locked", "unsynchronized", "wrong_date")
 DEFAULT_DURATION_S = 12.0  # the drift is known after ten seconds
 
 
@@ -120,6 +123,28 @@ def clock(
             conclude(one.device)
     if any(finding.is_fault for report in reports for finding in report.findings):
         raise click.exceptions.Exit(FINDINGS)
+
+
+def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) -> Diagnosis | None:
+    """Return the finding of `doctor` about the clock of a source that sends valid data.
+
+    A clock that nothing synchronizes is no problem: many sensors are used so.
+
+    Returns:
+        None if the sensor sends no time, or cannot be opened again.
+    """
+    try:
+        with open_device(source, sensor_id, start=False, period=LOOK_S) as device:
+            one = SourceClock(device, source, DRIFT_LIMIT_PPM)
+            _read_all([one], seconds)
+            report = one.report()
+    except LidarSpecError:
+        return None
+    verdict = report.verdict
+    if verdict.code == "no_clock":
+        return None
+    is_ok = not verdict.is_fault or verdict.code in UNSYNCHRONIZED
+    return Diagnosis(is_ok, f"clock: {describe_clock(report)}", "" if is_ok else verdict.advice)
 
 
 def _read_all(clocks: Sequence[SourceClock], duration: float | None) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from lidarspec.cli.clock import diagnose_clock
 from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
@@ -655,6 +656,9 @@ def doctor(
         diagnoses = list(examine_computer())
     else:
         diagnoses = list(examine(source, sensor, seconds=duration))
+        if all(finding.ok for finding in diagnoses):
+            about_clock = diagnose_clock(source, sensor_id, duration)
+            diagnoses += [] if about_clock is None else [about_clock]
     if as_json:
         emit_json([finding.to_dict() for finding in diagnoses], output)
     else:

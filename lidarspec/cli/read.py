@@ -33,6 +33,8 @@ from lidarspec.cli.options import (
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame, UsageError, printable
+from lidarspec.explaining.clock_text import describe_clock
+from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, TimeSlice
@@ -293,13 +295,14 @@ class StatsPrinter:
         )
         sys.stdout.flush()
 
-    def summary(self, reading: MeterReading) -> None:
+    def summary(self, reading: MeterReading, clock: ClockReport) -> None:
         """Print the values of the whole input."""
         if self.as_json:
             self._emit(
                 {
                     "kind": "summary",
                     **self._figures(reading),
+                    "clock": clock.to_dict(),
                     "stats": self.device.stats.to_dict(),
                     "info": self.device.info,
                 }
@@ -317,6 +320,8 @@ class StatsPrinter:
         for name, unit, _, text in FIGURES:
             if text(reading) != "-":
                 say(f"  {name:<8} {text(reading):>10} {unit}")
+        if self.device.sensor.clock is not None:
+            say(f"  clock    {describe_clock(clock)}")
         for fact, value in self.device.info.items():
             say(f"  {fact}: {printable(value)}")
 
@@ -414,12 +419,12 @@ def _print_stats(
         else:
             _print_by_packet_time(feed, lines, interval, lasting)
     except KeyboardInterrupt:
-        lines.summary(_measure_input(feed, start))
+        lines.summary(_measure_input(feed, start), feed.clock.report())
         raise
     reading = _measure_input(feed, start)
     if reading.packets == 0:
         raise no_scan_error(feed.device, source, reading.seconds)
-    lines.summary(reading)
+    lines.summary(reading, feed.clock.report())
     return reading
 
 

@@ -146,14 +146,24 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         commands = {name: _command_to_dict(sensor, name) for name in sensor.commands}
         emit_json({**_sensor_to_dict(sensor), "frames": frames, "commands": commands}, output)
         return
-    from lidarspec.explaining.formatting import describe_losses
+    from lidarspec.explaining.formatting import (
+        describe_declared_clock,
+        describe_declared_status,
+        describe_losses,
+    )
 
+    clock = ""
+    if sensor.clock is not None:
+        clock = f"\n  clock   {describe_declared_clock(sensor.clock)}"
+        if sensor.clock.status is not None:
+            clock += f"\n  lock    {describe_declared_status(sensor.clock)}"
+    clock = clock.replace("`", "")
     losses = describe_losses(sensor).replace("`", "")
     links = _format_links(summarize_links(sensor))
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}"
         + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
-        f"  link    {links}\n{_format_range(sensor)}  losses  {losses}"
+        f"  link    {links}\n{_format_range(sensor)}  losses  {losses}{clock}"
         f"\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     if sensor.info:

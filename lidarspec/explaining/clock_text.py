@@ -1,4 +1,4 @@
-"""Describe a sensor's clock in words: for `clock`, `stats`, `doctor` and the page."""
+"""Describe a sensor's clock in words: what it counts, and how it runs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def describe_clock(report: ClockReport) -> str:
         parts.append(describe_offset(report))
     if not math.isnan(report.drift_ppm):
         parts.append(f"{report.drift_ppm:+.1f} ppm")
-    parts.append(report.verdict.text)
+    if report.verdict.is_fault:
+        parts.append(report.verdict.text)
     return ", ".join(parts)
 
 

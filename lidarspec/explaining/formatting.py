@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from lidarspec.errors import WireError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
+from lidarspec.spec.timing import EPOCHS, Clock
 
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
@@ -438,3 +439,39 @@ def describe_losses(sensor: Sensor) -> str:
     if sensor.counts_losses:
         return "counted by the clock"
     return "not counted, because the packets have no counter and no clock with a declared pace"
+
+
+def describe_declared_clock(clock: Clock) -> str:
+    """Return the fields of a clock, and what it counts, in Markdown."""
+    names = [clock.source] if isinstance(clock.source, str) else clock.source
+    if callable(names):
+        fields = "calculated from the packet"
+    else:
+        fields = " + ".join(f"`{name}`" for name in names)
+    if clock.wraps_at:
+        again = f", wraps at {clock.wraps_at:g} s"
+    else:
+        again = ""
+    parts = [fields + again]
+    if clock.reference:
+        parts.append(f"with the date from `{clock.reference[0]}` frames")
+    if clock.epoch:
+        parts.append(f"counts {EPOCHS[clock.epoch]}")
+    return ", ".join(parts)
+
+
+def describe_declared_status(clock: Clock) -> str:
+    """Return the field with the state of a clock, and the meaning of its values, in Markdown."""
+    status = clock.status
+    assert status is not None
+    if callable(status.source):
+        place = f"calculated from `{status.frame}` frames" if status.frame else "calculated"
+    else:
+        place = f"`{'.'.join(filter(None, (status.frame, status.source)))}`"
+    meanings = []
+    for value, state in status.states.items():
+        meaning = f"{value} {state.meaning}"
+        if state.epoch is not None:
+            meaning += f" ({EPOCHS[state.epoch]})"
+        meanings.append(meaning)
+    return f"{place}: {', '.join(meanings)}"

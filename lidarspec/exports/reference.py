@@ -14,7 +14,12 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.formatting import describe_losses, format_argument_type
+from lidarspec.explaining.formatting import (
+    describe_declared_clock,
+    describe_declared_status,
+    describe_losses,
+    format_argument_type,
+)
 from lidarspec.exports.quick_start import list_commands, read_notes, write_python
 from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, pack_found
@@ -23,7 +28,7 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
-from lidarspec.spec.timing import EPOCHS, Clock, Every, OnFlag, Split
+from lidarspec.spec.timing import Every, OnFlag, Split
 
 #: Status of a sensor -> its description.
 STATUSES = {
@@ -70,9 +75,9 @@ def _iter_facts(sensor: Sensor) -> Iterator[str]:
     if sensor.scan is not None:
         rows.append(("scan", f"ends {_describe_scan_rule(sensor.scan)}"))
     if sensor.clock is not None:
-        rows += [("clock", _describe_clock(sensor.clock))]
+        rows += [("clock", describe_declared_clock(sensor.clock))]
         if sensor.clock.status is not None:
-            rows.append(("clock status", _describe_clock_status(sensor.clock)))
+            rows.append(("clock status", describe_declared_status(sensor.clock)))
     rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
     rows += [
@@ -117,41 +122,6 @@ def _describe_scan_rule(scan: Split) -> str:
     if isinstance(scan, OnFlag) and scan.value is not None:
         return f"before every packet in which `{scan.name}` is {scan.value:g}"
     return RULES[type(scan).__name__].format(**vars(scan))
-
-
-def _describe_clock(clock: Clock) -> str:
-    names = [clock.source] if isinstance(clock.source, str) else clock.source
-    if callable(names):
-        fields = "calculated from the packet"
-    else:
-        fields = " + ".join(f"`{name}`" for name in names)
-    if clock.wraps_at:
-        again = f", wraps at {clock.wraps_at:g} s"
-    else:
-        again = ""
-    parts = [fields + again]
-    if clock.reference:
-        parts.append(f"with the date from `{clock.reference[0]}` frames")
-    if clock.epoch:
-        parts.append(f"counts {EPOCHS[clock.epoch]}")
-    return ", ".join(parts)
-
-
-def _describe_clock_status(clock: Clock) -> str:
-    """Return the field with the state of the clock, and the meaning of its values."""
-    status = clock.status
-    assert status is not None
-    if callable(status.source):
-        place = f"calculated from `{status.frame}` frames" if status.frame else "calculated"
-    else:
-        place = f"`{'.'.join(filter(None, (status.frame, status.source)))}`"
-    meanings = []
-    for value, state in status.states.items():
-        meaning = f"{value} {state.meaning}"
-        if state.epoch is not None:
-            meaning += f" ({EPOCHS[state.epoch]})"
-        meanings.append(meaning)
-    return f"{place}: {', '.join(meanings)}"
 
 
 def _iter_commands(sensor: Sensor) -> Iterator[str]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.errors import PluginError
 from lidarspec.leap_seconds import read_leap_seconds
 from lidarspec.packets.clock_estimate import ClockJump, DeviceClock
 from lidarspec.packets.clock_findings import ClockFinding
@@ -160,11 +161,15 @@ class ClockMonitor:
             return []
         if find_clock(packets.sensor, packets.frame) is not clock:
             return []
-        events = self._read_status(packets)
+        try:
+            events = self._read_status(packets)
+            readings = clock_ns(self._sensor, packets.batch())
+        except Exception as error:  # the plugin's functions
+            packets.stats.error(PluginError.of(error, "clock"), len(packets))
+            return []
         self._device_ns = packets.time_ns.item(-1)
         known = packets.host_ns > 0
         if known.any():
-            readings = clock_ns(self._sensor, packets.batch())
             for piece in _split(packets.host_ns[known]):
                 which = np.flatnonzero(known)[piece]
                 jumps = self._observe(

@@ -12,6 +12,7 @@ import numpy as np
 
 from lidarspec.device.device import Device
 from lidarspec.errors import UsageError
+from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.view.live_scans import LOOK_S, LiveScans, Times
@@ -43,6 +44,7 @@ class LiveFrames:
         packets: the packets that were read last, one batch for each frame type.
         ended: whether the input has ended.
         meter: counts the frames.
+        clock: watches the sensor's clock.
     """
 
     def __init__(self, device: Device) -> None:
@@ -50,6 +52,7 @@ class LiveFrames:
         self.packets: Collection[Packets] = ()
         self.ended = False
         self.meter = RateMeter(device.stats, counts_losses=device.sensor.counts_losses)
+        self.clock = ClockMonitor(device.sensor)
         self._batches = device.packets_by_frame(device.sensor.main_frames, wait=LOOK_S)
 
     @property
@@ -72,6 +75,8 @@ class LiveFrames:
             batch = next(self._batches, None)
             self.ended = batch is None
             self.packets = [] if batch is None else batch.values()
+            for packets in self.packets:
+                self.clock.add(packets)
             self.meter.frames(sum(map(len, self.packets)), self.times_ns)
             if time.monotonic() >= until:
                 return

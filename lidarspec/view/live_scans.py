@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.device.device import Device
 from lidarspec.device.device_input import BATCH_BYTES
+from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import ScanSelector, Selection, TimeSlice
@@ -55,6 +56,7 @@ class LiveScans:
             scan or None.
         number: number of times that `scan` has changed.
         meter: counts packets and scans.
+        clock: watches the sensor's clock.
 
     Raises:
         UsageError: for a sensor without points.
@@ -77,6 +79,7 @@ class LiveScans:
         self.scan: Scan | None = None
         self.number = 0
         self.meter = self._make_meter()
+        self.clock = ClockMonitor(device.sensor)
         self._select = select or Selection()
         self._sieve = ScanSelector(self._select, device.source, device.skip_until)
         self._times = TimeSlice(self._select.times)
@@ -176,6 +179,7 @@ class LiveScans:
         if len(selected):
             self.meter = meter
             self.meter.packets(selected)
+            self.clock.add(selected)
             self._has_counted = True
         self._store_scans(self._stream.add(packets))
         if self._read_ahead_s is not None:

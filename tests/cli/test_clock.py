@@ -66,3 +66,20 @@ def test_sources_are_compared_with_the_first(tmp_path: Path) -> None:
     assert reports[0]["to_first_s"] is None
     assert reports[1]["to_first_s"] == pytest.approx(2e-3, abs=1e-6)
     assert "+2.00 ms to the first source" in ran("clock", first, second).stdout
+
+
+def test_stats_and_doctor_report_the_clock(tmp_path: Path) -> None:
+    path = record(tmp_path / "drive.lsr", ahead_ns=0)
+    stats = ran("stats", path)
+    assert "runs on UTC, expected TAI" in stats.stdout
+    summary = json.loads(ran("stats", path, "--json").stdout.splitlines()[-1])
+    assert summary["clock"]["findings"][0]["code"] == "utc"
+    diagnoses = json.loads(ran("doctor", path, "--json", code=1).stdout)
+    assert [one["ok"] for one in diagnoses] == [True, False]
+
+
+def test_a_clock_that_nothing_sets_is_no_problem_for_doctor(tmp_path: Path) -> None:
+    path = record(tmp_path / "drive.lsr", ahead_ns=-BEGAN_NS, time_type=0)
+    diagnoses = json.loads(ran("doctor", path, "--json").stdout)
+    assert all(one["ok"] for one in diagnoses)
+    assert "not synchronized" in diagnoses[-1]["text"]

@@ -30,7 +30,9 @@ from std_srvs.srv import Trigger
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import parse_arguments
+from lidarspec.explaining.clock_text import describe_clock
 from lidarspec.explaining.explanation import reply_text
+from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
 from lidarspec_ros2.clock import describe_jump
@@ -214,7 +216,9 @@ class LidarNode(LifecycleNode):
                         device.stats, DIAGNOSTICS_PERIOD_S if device.is_live else None
                     )
                     self._run_in_executor(
-                        partial(self._publish_diagnostics, device, topics, reading)
+                        partial(
+                            self._publish_diagnostics, device, topics, reading, feed.clock.report()
+                        )
                     )
         except Exception as error:
             self._fail(error)
@@ -248,7 +252,9 @@ class LidarNode(LifecycleNode):
         if self._was_lost:
             self.trigger_activate()
 
-    def _publish_diagnostics(self, device: Device, topics: Topics, reading: MeterReading) -> None:
+    def _publish_diagnostics(
+        self, device: Device, topics: Topics, reading: MeterReading, report: ClockReport
+    ) -> None:
         """Publish the state of the sensor on /diagnostics."""
         if device is not self._device:  # the device was closed
             return
@@ -259,16 +265,15 @@ class LidarNode(LifecycleNode):
         more |= {f"{topic} sent": str(number) for topic, number in topics.sent.items()}
         clock = topics.stamps.clock
         more |= {
+            "clock": describe_clock(report),
+            "clock verdict": report.verdict.code,
             "clock drift [ppm]": f"{clock.drift_ppm:+.1f}",
             "clock set": f"{clock.jumps} times",
         }
-        status = make_status(
-            self.get_name(),
-            device,
-            reading,
-            [*filter(None, (describe_jump(clock), topics.fault))],
-            more,
-        )
+        warnings = [*filter(None, (describe_jump(clock), topics.fault))]
+        if self._settings["device_time_is_ros_time"] and report.verdict.is_fault:
+            warnings.append(f"the sensor's clock: {report.verdict.text}; {report.verdict.advice}")
+        status = make_status(self.get_name(), device, reading, warnings, more)
         self._diagnostics.publish(
             DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status])
         )

@@ -10,6 +10,7 @@ out at its next turn.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import weakref
@@ -19,6 +20,8 @@ from dataclasses import replace
 from typing import Any
 
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
+from lidarspec.explaining.clock_text import describe_clock
+from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.view.live_scans import DEFAULT_STEP_S, LOOK_S, LiveScans
@@ -88,6 +91,7 @@ class Broadcast:
         speed: speed of a file, relative to real time.
         warnings: warnings of the device.
         info: facts about the device, for example its serial number, by name.
+        clock: the sensor's clock in words; "" if the sensor sends no time.
         history: the figures of the last minute, one dict for each second.
         failure: the error that ended the reading, None while it continues.
         news: called in the reading thread if there is anything new.
@@ -111,6 +115,7 @@ class Broadcast:
         self.speed = 1.0
         self.warnings: list[str] = []
         self.info: dict[str, str] = {}
+        self.clock = ""
         self.history = deque[dict[str, Any]](maxlen=round(HISTORY_S / FIGURES_PERIOD_S))
         self.failure: LidarSpecError | None = None
         self.news: Callable[[], None] = lambda: None
@@ -375,13 +380,26 @@ class Broadcast:
         latency_s = None
         if self.is_live and self.shown is not None:
             latency_s = now - self.shown.sent
+        clock = self._feed.clock.report()
+        if self.device.sensor.clock is not None:
+            self.clock = describe_clock(clock)
         return {
             "at": now,
             **reading.to_dict(),
+            "clock_offset_s": self._find_clock_offset(clock),
             "lost": stats.lost,
             "disconnects": stats.disconnects,
             "latency_s": latency_s,
         }
+
+    def _find_clock_offset(self, clock: ClockReport) -> float | None:
+        """Return by how much the sensor's clock is ahead, s; without a date since the start."""
+        if not math.isnan(clock.error_s):
+            return clock.error_s
+        samples = self._feed.clock.samples
+        if not samples:
+            return None
+        return clock.offset_s - samples[0].offset_s
 
     def _arrival(self, scan: Scan) -> float:
         """Return the arrival of a scan's last packet, seconds since 1970; for a file: now."""

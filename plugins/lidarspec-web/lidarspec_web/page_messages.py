@@ -98,6 +98,7 @@ class PageMessages:
             "figures": broadcast.history[-1] if broadcast.history else None,
             "warnings": warnings,
             "info": broadcast.info,
+            "clock": broadcast.clock,
             "recording": recording,
             "damaged": {"total": broadcast.backlog.damaged, "newest": self._list_damaged(since)},
         }

@@ -40,9 +40,17 @@ def test_the_first_message_describes_the_source(tmp_path: Path, sensor: str, pla
             {"total": 0, "newest": []},
         )
         assert state["figures"]["speed_hz"] == pytest.approx(10, rel=0.2)
-        assert {"lost", "disconnects", "latency_s", "jitter_s", "loss_rate", "at"} <= state[
-            "figures"
-        ].keys()
+        names = {
+            "lost",
+            "disconnects",
+            "latency_s",
+            "jitter_s",
+            "loss_rate",
+            "clock_offset_s",
+            "at",
+        }
+        assert names <= state["figures"].keys()
+        assert state["clock"]
 
 
 @pytest.mark.slow

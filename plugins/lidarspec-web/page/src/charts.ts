@@ -35,6 +35,7 @@ const CHARTS: Chart[] = [
     },
   },
   { title: "Jitter", unit: "ms", digits: 3, of: ({ jitter_s }) => (jitter_s == null ? null : 1e3 * jitter_s) },
+  { title: "Clock offset", unit: "ms", digits: 2, of: ({ clock_offset_s: offset }) => (offset == null ? null : 1e3 * offset) },
 ];
 
 const whole = new Intl.NumberFormat("en-US", { maximumFractionDigits: 0 });
@@ -154,6 +155,10 @@ export class Charts {
 /** The ends of a chart: from zero, unless values stay close together far from it. */
 function spread(low: number | null, high: number | null): [number, number] {
   if (low === null || high === null) return [0, 1];
+  if (low < 0) {
+    const around = Math.max(0.1 * (high - low), 0.1);
+    return [low - around, high + around];
+  }
   if (low > 0 && high - low < 0.5 * high) {
     const around = Math.max(high - low, 0.02 * high);
     return [low - around, high + around];

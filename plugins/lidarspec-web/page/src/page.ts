@@ -194,7 +194,7 @@ class Page {
     this.#age();
     const isLive = this.#hello?.live === true && !state.paused;
     if (state.figures) this.#charts.add(state.figures);
-    this.#charts.tell(state.figures, [["Drawing rate", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["Latency", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
+    this.#charts.tell(state.figures, [...(state.clock ? [["Clock", state.clock] as [string, string]] : []), ["Drawing rate", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["Latency", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
     const { source } = this.#hello ?? { source: "" };
     named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text.replace(`${source}: `, "") })));
     named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));

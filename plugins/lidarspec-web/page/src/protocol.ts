@@ -128,6 +128,8 @@ export interface State {
   figures: Figures | null;
   warnings: string[];
   info: Record<string, string>;
+  /** the sensor's clock in words; empty if the sensor sends no time */
+  clock: string;
   recording: { name: string; bytes: number } | null;
   damaged: { total: number; newest: Damage[] };
 }
