@@ -33,7 +33,7 @@ from lidarspec.simulation.simulator import (
     frame_simulation,
 )
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
-from lidarspec.spec.description import Answer, Command, Frame
+from lidarspec.spec.description import Answer, Command, Frame, Sweep
 from lidarspec.spec.links import Http, is_datagram
 from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
@@ -310,6 +310,16 @@ class _FrameStream:
         self._position = 0
         self.due = began
 
+    @property
+    def next_number(self) -> int:
+        """The number of the first frame that is not made yet."""
+        return self._next
+
+    def change(self, frame_simulation: FrameSimulation) -> None:
+        """Continue with another simulation, from its frame 0 on, after the frames made so far."""
+        self._made = frame_simulation
+        self._next = 0
+
     def take(self, upto: float) -> list[tuple[float, bytes]]:
         """Return the frames that are due by a time, with their times."""
         taken: list[tuple[float, bytes]] = []
@@ -391,6 +401,7 @@ class SimulatedDevice:
         self._plan: list[_PlannedData] = []
         self._planned = 0
         self._stream: _FrameStream | None = None
+        self._sweep: Sweep | None = None  # after the effects of commands; None before any
         self._powered = 0
         self._time = 0.0
         self._plug: int | None = None
@@ -413,6 +424,7 @@ class SimulatedDevice:
         """Switch the device on, or off and on again."""
         self._plan = []
         self._stream = None
+        self._sweep = None
         self._powered = now
         self._time = 0.0
         self.destination = None
@@ -592,6 +604,8 @@ class SimulatedDevice:
             else:
                 self._put(time_ns, command.link, answer.frame, answer.data)
                 mode = answer.frame if answer.frame in announcing else mode
+        if request.name in self.sensor.simulation.effects:
+            self._apply_effect(request.name)
         if command.starts and not self.sensor.has_points:
             self._begin_unasked(time_ns)
         elif command.starts:
@@ -607,6 +621,18 @@ class SimulatedDevice:
             )
             if chosen is not None:
                 self._begin(time_ns, chosen)
+
+    def _apply_effect(self, command: str) -> None:
+        """Change the sweep after a command; data that is made already is sent before."""
+        sweep = self._sweep or self.sensor.simulation.sweep
+        if sweep is None:
+            return
+        number = 0
+        if self._stream is not None:
+            number = self._stream.next_number
+        self._sweep = self.sensor.simulation.effects[command](sweep, number)
+        if self._stream is not None:
+            self._stream.change(self._simulation(self._stream.frame))
 
     def _begin_unasked(self, at: float) -> None:
         """Plan the first frame of each type without points that is sent periodically."""
@@ -627,7 +653,10 @@ class SimulatedDevice:
         )
 
     def _simulation(self, frame: str) -> FrameSimulation:
-        stream_simulation = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
+        sensor = self.sensor
+        if self._sweep is not None:
+            sensor = replace(sensor, simulation=replace(sensor.simulation, sweep=self._sweep))
+        stream_simulation = frame_simulation(sensor, frame, blocked=bool(self.faults.rotor))
         if not stream_simulation.interval:
             raise SpecError(
                 "its rate is unknown: declare `rate`",

@@ -36,6 +36,8 @@ from lidarspec.spec.wire_forms import WireForm
 
 #: one item that a sensor sends for a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
+#: a function of the number of a frame: the physical values of its fields, by path.
+Sweep = Callable[[int], Mapping[str, Any]]
 Answers = tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]]
 _Described = TypeVar("_Described")
 
@@ -94,16 +96,20 @@ class Simulation:
         directions: a function of the frame number i that returns the azimuths and elevations of
             its points, radians: two arrays that broadcast to the points of a frame. Needed for
             `Cartesian` points.
+        effects: command -> a function that returns the sweep from the command on. Its arguments are
+            the sweep so far and the number of the next frame; the new sweep counts from 0. Only for
+            a sensor, not for a frame type.
     """
 
-    sweep: Callable[[int], Mapping[str, Any]] | None = None
+    sweep: Sweep | None = None
     encode: Callable[..., Mapping[str, Any]] | None = None
     rate: float = 0.0
     answers: Mapping[str, Answers] = field(default_factory=dict)
     directions: Callable[[int], tuple[Any, Any]] | None = None
+    effects: Mapping[str, Callable[[Sweep, int], Sweep]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        freeze(self, "answers")
+        freeze(self, "answers", "effects")
 
 
 @reject_unknown_arguments

@@ -315,6 +315,7 @@ def _check_sensor(sensor: SensorDescription) -> None:
         _check_command(sensor, name, command)
     if sensor.commands:
         _check_names(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
+        _check_names(sensor, "simulation.effects", sensor.simulation.effects, sensor.commands)
     _check_names(sensor, "state", sensor.state, sensor.frames)
     _check_clock(sensor)
     _check_names(sensor, "info", sensor.info_frames, sensor.frames)

@@ -273,7 +273,7 @@ def test_build_fills_arrays_and_later_values_win() -> None:
 
 
 def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> None:
-    common = ("mt.frequency=5.5Hz", "mt.start=0", "fsa.angle=10deg", "lsa.angle=12deg")
+    common = ("mt.m=55", "mt.start=0", "fsa.angle=10deg", "lsa.angle=12deg")
     every = ("samples[*].distance=1m", "samples[*].intensity=3", "samples[*].exposure=1")
     sensor = ls.sensor("cspc-coin-d4")
     frame = sensor.parse(

@@ -24,6 +24,7 @@ without the rotation speed. The M1CT_Coin_Plus, which sends Camsense's packets, 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Literal
@@ -35,6 +36,7 @@ from construct import (
     BitStruct,
     Bytes,
     ByteSwapped,
+    Computed,
     Const,
     Construct,
     Int8ul,
@@ -51,6 +53,7 @@ from lidarspec.spec import (
     OnFlag,
     Polar,
     Relative,
+    Reported,
     Scaled,
     Sensor,
     Serial,
@@ -66,9 +69,17 @@ from lidarspec.spec import (
 #: 360 degrees divided by 0.9473 degrees, the step of the manual's angle example.
 POINTS_PER_TURN = 380
 SAMPLES_PER_PACKET = 25  # of a full packet (the manual's angle example)
+CUSTOMER_FIRMWARE = 4  # simulated number; the manual gives no example
+CLOCKWISE = 0  # value of `direction` (manual 2.2.2, byte 15)
 SPEED_SETTLING_S = 1.0  # the manual has "less than 3" (1b)
 LOW_EXPOSURE = 2  # value of `exposure` (manual 2.2.3, Exp_M)
-LOW_SPEED_HZ = 5.5  # the slower of the two speeds (manual 1c)
+HIGH_EXPOSURE = 1
+LOW_SPEED_HZ = 5.5  # the two speeds (manual 1c)
+HIGH_SPEED_HZ = 7.0
+# The exposure changes after three revolutions below 6 or above 6.5 Hz (manual 2.2.3)
+LOW_EXPOSURE_BELOW_HZ = 6.0
+HIGH_EXPOSURE_ABOVE_HZ = 6.5
+TURNS_BEFORE_EXPOSURE = 3
 
 COMMAND = Checksummed(
     Struct(
@@ -153,19 +164,23 @@ def make_angle() -> Construct:
     )
 
 
-def make_data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checksummed:
+START = "start" / BitsInteger(1) * "1: start packet, a revolution begins"
+
+
+def make_data(
+    first: tuple[Construct, ...], sample: Construct, groups: tuple[int, ...]
+) -> Checksummed:
     """Return the struct of a point packet.
 
     Args:
-        first: the 7 bits above the start flag of the first byte.
+        first: the fields of the first byte, M&T.
         sample: the struct of one sample.
         groups: sizes in bytes of the words of a sample that enter the checksum.
     """
     return Checksummed(
         Struct(
             "header" / Const(b"\xaa\x55"),
-            "mt"
-            / BitStruct(first, "start" / BitsInteger(1) * "1: start packet, a revolution begins"),
+            *first,
             "lsn" / Int8ul * "number of samples",
             "fsa" / make_angle() * "angle of the first sample",
             "lsa" / make_angle() * "angle of the last sample",
@@ -178,10 +193,18 @@ def make_data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> C
 
 
 DISTANCE = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
+M_AND_T: tuple[Construct, ...] = (
+    "mt"
+    / BitStruct(
+        "m"
+        / BitsInteger(7)
+        * "start packet: scans per second in 0.1 Hz; next packet: customer firmware; else 0",
+        START,
+    ),
+    "frequency" / Computed(this.mt.m * this.mt.start / 10) * "scans per second; 0 if unknown",
+)
 DATA = make_data(
-    "frequency"
-    / Scaled(BitsInteger(7), 0.1, "Hz")
-    * "scans per second in a start packet; firmware number in the next packet; else 0",
+    M_AND_T,
     ByteSwapped(
         BitStruct(
             DISTANCE, "intensity" / BitsInteger(8), "exposure" / BitsInteger(2) * "1 high, 2 low"
@@ -190,7 +213,7 @@ DATA = make_data(
     (1, 2),
 )
 OLDER_DATA = make_data(
-    "reserved" / BitsInteger(7),
+    ("mt" / BitStruct("reserved" / BitsInteger(7), START),),
     ByteSwapped(BitStruct(DISTANCE, "flags" / BitsInteger(2) * "meaning unknown")),
     (2,),
 )
@@ -231,22 +254,28 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
 
     Uncorrected angles are evenly spaced from FSA to LSA and count from the zero of the data.
     Corrected angles (manual 2.2.3) count clockwise from the zero of the data, or from the mark on
-    the housing if `zero` is "housing".
+    the housing if `zero` is "housing". If the sensor reports that it does not turn clockwise, the
+    angles of the wire count counter-clockwise; this is assumed, as the manual has only clockwise.
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
-    clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
+    corrected = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
+    clockwise = np.where(f.state.info.direction == CLOCKWISE, corrected, -corrected)
     return raw, clockwise + f.state.info.zero_angle if zero == "housing" else clockwise
 
 
-def points(f: Fields, zero: str = "data") -> Polar:
-    """Return the points of a packet, with times from the latest reported speed."""
+def points(f: Fields, zero: str = "data", has_exposure: bool = False) -> Polar:
+    """Return the points of a packet, with times from the latest reported speed.
+
+    `has_exposure` adds the column `exposure`.
+    """
     raw, clockwise = directions(f, zero)
-    rate_hz = last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0))
+    rate_hz = last(f.mt.m / 10, where=(f.mt.start == 1) & (f.mt.m > 0))
     return Polar(
         range=f.samples.distance,
         azimuth=-np.deg2rad(clockwise),  # clockwise (manual, section 1a)
         intensity=f.samples.intensity,
         time=np.nan_to_num((raw - f.fsa.angle) / (rate_hz * 360)),
+        extra={"exposure": f.samples.exposure} if has_exposure else {},
     )
 
 
@@ -270,35 +299,87 @@ def configure(
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
 
-def sweep(i: int, steps: int = POINTS_PER_TURN, hertz: float = LOW_SPEED_HZ) -> dict[str, float]:
-    """Return the simulated values of packet i.
+@dataclasses.dataclass(frozen=True)
+class Turning:
+    """The simulated values of each packet, while the sensor turns at one speed.
 
-    A revolution is a start packet, then packets of 25 samples and a shorter one.
+    A revolution is a start packet, then packets of 25 samples and a shorter one. The exposure
+    follows the speed after three revolutions (manual 2.2.3).
+
+    Attributes:
+        hertz: revolutions per second.
+        steps: points per revolution.
+        exposure: the exposure at the beginning.
+        before: the values of the packets that complete the revolution before, at another speed.
+        firmware: the customer firmware.
+        follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.
+    """
+
+    hertz: float = LOW_SPEED_HZ
+    steps: int = POINTS_PER_TURN
+    exposure: int = HIGH_EXPOSURE  # after power-on (manual 2.2.3, Exp_M)
+    before: tuple[dict[str, float], ...] = ()
+    firmware: int = 0
+    follows_speed: bool = True
+
+    @property
+    def packets(self) -> int:
+        """The number of packets in a revolution."""
+        return 1 + -(-(self.steps - 1) // SAMPLES_PER_PACKET)
+
+    def __call__(self, i: int) -> dict[str, float]:
+        """Return the values of packet i."""
+        if i < len(self.before):
+            return self.before[i]
+        packet = (i - len(self.before)) % self.packets
+        first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES_PER_PACKET
+        samples = 1 if packet == 0 else min(SAMPLES_PER_PACKET, self.steps - first)
+        state = {0: round(self.hertz * 10), 1: self.firmware}
+        return {
+            "mt.m": state.get(packet, 0),
+            "mt.start": int(packet == 0),
+            "lsn": samples,
+            "fsa.angle": first * 360 / self.steps,
+            "lsa.angle": (first + samples - 1) * 360 / self.steps,
+            "samples.exposure": self.find_exposure(i),
+        }
+
+    def find_exposure(self, i: int) -> int:
+        """Return the exposure of packet i."""
+        turns = (i - len(self.before)) // self.packets
+        if turns < TURNS_BEFORE_EXPOSURE or not self.follows_speed:
+            return self.exposure
+        if self.hertz < LOW_EXPOSURE_BELOW_HZ:
+            return LOW_EXPOSURE
+        if self.hertz > HIGH_EXPOSURE_ABOVE_HZ:
+            return HIGH_EXPOSURE
+        return self.exposure
+
+
+def change_speed(sweep: Any, i: int, hertz: float) -> Turning:
+    """Return the values from packet i on, with another speed after the current revolution.
 
     Args:
-        i: the number of the packet.
-        steps: points per revolution.
-        hertz: revolutions per second.
+        sweep: the `Turning` so far.
+        hertz: revolutions per second; the sensor measures as many points per second as before.
     """
-    packet = i % (1 + -(-(steps - 1) // SAMPLES_PER_PACKET))
-    first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES_PER_PACKET
-    samples = 1 if packet == 0 else min(SAMPLES_PER_PACKET, steps - first)
-    return {
-        "mt.frequency": hertz if packet == 0 else 0.0,
-        "mt.start": int(packet == 0),
-        "lsn": samples,
-        "fsa.angle": first * 360 / steps,
-        "lsa.angle": (first + samples - 1) * 360 / steps,
-        "samples.exposure": LOW_EXPOSURE,
-    }
+    values = map(sweep, itertools.count(i))
+    before = tuple(itertools.takewhile(lambda packet: not packet["mt.start"], values))
+    return dataclasses.replace(
+        sweep,
+        hertz=hertz,
+        steps=round(sweep.hertz * sweep.steps / hertz),
+        exposure=sweep.find_exposure(i),
+        before=before,
+    )
 
 
 def older_sweep(i: int) -> dict[str, float]:
     """Return the simulated values of packet i of the older kind."""
     return {
         name: value
-        for name, value in sweep(i).items()
-        if name not in ("mt.frequency", "samples.exposure")
+        for name, value in Turning()(i).items()
+        if name not in ("mt.m", "samples.exposure")
     }
 
 
@@ -329,19 +410,24 @@ def make_start_packets(
     )
 
 
-def has_state_bits(f: Fields) -> Any:
+def has_customer_firmware(f: Fields) -> Any:
     """Return whether the upper bits of M&T are set in a packet without start flag.
 
     A CSPC sets them at most in the first packet after a start (manual 2.2.3, M&T).
     """
-    return (f.mt.start == 0) & (f.mt.frequency > 0)
+    return (f.mt.start == 0) & (f.mt.m > 0)
+
+
+def reports_firmware(f: Fields) -> Any:
+    """Return whether an acknowledgement contains the firmware (manual 2.1.3; SDK for 5C)."""
+    return ((f.mode == 0x50) | (f.mode == 0x5C)) & (f.firmware > 0)
 
 
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
     "bits above the lowest one of the third byte in packets that do not begin a revolution",
-    has_state_bits,
+    has_customer_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
     **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "its replies to requests"),
@@ -350,6 +436,14 @@ YDLIDAR_RELATIVES: dict[str, str | Relative] = {
 
 COINS = ("cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6")
 VERSION = (("ack", {"firmware": 3}),)
+
+#: The version of the acknowledgement, 3 for V3.0, and the revision of the device information, 4 for
+#: Rev 4 (manual 2.1.3 and 2.2.2).
+INFO_FACTS: dict[str, str | Reported] = {
+    "model": "info.model",
+    "firmware": Reported("ack.firmware", where=reports_firmware, text="V{}.0".format),
+    "revision": Reported("info.revision", text="Rev {}".format),
+}
 
 M1C1_MINI = Sensor(
     "cspc-m1c1-mini",
@@ -362,7 +456,7 @@ M1C1_MINI = Sensor(
         "data": Frame(DATA, data=True, max_length=10 + 3 * 255, plausible=plausible),
         "command": Frame(COMMAND, direction="out"),
     },
-    points=points,
+    points=partial(points, has_exposure=True),
     scan=OnFlag("mt.start"),
     # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the 2-byte format
     links={"data": Serial(150_000, 115_200, dtr=False)},
@@ -375,19 +469,28 @@ M1C1_MINI = Sensor(
     },
     fillers=b"\xfe\xff",
     # the device information printed in the manual, 2.2.2
-    state={"info": {"correction": 1, "zero_angle": 12}},
+    state={"info": {"correction": 1, "zero_angle": 12, "direction": CLOCKWISE}},
+    # The commands of the exposure probably set the speed, which the exposure follows: the SDK gives
+    # both pairs of names to the same bytes
     simulation=Simulation(
-        sweep, answers={"start": make_start_packets(3, b"M1C1_Mini", 4), "get_version": VERSION}
+        Turning(firmware=CUSTOMER_FIRMWARE),
+        answers={"start": make_start_packets(3, b"M1C1_Mini", 4), "get_version": VERSION},
+        effects={
+            "low_exposure": partial(change_speed, hertz=LOW_SPEED_HZ),
+            "high_exposure": partial(change_speed, hertz=HIGH_SPEED_HZ),
+        },
     ),
-    configure=partial(configure, points),
+    configure=partial(configure, partial(points, has_exposure=True)),
     on_open=("start",),
     on_close=("stop",),
     range_limits=(0.001, 16.383),  # the limits of the field; the manual gives none
     vendor_axes=("forward", "right", "up"),
-    turn=(LOW_SPEED_HZ, 7.0),  # manual 1c
+    turn=(LOW_SPEED_HZ, HIGH_SPEED_HZ),  # manual 1c
     relatives={**dict.fromkeys(COINS, "info.model"), **YDLIDAR_RELATIVES},
-    # not ack.firmware, which is 0 except in the reply to start (manual 2.1.3)
-    info={"model": "info.model", "firmware": "info.revision"},
+    info={
+        **INFO_FACTS,
+        "customer_firmware": Reported("data.mt.m", where=has_customer_firmware),
+    },
     status="vectors",
     source=(
         "CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC"
@@ -429,7 +532,7 @@ M1C1_MINI_V11 = Sensor(
     range_limits=M1C1_MINI.range_limits,
     vendor_axes=M1C1_MINI.vendor_axes,
     relatives={f"ydlidar-{name}": SPEED_RELATIVE for name in TWO_BYTE_MODELS.split()},
-    info=M1C1_MINI.info,
+    info=INFO_FACTS,
     status="vectors",
     source=(
         "CSPC M1C1_Mini development manual v1.1 (2020-01-22), sections 1 and 2; baud rate and DTR"
@@ -448,9 +551,11 @@ def make_coin(model: str, **facts: Any) -> Sensor:
         M1C1_MINI,
         id=name,
         model=model,
+        points=points,
+        configure=partial(configure, points),
         links={"data": Serial(230_400, dtr=False)},
         # the device information of a live COIN-D4
-        state={"info": {"correction": 0, "zero_angle": 0}},
+        state={"info": {"correction": 0, "zero_angle": 0, "direction": CLOCKWISE}},
         relatives={
             **dict.fromkeys({"cspc-m1c1-mini", *COINS} - {name}, "info.model"),
             **YDLIDAR_RELATIVES,
@@ -463,13 +568,14 @@ def make_coin(model: str, **facts: Any) -> Sensor:
 def make_coin_simulation(model: str, **turns: Any) -> Simulation:
     """Return a simulated COIN, which sends its model after the start command.
 
-    `turns` are arguments of `sweep`.
+    `turns` are arguments of `Turning`.
     """
     answers = {
         "start": make_start_packets(1, model.encode(), 1, b"\xfa\xfa"),
         "get_version": VERSION,
     }
-    return Simulation(partial(sweep, **turns), answers=answers)
+    turning = Turning(exposure=LOW_EXPOSURE, follows_speed=False, **turns)
+    return Simulation(turning, answers=answers)
 
 
 COIN_D4 = make_coin(

@@ -66,7 +66,7 @@ def packet(angles: tuple[float, float], distances: list[int], **more: Any) -> by
         fsa=raw[0],
         lsa=raw[1],
         samples=samples,
-        **{"mt": {"frequency": 0, "start": 0}, **more},
+        **{"mt": {"m": 0, "start": 0}, **more},
     )
 
 
@@ -192,7 +192,7 @@ def test_an_older_model_is_distinguished_from_a_ydlidar() -> None:
         packet((360.0, 10.0), [1000, 1000]),
         packet((10.0, 360.0), [1000, 1000]),
         packet(
-            (10.0, 20.0), [1000, 1000], mt={"frequency": 55, "start": 1}
+            (10.0, 20.0), [1000, 1000], mt={"m": 55, "start": 1}
         ),  # a start packet has one sample
         bytes(200),
         b"\xff" * 200,
@@ -316,7 +316,7 @@ def test_one_sample_has_the_first_angle() -> None:
     np.testing.assert_allclose(
         clockwise(cloud), [expected["first_angle_deg"]], atol=2e-5
     )  # 0.5 - 9.883 goes below 0
-    assert packets["mt.frequency"].tolist() == [pytest.approx(expected["scan_freq_hz"])]
+    assert packets["frequency"].tolist() == [pytest.approx(expected["scan_freq_hz"])]
     assert (round(float(cloud.range[0]) * 1000), packets.raw["samples"]["intensity"][0, 0]) == (
         500,
         200,

@@ -38,7 +38,7 @@ def turn(*, start: int = 0, number: int = 17) -> bytes:
             values["lsn"]
         )
         nested: dict[str, Any] = {"samples": samples}
-        for path in ("mt.frequency", "mt.start", "fsa.angle", "lsa.angle"):
+        for path in ("mt.m", "mt.start", "fsa.angle", "lsa.angle"):
             nested.setdefault(path.partition(".")[0], {})[path.partition(".")[2]] = values[path]
         frames.append(SENSOR.build("data", units=True, **nested))
     return b"".join(frames)
