@@ -489,7 +489,7 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     Args:
         at: ns since 1970.
 
-            Returns:
+    Returns:
         False if the position is unchanged, because the packet is not further ahead, or the file is
         a pipe or compressed.
     """

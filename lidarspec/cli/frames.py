@@ -173,9 +173,9 @@ def listing(
     """Yield the lines of explained pieces; each piece has a title.
 
     Args:
-      at: the offset of a byte; the title names the field at this offset.
-      every: whether to draw the bits of every element of an array, instead of only the first.
-      verdicts: whether to add the damage of each piece to its title.
+        at: the offset of a byte; the title names the field at this offset.
+        every: whether to draw the bits of every element of an array, instead of only the first.
+        verdicts: whether to add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)

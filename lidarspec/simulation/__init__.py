@@ -1,14 +1,14 @@
-"""Simulated sensors, made from their specs.
+"""Simulate sensors from their specs.
 
-In: a sensor, a scene, commands. Out: the bytes that the sensor would send, and their times. This
-package uses no port, clock or thread. Modules in reading order:
+In: a sensor, a scene, and commands. Out: the bytes that the sensor would send, and their times.
+This package uses no port, clock or thread. Modules in reading order:
 
-* `scenes`: the range of a beam in a scene.
-* `frame_maker`: frames from physical values.
-* `raw_values`: raw values in the frames of a table.
-* `clock_faults`: drift, steps, lost lock and restarts of a clock; `clock_writer`: its readings and
-  its status in frames.
-* `simulator`: `simulate`: ranges measured in a scene, packets with them, and their times.
-* `device`: a simulated device, which also replies to commands.
-* `faults`: faults on the links.
+* `scenes`: returns the range that a beam measures in a scene.
+* `frame_maker`: makes frames from physical values.
+* `raw_values`: writes raw values into frames.
+* `clock_faults`: drift, steps, lost lock and restarts of a clock.
+* `clock_writer`: writes the readings and the status of a clock into frames.
+* `simulator`: `simulate` measures ranges in a scene and makes packets with these ranges.
+* `device`: a simulated device, which sends packets and replies to commands.
+* `faults`: corrupts, drops and reorders the data of a simulated device.
 """

@@ -1,7 +1,8 @@
 """Faults of a simulated sensor's clock.
 
-`ClockFaults` is the value that a user gives, also as text: ``drift=50ppm,step=0.2s@10s``. A
-`ClockTimeline` applies it to the readings of one power cycle.
+`ClockFaults` describes the faults; a user can give them as text, ``drift=50ppm,step=0.2s@10s``. A
+`ClockTimeline` applies the faults to the readings of a clock from power-on to power-off. These
+texts are supported:
 
 | text | fault |
 |---|---|
@@ -31,11 +32,12 @@ Times = NDArray[np.int64]
 SECOND_NS = 1_000_000_000
 #: The time scales that a clock can follow.
 SCALES = ("utc", "tai", "gps")
-#: The state of a clock: locked; it keeps its time without a source; or it has restarted.
+#: States of a clock: it is locked to its source, it has lost its source and continues, or it has
+#: restarted.
 LOCKED = 0
 LOST = 1
 RESTARTED = 2
-#: The fastest drift, 2 %; a clock without a crystal is better.
+#: Maximum drift, 2 %. The drift of every real clock is smaller.
 MAX_DRIFT_PPM = 20_000.0
 
 
@@ -44,13 +46,13 @@ class ClockFaults:
     """The faults of a clock; all times are seconds since power-on.
 
     Args:
-        follows: "utc", "tai" or "gps": the clock is set to the time of the computer in this time
-            scale; "" if it keeps the times that the simulated sensor declares.
-        drift_ppm: the share by which the clock is fast, in millionths.
-        steps: pairs of a time and the seconds by which the clock jumps forward.
-        unlocked: pairs of the times when the clock loses its lock, and when it has it again.
-        restarts: the times when the clock starts again as after power-on. From then on it follows
-            nothing and is not locked.
+        follows: "utc", "tai" or "gps" to set the clock to the time of the computer in this time
+            scale; "" to use the times that the simulated sensor declares.
+        drift_ppm: how much faster the clock runs, in millionths; negative if it runs slower.
+        steps: (time, size) of each jump forward, in seconds; negative sizes are jumps back.
+        unlocked: (start, end) of each time range in which the clock is not locked.
+        restarts: the times at which the clock starts again as after power-on. After a restart, it
+            does not follow a time scale and is not locked.
 
     Raises:
         UsageError: for an unknown time scale, or a drift of more than 2 %.
@@ -75,7 +77,7 @@ class ClockFaults:
 
     @property
     def sets_status(self) -> bool:
-        """Whether the sensor reports whether its clock is locked, other than by default."""
+        """Whether these faults change the status that the sensor reports."""
         return bool(self.follows or self.unlocked or self.restarts)
 
 
@@ -95,10 +97,10 @@ def parse_clock_faults(text: str) -> ClockFaults:
         elif name in _READERS:
             faults = _READERS[name](faults, value, start_s)
         else:
-            known = (*SCALES, *_READERS)
+            names = (*SCALES, *_READERS)
             raise UsageError(
-                f"invalid clock fault {part.strip()!r}: expected {', '.join(known)}"
-                f"{did_you_mean(name, known)}"
+                f"invalid clock fault {part.strip()!r}: expected {', '.join(names)}"
+                f"{did_you_mean(name, names)}"
             )
     return faults
 
@@ -135,7 +137,7 @@ def _unlock(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
 
 def _restart(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     if value:
-        raise UsageError(f"invalid restart={value}: expected a time only, as restart@10s")
+        raise UsageError(f"invalid restart={value}: expected only a time, as in restart@10s")
     return replace(faults, restarts=(*faults.restarts, start_s))
 
 
@@ -154,10 +156,10 @@ class ClockTimeline:
 
     Args:
         faults: the faults.
-        power_on_ns: the time of the computer at power-on, ns since 1970 in UTC.
+        power_on_ns: the time of the computer when the sensor was switched on, ns since 1970 in UTC.
 
     Attributes:
-        jump_ns: the sum of the jumps that were made while the sensor runs.
+        jump_ns: the sum of the jumps that `jump_clock` of the device has caused, ns.
     """
 
     def __init__(self, faults: ClockFaults, power_on_ns: int = 0) -> None:
@@ -171,12 +173,12 @@ class ClockTimeline:
         return not self.faults and not self.jump_ns
 
     def shift(self, readings: Times, times: Times, first_reading: int) -> Times:
-        """Return the readings with the faults, (n,) ns, not wrapped.
+        """Return the readings of the clock with the faults, (n,) ns, not wrapped.
 
         Args:
             readings: the readings without faults, (n,) ns.
-            times: the times since power-on, (n,) ns.
-            first_reading: the reading at power-on, ns.
+            times: the time of each reading since power-on, (n,) ns.
+            first_reading: the reading at power-on without faults, ns.
         """
         faults = self.faults
         shifted: Times = readings
@@ -190,14 +192,18 @@ class ClockTimeline:
             shifted = np.where(has_restarted, first_reading + times - restart_ns, shifted)
         drifted = np.rint(faults.drift_ppm * 1e-6 * (times - start)).astype(np.int64)
         shifted = shifted + drifted + self.jump_ns
-        for at, size in faults.steps:
-            at_ns = round(at * SECOND_NS)
+        for step_s, size in faults.steps:
+            at_ns = round(step_s * SECOND_NS)
             has_jumped = (times >= at_ns) & (at_ns >= start)
             shifted = shifted + np.where(has_jumped, round(size * SECOND_NS), 0)
         return shifted
 
     def lock_states(self, times: Times) -> NDArray[np.int64]:
-        """Return LOCKED, LOST or RESTARTED at some times since power-on, (n,) ns."""
+        """Return LOCKED, LOST or RESTARTED for each time since power-on, (n,).
+
+        Args:
+            times: the times, (n,) ns.
+        """
         states = np.full(len(times), LOCKED)
         for begin, end in self.faults.unlocked:
             is_lost = times >= round(begin * SECOND_NS)
@@ -209,7 +215,7 @@ class ClockTimeline:
         return states
 
     def _scale_offset_ns(self) -> int:
-        """Return the followed time scale minus UTC, ns."""
+        """Return the time scale that the clock follows minus UTC, ns."""
         table = read_leap_seconds()
         now_s = self._power_on_ns / SECOND_NS
         offsets_s = {"utc": 0, "tai": table.tai_minus_utc(now_s), "gps": table.gps_minus_utc(now_s)}

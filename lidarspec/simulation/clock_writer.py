@@ -1,15 +1,17 @@
-"""Write times and the status of a clock into simulated frames: the inverse of reading them.
+"""Write the time and the status of a clock into simulated frames.
 
-A clock is a field, fields that add up, or a function of fields. The fields that a function depends
-on are found by raising each by one and by two. Equal steps make a field linear, such as the
-microseconds or the hour. A field with steps of 28 to 31 days is the month, and one with steps of
-365 or 366 days the year.
+A clock is a field, a sum of fields, or a function of fields. The fields that a function depends on
+are found by increasing each field by one and by two. If both steps of the time are equal, the field
+is linear, such as the microseconds or the hour. A field with steps of 28 to 31 days is the month,
+and a field with steps of 365 or 366 days is the year.
 
-To write a time, the fields of the date get the date. Then the linear fields share the rest, from
-the coarsest to the finest. A clock that is a single field is shifted instead, with all elements of
-its array, the other parts of its frame, and all fields of the same unit, scale and size: they carry
-times by the same clock, such as the start and the end of a measurement. If the time cannot be read
-back from a frame, the clock cannot be written.
+To write a time, the date is written into the fields of the date. The rest is distributed over the
+linear fields, from the coarsest to the finest. If the clock is a single field, a time difference is
+added to the field instead, and also to all elements of its array, to the other parts of its frame,
+and to all fields of the same unit, scale and size. These fields have times of the same clock, such
+as the start and the end of a measurement.
+
+If the time that was written cannot be read back from a frame, the clock cannot be written.
 """
 
 from __future__ import annotations
@@ -38,22 +40,28 @@ from lidarspec.spec.tree import FieldInfo, to_exact
 
 Times = NDArray[np.int64]
 DAY_NS = 86_400_000_000_000
-#: The days of years and of months.
+#: Numbers of days in a year. The next constant is the numbers of days in a month.
 YEAR_DAYS = (365, 366)
 MONTH_DAYS = (28, 29, 30, 31)
-#: The largest raw value that is written.
+#: Maximum raw value to write.
 MAX_RAW = 2**63 - 1
-#: How many values of a field are tried, to find those of a calculated status, and of how many
-#: fields together.
+#: Maximum number of values of a field to try, to find the values of a calculated status. The next
+#: constant is the maximum number of fields.
 MAX_STATUS_VALUES = 16
 MAX_STATUS_FIELDS = 2
-#: The shift that tests whether a clock can be written, ns. It is larger than a second.
+#: Time difference that is added in order to test whether a clock can be written, ns. It is larger
+#: than a second.
 TEST_SHIFT_NS = 1_500_000_000
 
 
 @dataclass(frozen=True)
 class _TimeField:
-    """A field of a clock, and the nanoseconds of one raw step: whole, or a fraction."""
+    """A field of a clock.
+
+    Attributes:
+        path: path of the field.
+        step_ns: nanoseconds per raw step; not always a whole number.
+    """
 
     path: str
     step_ns: float
@@ -61,7 +69,7 @@ class _TimeField:
 
 @dataclass(frozen=True)
 class _StatusChoice:
-    """Raw values of the fields of a status, and their meaning."""
+    """A possible status of a clock: the raw values of its fields, and their meaning."""
 
     raw: tuple[int, ...]
     state: ClockState
@@ -69,7 +77,15 @@ class _StatusChoice:
 
 @dataclass(frozen=True)
 class _DateFields:
-    """The fields of a date, with the raw values of one date."""
+    """The fields of a date.
+
+    Attributes:
+        year: path of the field with the year.
+        month: path of the field with the month.
+        day: path of the field with the day.
+        date: an example date.
+        raw: raw values of the year, the month and the day of this date.
+    """
 
     year: str
     month: str
@@ -84,11 +100,11 @@ class ClockWriter:
     Args:
         sensor: the sensor.
         clock: the clock of these frames.
-        table: frames as they are simulated; the fields of the clock are found with the first.
+        table: simulated frames. The fields of the clock are found by changing a copy of the first.
 
     Attributes:
         resolution_ns: the smallest step of the clock, ns.
-        period_ns: the time after which it wraps, ns; 0 if it does not.
+        period_ns: the time after which the clock wraps, ns; 0 if it does not wrap.
 
     Raises:
         UsageError: if the clock cannot be written.
@@ -115,7 +131,10 @@ class ClockWriter:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether the reading at a date is defined: it wraps never, or at shares of a day."""
+        """Whether the reading at a date is defined.
+
+        The clock must never wrap, or wrap after a time that divides a day.
+        """
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
     def read(self, table: CompiledTable) -> Times:
@@ -123,7 +142,7 @@ class ClockWriter:
         return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
     def write(self, table: CompiledTable, readings: Times) -> None:
-        """Write readings, (n,) ns; a clock that wraps is wrapped."""
+        """Write readings, (n,) ns, into the frames; wrap them if the clock wraps."""
         readings = self._round(readings)
         if self.period_ns:
             readings = readings % self.period_ns
@@ -148,14 +167,14 @@ class ClockWriter:
         write_raw(table, finest.path, _clip(info, finest_raw))
 
     def _round(self, readings: Times) -> Times:
-        """Return readings rounded to the resolution, if that is a whole number of ns."""
+        """Return readings rounded to the resolution, if it is a whole number of ns."""
         step = round(self.resolution_ns)
         if step != self.resolution_ns or step < 2:
             return readings
         return (readings + step // 2) // step * step
 
     def _shift_fields(self, table: CompiledTable, shifts: Times) -> None:
-        """Add nanoseconds, (n,), to all elements of the clock's fields."""
+        """Add time differences, (n,) ns, to all elements of the clock's fields."""
         rows = table
         if self._parts:
             rows = PartRows(table, self._parts)
@@ -170,16 +189,16 @@ class ClockWriter:
             rows.put_back()
 
     def _write_date(self, table: CompiledTable, date: _DateFields, readings: Times) -> None:
-        """Write the fields of a date."""
+        """Write the dates of readings, (n,) ns, into the fields of the date."""
         days = np.floor_divide(readings, DAY_NS).astype("datetime64[D]")
         here = _split_date(days)
         base = _split_date(np.array([date.date]))
         paths = (date.year, date.month, date.day)
-        for path, raw, value, known in zip(paths, date.raw, here, base, strict=True):
-            write_raw(table, path, _clip(table.schema.fields[path], raw + value - known))
+        for path, raw, value, base_value in zip(paths, date.raw, here, base, strict=True):
+            write_raw(table, path, _clip(table.schema.fields[path], raw + value - base_value))
 
     def _find_fields_to_shift(self, source: str, table: CompiledTable) -> None:
-        """Find the field of the clock, and those that carry times by the same clock."""
+        """Find the field of the clock, and all fields with times of the same clock."""
         place = clock_parts((source,), table.schema)
         rows = table
         if place is not None:
@@ -197,7 +216,7 @@ class ClockWriter:
         """Find the fields that the function of the clock depends on.
 
         Args:
-            table: one frame, which is changed and restored.
+            table: a table of one frame, which is changed and restored.
         """
         linear = list[_TimeField]()
         date = dict[str, str]()
@@ -229,9 +248,9 @@ class ClockWriter:
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
-        """Return the steps of the reading, ns, if a field is raised by one and once more."""
+        """Return the steps of the reading, ns, if a field is increased by one, twice."""
         before = table.raw(path)
-        start = 0  # a float with a date is too coarse for a step
+        start = 0  # a float cannot represent a date and a step of one raw value
         if info.kind == "int":
             start = max(min(before.item(), info.limits[1] - 2), 0)
         readings = list[int]()
@@ -242,7 +261,7 @@ class ClockWriter:
         return readings[1] - readings[0], readings[2] - readings[1]
 
     def _check(self, table: CompiledTable) -> None:
-        """Raise UsageError unless a reading that is written can be read back."""
+        """Raise UsageError if a reading that was written cannot be read back."""
         wanted = self.read(table) + TEST_SHIFT_NS
         if self.period_ns:
             wanted = wanted % self.period_ns
@@ -260,7 +279,7 @@ class FrameClock:
     Args:
         sensor: the sensor.
         frame: the frame type.
-        table: frames of this type from number 0 on.
+        table: frames of this type; the first has the number 0.
 
     Attributes:
         has_clock: whether the frames have a clock that can be written.
@@ -287,7 +306,7 @@ class FrameClock:
 
     @cached_property
     def _status(self) -> StatusWriter | None:
-        """The writer of the status; None if these frames do not have it.
+        """The writer of the status; None if these frames do not contain the status.
 
         Raises:
             UsageError: if the status cannot be written.
@@ -302,7 +321,10 @@ class FrameClock:
         return StatusWriter(self._sensor, self._first, read)
 
     def check(self, faults: ClockFaults) -> None:
-        """Raise UsageError unless these frames can show the faults, except those of the status."""
+        """Raise UsageError if these frames cannot show the faults of the readings.
+
+        Faults of the status are not checked.
+        """
         if self._writer is None:
             raise UsageError(
                 f"{self._sensor.id} has no clock in {self._frame!r} frames, so that the clock"
@@ -311,22 +333,24 @@ class FrameClock:
         if faults.follows and not self._writer.can_follow_dates:
             raise UsageError(
                 f"the clock of {self._sensor.id} cannot follow {faults.follows.upper()}: it wraps"
-                f" at {self._writer.period_ns / 1e9:g} s, which is no share of a day"
+                f" at {self._writer.period_ns / 1e9:g} s, which does not divide a day"
             )
 
     def check_status(self) -> None:
-        """Raise UsageError unless these frames can show that the clock is not locked."""
+        """Raise UsageError if these frames cannot show that the clock is not locked."""
         if self._status is None:
             raise UsageError(
                 f"{self._sensor.id} does not declare the status of its clock in {self._frame!r}"
-                " frames, so that the clock cannot lose its lock"
+                " frames, so the clock cannot lose its lock"
             )
 
     def apply(self, table: CompiledTable, timeline: ClockTimeline, times: Times) -> None:
         """Write the faults of a timeline into frames.
 
         Args:
-            times: the times of the frames since power-on, (n,) ns.
+            table: the frames.
+            timeline: the faults.
+            times: the time of each frame since power-on, (n,) ns.
         """
         if timeline.is_perfect:
             return
@@ -336,14 +360,19 @@ class FrameClock:
         if timeline.faults.sets_status:
             try:
                 status = self._status
-            except UsageError:  # only faults of the lock require it, and they were checked
+            except (
+                UsageError
+            ):  # only faults of the lock require the status, and they were checked before
                 status = None
             if status is not None:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
 
 
 def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
-    """Return the clock of frames, also of those that complete the clock of the data frames."""
+    """Return the clock of a frame type; None if it has no clock.
+
+    The frames that give the date of the data frames have a clock as well.
+    """
     clock = find_clock(sensor, frame)
     shared = sensor.clock
     if clock is not None or shared is None:
@@ -360,10 +389,11 @@ class StatusWriter:
     """Writes into frames whether the clock is locked.
 
     Args:
-        sensor: the sensor, whose clock declares a status.
+        sensor: the sensor; its clock declares a status.
         table: frames of the type that has the status.
-        read: reads the clock of these frames, (n,) ns; None if they have no clock. A status that
-            changes the reading is not used: the fields of the clock then have another form.
+        read: returns the readings of the clock in frames, (n,) ns; None if they have no clock. A
+            status that changes the reading is not used, because the fields of the clock then have
+            another format.
 
     Raises:
         UsageError: if no values of the fields give a locked and an unlocked status.
@@ -390,9 +420,11 @@ class StatusWriter:
             for value, state in self._status.states.items():
                 self._choices.append(_StatusChoice((int(info.raw(value)),), state))
         if read is not None:
-            self._choices = [one for one in self._choices if self._keeps_clock(table, one, read)]
-        known = {choice.state.locked for choice in self._choices}
-        if not known >= {True, False}:
+            self._choices = [
+                choice for choice in self._choices if self._keeps_clock(table, choice, read)
+            ]
+        locked_states = {choice.state.locked for choice in self._choices}
+        if not locked_states >= {True, False}:
             raise UsageError(
                 f"{sensor.id} cannot lose its lock: its status does not distinguish a locked clock"
             )
@@ -401,8 +433,9 @@ class StatusWriter:
         """Write the status of frames.
 
         Args:
+            table: the frames.
             states: LOCKED, LOST or RESTARTED for each frame, (n,).
-            follows: the time scale that the clock follows, if several states are locked.
+            follows: the time scale that the clock follows. It selects one of several locked states.
         """
         raw = np.array(self.choose(follows))[states]
         for path, column in zip(self._paths, raw.T, strict=True):
@@ -413,29 +446,34 @@ class StatusWriter:
     def choose(self, follows: str) -> tuple[tuple[int, ...], ...]:
         """Return the raw values of the fields for a locked, a lost and a restarted clock.
 
-        A lost clock counts the same as the locked one, if there is such a status; a restarted clock
-        counts from power-on.
+        The status of a lost clock has the same epoch as that of the locked clock, if possible. The
+        status of a restarted clock has the epoch power-on, if possible.
         """
 
         def rank(choice: _StatusChoice, epoch: str, raw: tuple[int, ...]) -> tuple[Any, ...]:
             changes = [a != b for a, b in zip(choice.raw, raw, strict=True)]
             differs = self._clock.epoch_in(choice.state) != epoch
-            return differs, sum(changes), sum(choice.raw), changes  # a mode comes before its status
+            return (
+                differs,
+                sum(changes),
+                sum(choice.raw),
+                changes,
+            )  # a field with the mode comes before the field with its status
 
         locked = min(
-            (one for one in self._choices if one.state.locked),
-            key=lambda one: (self._clock.epoch_in(one.state) != follows, sum(one.raw)),
+            (choice for choice in self._choices if choice.state.locked),
+            key=lambda choice: (self._clock.epoch_in(choice.state) != follows, sum(choice.raw)),
         )
-        unlocked = [one for one in self._choices if one.state.locked is False]
+        unlocked = [choice for choice in self._choices if choice.state.locked is False]
         epoch = self._clock.epoch_in(locked.state)
-        lost = min(unlocked, key=lambda one: rank(one, epoch, locked.raw))
-        restarted = min(unlocked, key=lambda one: rank(one, "boot", locked.raw))
+        lost = min(unlocked, key=lambda choice: rank(choice, epoch, locked.raw))
+        restarted = min(unlocked, key=lambda choice: rank(choice, "boot", locked.raw))
         return locked.raw, lost.raw, restarted.raw
 
     def _keeps_clock(
         self, table: CompiledTable, choice: _StatusChoice, read: Callable[[CompiledTable], Times]
     ) -> bool:
-        """Return whether the clock of a frame reads the same with a status."""
+        """Return whether a status leaves the reading of the clock unchanged."""
         frame = _copy_first(table)
         reading = read(frame).item()
         for path, raw in zip(self._paths, choice.raw, strict=True):
@@ -443,7 +481,7 @@ class StatusWriter:
         return bool(read(frame).item() == reading)
 
     def _find_choices(self, table: CompiledTable) -> None:
-        """Find the fields of a calculated status, and the values that have a meaning."""
+        """Find the fields of a calculated status, and their values with a meaning."""
         for path, info in table.schema.fields.items():
             if info.kind != "int" or info.axes or info.const is not None:
                 continue
@@ -464,7 +502,7 @@ class StatusWriter:
     def _calculate(
         self, table: CompiledTable, paths: Sequence[str], raws: Sequence[NDArray[np.int64]]
     ) -> NDArray[np.float64]:
-        """Return the status for raw values of some fields of a frame, (n,)."""
+        """Return the status for each combination of raw values of some fields, (n,)."""
         source = self._status.source
         assert callable(source)
         frames = _repeat_first(table, len(raws[0]))
@@ -480,7 +518,7 @@ class StatusWriter:
 def _shift_raw(
     info: FieldInfo, raw: NDArray[Any], shifts: Times, step_ns: float, period_ns: int
 ) -> NDArray[Any]:
-    """Return raw values of a clock, shifted by nanoseconds and wrapped."""
+    """Return raw values of a clock after adding time differences, wrapped."""
     if info.kind == "int" and isinstance(step_ns, int):
         # exact, also for a shift of years
         whole: NDArray[Any] = raw.astype(np.int64) + shifts // step_ns
@@ -492,7 +530,7 @@ def _shift_raw(
 
 
 def _describe_form(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties that two fields with times by one clock share."""
+    """Return the properties that are equal in fields with times of the same clock."""
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 
@@ -504,7 +542,7 @@ def _to_step(step: Any) -> float:
 
 
 def _clip(info: FieldInfo, raw: NDArray[Any]) -> NDArray[Any]:
-    """Return the values that a field can hold."""
+    """Return raw values, limited to the range of the field."""
     if info.kind != "int":
         return raw
     low, high = info.limits
@@ -524,12 +562,12 @@ def _split_date(days: NDArray[np.datetime64]) -> tuple[NDArray[np.int64], ...]:
 
 
 def _copy_first(table: CompiledTable) -> CompiledTable:
-    """Return a copy of the first frame."""
+    """Return a table with a copy of the first frame."""
     return _repeat_first(table, 1)
 
 
 def _repeat_first(table: CompiledTable, count: int) -> CompiledTable:
-    """Return copies of the first frame."""
+    """Return a table with `count` copies of the first frame."""
     (group,) = table.take(np.zeros(1, np.intp)).groups
     rows = np.repeat(group.rows, count, axis=0)
     return CompiledTable(table.schema, [LayoutRows(group.layout, np.arange(count), rows)])

@@ -1,9 +1,10 @@
-"""A simulated sensor as a device, sans-IO: bytes in, bytes out.
+"""A simulated sensor as a device: it gets bytes and returns bytes, without I/O.
 
-It follows the spec and knows no sensor. Time runs as in reality or faster: data frames are sent at
-the pace of the sensor's clock, commands get the documented replies (`ReplyMaker`), start and stop
-are obeyed, other frames are sent at their own rate. A sensor that no command of `on_open` starts
-sends from power-on. All times are the caller's, in ns of one monotonic clock.
+All behaviour follows from the spec. Data frames are sent at the rate of the sensor's clock, and
+other frames at their declared rate. Commands get the documented replies (`ReplyMaker`), and can
+start and stop the data. If no command of `on_open` starts the sensor, it sends data from power-on.
+The caller passes the current time to each method, in ns of one monotonic clock; the device can be
+faster than real time.
 """
 
 from __future__ import annotations
@@ -39,12 +40,13 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: Maximum size of a batch of data: in ns of the device's time, and in packets.
+#: Maximum duration of a batch of data, in ns of the device's time. The next constant is the maximum
+#: number of packets.
 MAX_BATCH_NS = SECOND // 4
 MAX_BATCH_PACKETS = 128
 #: Number of fillers that are sent in a pause.
 PAUSE_FILLERS = 14
-#: Maximum delay of a device in ns. If it is polled less often, its time does not catch up.
+#: Maximum delay of a device in ns. If a device is polled later, the rest of the delay is skipped.
 MAX_DELAY_NS = SECOND
 
 #: Name of the value for `answers` functions with the port at which the data is served.
@@ -56,7 +58,7 @@ REQUEST_TIMEOUT_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class ReceivedCommand:
-    """A received command with the raw values of the fields of its frame, by path.
+    """A received command, with the raw values of the fields of its frame by path.
 
     The values in its templates are among them as texts, by name in braces: "{handle}".
     """
@@ -67,7 +69,7 @@ class ReceivedCommand:
 
     @property
     def destination(self) -> tuple[str, int] | None:
-        """The address and port to which the data goes from now on; None if it does not say.
+        """(address, port) to which the command redirects the data; None if it does not.
 
         The address is "" if the command contains only a port.
         """
@@ -78,16 +80,20 @@ class ReceivedCommand:
         return _to_host(address), int(port)
 
     def _find(self, kind: type[Port | Address], placeholder: str) -> Any:
-        """Return the value of this kind in the command; None if it has none."""
+        """Return the value of this kind in the command; None if it has no such value."""
         paths = [path for path, value in self.command.values.items() if isinstance(value, kind)]
-        paths += [one.path for one in self.command.arguments.values() if isinstance(one.kind, kind)]
+        paths += [
+            argument.path
+            for argument in self.command.arguments.values()
+            if isinstance(argument.kind, kind)
+        ]
         for path in paths:
             return _get_flat(self.values, path)
         return self.values.get(f"{{{placeholder}}}")
 
 
 def _get_flat(values: Mapping[str, Any], path: str) -> Any:
-    """Return a value at a path that may end with an index; None if there is none."""
+    """Return the value at a path, which may end with an index; None if missing."""
     base, _, index = path.partition("[")
     value = values.get(base)
     if index and isinstance(value, list):
@@ -96,7 +102,7 @@ def _get_flat(values: Mapping[str, Any], path: str) -> Any:
 
 
 def _to_host(address: Any) -> str:
-    """Return an address as text; "" for None and for an address of zeros."""
+    """Return an address as text; "" for None and for the address 0.0.0.0."""
     from ipaddress import ip_address  # a slow import
 
     if isinstance(address, list):
@@ -106,16 +112,19 @@ def _to_host(address: Any) -> str:
     try:
         parsed = ip_address(address)
     except ValueError:
-        return ""  # no text of an address: the simulated sensor looks up no names
+        return ""  # a host name, which the simulated sensor cannot resolve
     if parsed.is_unspecified:
         return ""
     return str(parsed)
 
 
 class ReplyPart(NamedTuple):
-    """A part of a reply: the name of a frame and its bytes, or a pause in seconds.
+    """A part of a reply: a frame, other bytes, or a pause.
 
-    The name is empty for bytes that are no frame.
+    Attributes:
+        frame: the frame type; "" for bytes that are not a frame.
+        data: the bytes; b"" for a pause.
+        pause: duration of the pause, in seconds.
     """
 
     frame: str = ""
@@ -127,7 +136,8 @@ class ReplyMaker:
     """Makes the replies of one sensor to its commands.
 
     Args:
-        shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
+        sensor: the sensor.
+        shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
 
     Attributes:
         data_port: the port at which the simulated sensor serves its data; 0 for none.
@@ -142,7 +152,7 @@ class ReplyMaker:
         self._decoders = {link: _command_decoder(sensor, link) for link in links}
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
-        """Return the commands that these bytes complete; other bytes are ignored."""
+        """Return the commands that received bytes complete; ignore other bytes."""
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
@@ -153,7 +163,7 @@ class ReplyMaker:
         return [request for request in requests if request is not None]
 
     def make_replies(self, request: ReceivedCommand) -> list[ReplyPart]:
-        """Return everything that is sent for a command before any data."""
+        """Return the parts of the reply to a command."""
         declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
@@ -168,7 +178,7 @@ class ReplyMaker:
         self._frames.use_timeline(timeline)
 
     def unasked_frame(self, name: str, number: int) -> bytes:
-        """Return the frame with this number of a type that the sensor sends periodically."""
+        """Return frame number `number` of a type that the sensor sends periodically."""
         return self._frames.numbered(name, number)
 
     def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
@@ -181,7 +191,7 @@ class ReplyMaker:
         return ReplyPart(name, self._frames.make(name, given))
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
-        """Return the physical values that match a reply to its request."""
+        """Return the physical values of a reply that are determined by its request."""
         fields = get_codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
@@ -191,7 +201,10 @@ class ReplyMaker:
         }
 
     def _request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
-        """Return the command of a frame; if several match, the most specific."""
+        """Return the command that a received frame contains; None if there is none.
+
+        If several commands match, returns the one with the most fixed values.
+        """
         values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
         sent = [
             one
@@ -209,9 +222,9 @@ class ReplyMaker:
 
 
 def _match_command(command: Command, values: Mapping[str, Any]) -> dict[str, str] | None:
-    """Return the values in the templates of a command, by name in braces.
+    """Return {name in braces: text} of the placeholders of a command's templates.
 
-    None if the values of the frame are not those of the command.
+    Returns None if the values of the frame do not match the command.
     """
     if any(values.get(path) != value for path, value in command.fixed.items()):
         return None
@@ -225,13 +238,13 @@ def _match_command(command: Command, values: Mapping[str, Any]) -> dict[str, str
 
 
 def _rank(command: Command) -> tuple[int, int]:
-    """Return how specific a command is, for a comparison with other matching commands."""
+    """Return a rank; the highest of several matching commands is the most specific."""
     literal_size = sum(template.literal_size for template in command.templates.values())
     return len(command.fixed), literal_size
 
 
 def _command_decoder(sensor: Sensor, link: str) -> Decoder:
-    """Return a decoder for the frames that are sent to the sensor."""
+    """Return a decoder for the frames that a link transmits to the sensor."""
     frames = {
         name: _as_incoming(frame)
         for name, frame in sensor.frames.items()
@@ -242,9 +255,9 @@ def _command_decoder(sensor: Sensor, link: str) -> Decoder:
 
 @functools.lru_cache(maxsize=256)
 def _as_incoming(frame: Frame) -> Frame:
-    """Return an outgoing frame type as the sensor receives it.
+    """Return an outgoing frame type as an incoming type, as the sensor receives it.
 
-    The result is cached, because its layout is cached with it.
+    The result is cached, so that its layout is computed only once.
     """
     return replace(frame, direction="in")
 
@@ -252,12 +265,12 @@ def _as_incoming(frame: Frame) -> Frame:
 def _to_physical(info: FieldInfo, value: Any) -> Any:
     """Return a parsed value in the unit of its field.
 
-    Bytes are unchanged, labels become numbers, and arrays are converted element by element.
+    Bytes are unchanged, a label becomes its number, and each element of an array is converted.
     """
     if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
         return value
     if isinstance(value, list | tuple):
-        return [_to_physical(info, one) for one in value]
+        return [_to_physical(info, element) for element in value]
     return info.physical(next((raw for raw, name in info.labels.items() if name == value), value))
 
 
@@ -270,7 +283,15 @@ def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[st
 
 
 class _PlannedData(NamedTuple):
-    """Planned data with its time, in ns since power-on; ordered by time, then by plan."""
+    """Data to be sent at a time, ordered by time and by the order of planning.
+
+    Attributes:
+        at: the time, ns since power-on.
+        number: number of the data, in the order of planning.
+        link: name of the link to send the data over.
+        frame: the frame type; "" for bytes that are not a frame.
+        data: the bytes.
+    """
 
     at: float
     number: int
@@ -280,13 +301,13 @@ class _PlannedData(NamedTuple):
 
 
 class _FrameStream:
-    """The data frames of one type from a start time, in ns since power-on.
+    """The data frames of one type that a device sends after it was started.
 
     Args:
         timeline: the faults of the sensor's clock.
 
     Attributes:
-        due: the time of the next frame.
+        due: the time of the next frame, ns since power-on.
     """
 
     def __init__(
@@ -321,7 +342,7 @@ class _FrameStream:
         self._next = 0
 
     def take(self, upto: float) -> list[tuple[float, bytes]]:
-        """Return the frames that are due by a time, with their times."""
+        """Return (time, frame) of the frames that are due until a time."""
         taken: list[tuple[float, bytes]] = []
         while self.due <= upto:
             if self._position == len(self._frames):
@@ -359,22 +380,22 @@ class SimulatedDevice:
     Args:
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
-        rate: speed relative to real time; inf: as fast as it is read.
-        faults: the faults on its links.
+        rate: speed relative to real time; infinity for as fast as the data is read.
+        faults: the faults on the links.
 
     Attributes:
-        present: whether it is plugged in.
-        commands_received: the names of the commands that it received.
-        destination: the address and port that a command has named for the data, ("", port) without
-            an address; None if no command did.
-        sent: number of sent frames by type, before any faults.
-        lines: link -> its faults.
-        utc_offset_ns: UTC minus the time that the caller passes, ns, from the next `start` on; for
-            clocks that follow UTC.
+        present: whether the device is connected.
+        commands_received: the names of the commands that the device has received.
+        destination: (address, port) to which a command has redirected the data; None if no command
+            has. The address is "" if the command contained only a port.
+        sent: number of sent frames by type, before faults.
+        lines: name of each link -> the link with its faults.
+        utc_offset_ns: UTC minus the time that the caller passes, ns, for clocks that follow UTC. A
+            change has an effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
-        SpecError: if its packet rate is unknown.
+        SpecError: if the spec does not determine the packet rate.
     """
 
     def __init__(
@@ -413,7 +434,8 @@ class SimulatedDevice:
     def _line(self, name: str, seed: int) -> FaultyLink:
         """Return the link of this name with its faults.
 
-        TCP and HTTP lose nothing; a byte stream other than the data link is TCP.
+        TCP and HTTP lose no bytes, so these links have no faults. A byte stream other than the data
+        link is TCP.
         """
         link = self.sensor.links[name]
         stream = not is_datagram(link)
@@ -442,16 +464,15 @@ class SimulatedDevice:
             self._begin(0.0, self.sensor.data_frame)
 
     def _waits_for_a_command(self) -> bool:
-        """Return whether it sends no data until a command of `on_open` starts it.
+        """Return whether the device sends no data until a start command is received.
 
-        If the start command of a sensor is not in `on_open`, it sends from power-on, because no
-        program would start it.
+        The start command must be in `on_open`, because no program would send another one.
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
 
     def serve_at(self, data_port: int) -> None:
-        """Set the port at which the data is served, for replies that report it."""
+        """Set the port at which the data is served; some replies report this port."""
         self._replies.data_port = data_port
 
     def unplug(self) -> None:
@@ -463,37 +484,37 @@ class SimulatedDevice:
         """Make the sensor's clock jump, starting within the next quarter of a second.
 
         Args:
-            seconds: the size of the jump, negative for a jump back; added to earlier jumps until
-                the next `start`.
+            seconds: the size of the jump; negative to jump back. Jumps add up until the next
+                `start`.
 
         Raises:
             UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
                 sent.
         """
         if self._stream is None:
-            raise UsageError(f"{self.sensor.id} sends no data, so that its clock cannot jump")
+            raise UsageError(f"{self.sensor.id} sends no data, so its clock cannot jump")
         self._simulation(self._stream.frame).clock.check(self.faults.clock)
         self._timeline.jump_ns += round(seconds * SECOND)
         self._replies.use_timeline(self._timeline)
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
-        """Receive bytes or a datagram."""
+        """Process received bytes, or a received datagram, at the time `now`."""
         self._switch_plug(now)
         if self.present:
             for request in self._replies.find_requests(data, now, link):
                 self._reply(request, self._clock(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
-        """Return the data sent until now, in order, as (link, bytes).
+        """Return the data that is sent until `now`, in order, as (link, bytes).
 
-        A byte stream gives one entry for each link, other links one for each datagram.
+        All bytes of a byte stream are one entry. Each datagram is an entry.
         """
         return [(link, data) for link, _, data in self.outgoing_with_types(now)]
 
     def outgoing_with_types(self, now: int) -> list[tuple[str, str, bytes]]:
-        """Return the data sent until now with its type, as (link, type, bytes).
+        """Return the data that is sent until `now`, as (link, frame type, bytes).
 
-        A byte stream gives one entry for each link, without a type.
+        All bytes of a byte stream are one entry, with the type "".
         """
         self._switch_plug(now)
         if not self.present:
@@ -514,7 +535,7 @@ class SimulatedDevice:
 
     @property
     def deadline(self) -> int | None:
-        """The time of the next output, disconnection or reconnection, or None."""
+        """The time of the next output, disconnection or reconnection; None if unknown."""
         times = [self._plug] if self._plug is not None else []
         if self.present:
             due = [self._plan[0].at] if self._plan else []
@@ -534,9 +555,9 @@ class SimulatedDevice:
         return bool(due.frame and self.sensor.frames[due.frame].simulation.rate)
 
     def _clock(self, now: int) -> float:
-        """Return the device's time in ns since power-on.
+        """Return the time of the device, ns since power-on.
 
-        With an infinite rate it advances whenever data is requested.
+        With an infinite rate, it advances when data is requested.
         """
         if math.isinf(self.rate):
             return self._time
@@ -545,7 +566,7 @@ class SimulatedDevice:
         return (now - self._powered) * self.rate
 
     def _due(self, upto: float) -> list[tuple[str, str, bytes]]:
-        """Return the data that is due by a time, in order, as (link, type, bytes)."""
+        """Return the data that is due until a time, in order, as (link, type, bytes)."""
         sendings: list[tuple[float, str, str, bytes]] = []
         while self._plan and self._plan[0].at <= upto:
             due = heapq.heappop(self._plan)
@@ -561,7 +582,7 @@ class SimulatedDevice:
         return [item[1:] for item in sendings]
 
     def _plan_next(self, due: _PlannedData) -> None:
-        """Plan the next frame of a type that is sent unasked."""
+        """Plan the next frame of a type that is sent periodically."""
         if due.frame:
             rate = self.sensor.frames[due.frame].simulation.rate
         else:
@@ -576,9 +597,9 @@ class SimulatedDevice:
             )
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
-        """Reply to a command, unless it has to wait until the data stops.
+        """Plan the reply to a command, unless the command is ignored while data is sent.
 
-        If the command starts the sensor, data follows the reply.
+        If the command starts the data, plans the data after the reply.
         """
         self.commands_received.append(request.name)
         command = request.command
@@ -641,7 +662,7 @@ class SimulatedDevice:
                 self._put(at, "data", name, self._replies.unasked_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
-        """Send fillers during a pause, and return the time of its end."""
+        """Plan the fillers that are sent in a pause, and return the end of the pause."""
         for step in range(PAUSE_FILLERS if self.sensor.fillers else 0):
             data = bytes([self._source.choice(self.sensor.fillers)])
             self._put(at + seconds * SECOND * (step + 1) / (PAUSE_FILLERS + 1), link, "", data)

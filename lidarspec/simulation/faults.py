@@ -1,8 +1,8 @@
 """Inject faults into the data of a simulated sensor.
 
 The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor, IMU noise
-and faults of the clock. The same seed causes the same faults in the same packets, however they are
-split into batches.
+and faults of the clock. For the same seed and the same packets, the faults are the same, even if
+the packets are split into different batches.
 """
 
 from __future__ import annotations
@@ -29,13 +29,15 @@ class Faults:
     """The faults of a simulated sensor.
 
     Args:
-        errors: fraction of corrupt bytes, 0 to 1. A bit of the byte is flipped; in a byte stream
-            the byte can also be dropped, or a random byte inserted after it.
-        loss: fraction of packets that are dropped, 0 to 1.
-        reorder: maximum delay of a datagram, in packets. One datagram in ten is delayed; 0: none.
-        unplug: interval between disconnections, in seconds; 0: never.
+        errors: fraction of bytes to corrupt, 0 to 1. One bit of the byte is flipped. In a byte
+            stream, the byte may be dropped instead, or a random byte inserted after it.
+        loss: fraction of packets to drop, 0 to 1.
+        reorder: maximum delay of a datagram, in packets; 0 for no delay. One datagram in ten is
+            delayed.
+        unplug: time between disconnections, in seconds; 0 for no disconnection.
         absent: duration of each disconnection, in seconds.
-        shake: standard deviation of the noise on IMU readings, in m/s2 and rad/s; 0: at rest.
+        shake: standard deviation of the noise on IMU measurements, in m/s2 and rad/s; 0 for no
+            noise.
         clock: the faults of the sensor's clock.
         rotor: "blocked" if the rotor does not turn and the angles are constant; "" if it turns.
 
@@ -94,7 +96,7 @@ def parse_faults(options: Mapping[str, str]) -> Faults:
     return Faults(**values)
 
 
-#: The names of the faults.
+#: The names of the faults, which are options of ``sim:`` sources.
 FAULTS = tuple(one.name for one in fields(Faults))
 
 
@@ -102,11 +104,13 @@ class FaultyLink:
     """A link that corrupts, drops and reorders packets.
 
     Args:
-        stream: whether the link is a byte stream; otherwise it carries datagrams.
+        faults: the faults.
+        seed: random seed.
+        stream: whether the link is a byte stream, instead of datagrams.
 
     Attributes:
-        sent: number of packets passed to `transmit`.
-        intact: number of packets that arrive without a fault inside them.
+        sent: number of packets that were passed to `transmit`.
+        intact: number of packets that arrive without a corrupt byte.
         lost: number of packets that are dropped.
 
     Raises:
@@ -125,9 +129,10 @@ class FaultyLink:
         self.sent = self.intact = self.lost = 0
 
     def transmit(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """Return the packets that arrive, as (frame name, bytes).
+        """Return the packets that arrive, as (frame type, bytes).
 
-        A later call returns delayed packets. Packets still delayed at the end are never returned.
+        Delayed packets are returned by later calls. Packets that are still delayed after the last
+        call are lost.
         """
         self.sent += len(packets)
         if not (self._faults.errors or self._faults.loss or self._faults.reorder):
@@ -153,7 +158,7 @@ class FaultyLink:
         return arrived
 
     def _draw_gap(self) -> int:
-        """Return the number of valid bytes before the next corrupt one."""
+        """Return a random number of valid bytes before the next corrupt byte."""
         rate = self._faults.errors
         if rate in (0.0, 1.0):
             return 0

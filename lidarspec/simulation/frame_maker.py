@@ -1,8 +1,8 @@
 """Make frames from physical values by path; all other fields are 0.
 
-Constants and checksums are filled in. Unlike `build`, this makes many frames at once and does not
-require every field: the values of a `sweep` or a reply are enough. Counts and options in the header
-select the layout, as in a decoder.
+Constants and checksums are filled in. Unlike `build`, `FrameMaker` makes many frames at once, and
+requires only some fields, for example those that a `sweep` returns. The values of header fields,
+such as counts, determine the layout of a frame, as in a decoder.
 """
 
 from __future__ import annotations
@@ -60,10 +60,13 @@ class FrameMaker:
         """Return a maker for parts of one kind.
 
         Args:
+            sensor: id of the sensor, for messages.
+            root: the node of the parts.
+            limit: maximum length of a frame, in bytes.
             given: raw values of the fields of the frame that the parts depend on.
         """
         maker = cls.__new__(cls)
-        maker._coder = None  # parts have no wire form of their own
+        maker._coder = None  # only whole frames have a wire form
         maker._makes(sensor, root, limit, given, set())
         return maker
 
@@ -91,9 +94,10 @@ class FrameMaker:
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
     def table(self, frames: Sequence[Values]) -> CompiledTable:
-        """Return one frame for each mapping of field paths to physical values.
+        """Return a table with one frame for each mapping of field paths to values.
 
-        Arrays may also be bytes, and parts are mappings of the same form.
+        Values are physical. An array of bytes may be given as bytes, and a part as a mapping of the
+        same form.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -116,11 +120,11 @@ class FrameMaker:
         return CompiledTable(self.schema, groups)
 
     def frame(self, values: Values) -> bytes:
-        """Return one frame with its checksum."""
+        """Return the bytes of one frame."""
         return self.seal(self.table([values]))[0]
 
     def seal(self, table: CompiledTable) -> list[bytes]:
-        """Return the frames of a table as they are sent.
+        """Return the bytes of the frames of a table, as they are sent.
 
         Raises:
             SpecError: if the wire form cannot write a value.
@@ -141,7 +145,7 @@ class FrameMaker:
         return frames
 
     def _with_counts(self, values: Values) -> Values:
-        """Return the values of a frame with the missing counts of its arrays and bytes."""
+        """Return the values of a frame, with the counts of its arrays if they are missing."""
         missing = [
             axis
             for axis, count_path in self._counts.items()
@@ -153,9 +157,10 @@ class FrameMaker:
         return counted
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
-        """Return the values of a frame with its parts replaced by their sizes and counts.
+        """Return the values of a frame without its parts, and the bytes of the parts.
 
-        The second result has the bytes of the parts, by axis.
+        The values contain the sizes and counts of the parts. The bytes are given by path of the
+        parts.
         """
         result = dict(values)
         parts_by_axis = dict[str, bytes]()
@@ -193,9 +198,9 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the first field of a formula so that it gives `number`.
+        """Set the first field of a formula so that the formula gives `number`.
 
-        A field that is already given keeps its value.
+        A field that has a value is not changed.
         """
         if formula is None:
             paths = []
@@ -209,7 +214,7 @@ class FrameMaker:
             values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
     def _layout(self, values: Values) -> Layout:
-        """Return the layout for these values of header fields."""
+        """Return the layout of a frame with these values of header fields."""
         while True:
             header = {path: self._raw(values, path) for path in self._layout_fields}
             key = tuple(header.values())
@@ -282,7 +287,7 @@ class FrameMaker:
 
 
 def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
-    """Set a value in nested mappings."""
+    """Set the value at a dotted path in nested mappings."""
     *parents, name = path.split(".")
     for parent in parents:
         values = values.setdefault(parent, {})
@@ -290,7 +295,7 @@ def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
 
 
 def seal_frames(table: CompiledTable) -> list[bytes]:
-    """Return the frames of a table in order, with constants and checksums."""
+    """Return the bytes of the frames of a table, with constants and checksums."""
     frames = [b""] * len(table)
     for group in table.groups:
         group.layout.seal(group.rows)

@@ -16,25 +16,25 @@ Floats = NDArray[np.float64]
 
 
 def round_raw(info: FieldInfo, raw: Floats) -> Floats:
-    """Return raw values as a field can hold them."""
+    """Return raw values, rounded if the field is an integer."""
     if info.kind == "int":
         return np.rint(raw)
     return raw
 
 
 class PartRows(CompiledTable):
-    """The parts of frames that have the points, with their frames.
+    """The parts of frames that contain the points.
 
     Args:
-        frames: the frames; `put_back` writes to them.
+        frames: the frames. `put_back` writes the parts into them.
         path: path of the parts.
     """
 
     def __init__(self, frames: CompiledTable, path: str) -> None:
-        place = frames.schema.within(path)
-        if place is None or place[2]:
+        parts = frames.schema.within(path)
+        if parts is None or parts[2]:
             raise SpecError("the frame has no such parts", path=path)
-        self.place = place[:2]
+        self.place = parts[:2]
         self.frames = frames
         own, self.which = frames.parts(*self.place)
         super().__init__(
@@ -43,12 +43,12 @@ class PartRows(CompiledTable):
         )
 
     def put_back(self) -> None:
-        """Write the parts, with their checksums, into their frames."""
+        """Write the parts with their checksums into the frames."""
         left = iter(seal_frames(self))
         axis, kind = self.place
         destinations = list[tuple[int, int, NDArray[np.uint8]]]()
         for group, buffer, walked in self.frames.walks(axis):
-            kinds = [one.node.name for one in group.layout.regions[axis].kinds]
+            kinds = [kind.node.name for kind in group.layout.regions[axis].kinds]
             for piece in (
                 piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind
             ):
@@ -62,7 +62,13 @@ class PartRows(CompiledTable):
 
 
 def write_raw(table: CompiledTable, path: str, values: NDArray[Any]) -> None:
-    """Write raw values, (n, ...) or a single one, into every frame that has the field."""
+    """Write raw values into every frame that has the field.
+
+    Args:
+        table: the frames.
+        path: path of the field.
+        values: the values, (n, ...), or one value for all frames.
+    """
     for group in table.groups:
         leaf = group.layout.leaves.get(path)
         if leaf is None:

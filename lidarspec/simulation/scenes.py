@@ -1,8 +1,8 @@
-"""Scenes for simulated sensors: the range of a beam in a direction.
+"""Scenes for simulated sensors, in which ranges are measured.
 
-A scene consists of upright boxes in the sensor's axes: x forward, y left, z up, in metres, with the
-sensor at the origin. Beams may begin next to the origin, and movers change their position with
-time, so both can be given for each beam. A scene can be read from a TOML file:
+A scene consists of upright boxes in the axes of the sensor: x forward, y left, z up, in metres,
+with the sensor at the origin. Some boxes (movers) move with time. A scene can be read from a TOML
+file:
 
     [room]                                  # walls, floor and ceiling; optional
     low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
@@ -35,14 +35,14 @@ from lidarspec.errors import UsageError, did_you_mean
 from lidarspec.trusted_files import read_document
 
 Floats = NDArray[np.float64]
-#: A value that broadcasts against the beams: an array, or one number for all.
+#: A number for all beams, or an array that broadcasts against the beams.
 Value = Any
 Vector = tuple[Value, Value, Value]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 class Scene(Protocol):
-    """A scene with measurable ranges."""
+    """A scene in which ranges can be measured."""
 
     def measure(
         self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
@@ -64,7 +64,7 @@ class Box:
     high: tuple[float, float, float]
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """Return the corners of the box in metres, the same at any time."""
+        """Return the lowest and the highest corner in metres, which do not depend on time."""
         return self.low, self.high
 
     @property
@@ -75,13 +75,14 @@ class Box:
 
 @dataclass(frozen=True)
 class Mover:
-    """A box that moves along a path and back again, for ever.
+    """A box that moves along a path and back again, repeatedly.
 
     Args:
-        size: size of the box, metres.
-        path: (x, y) of the points that its centre passes in straight lines; at least two.
-        speed: metres per second.
-        floor: height of its underside.
+        size: size of the box in x, y and z, metres.
+        path: (x, y) of at least two points, metres. The centre of the box moves between them in
+            straight lines.
+        speed: speed, metres per second.
+        floor: z of the underside of the box, metres.
     """
 
     size: tuple[float, float, float]
@@ -115,13 +116,14 @@ class Mover:
 
 @dataclass(frozen=True)
 class Room:
-    """Walls, floor and ceiling around the sensor, with boxes in it.
+    """A room around the sensor, with fixed and moving boxes.
 
     The default room has no symmetry, so that a mirrored point cloud can be recognised.
 
     Args:
-        walls: the walls; None outdoors, with nothing but the boxes.
-        boxes, movers: fixed and moving boxes.
+        walls: the box that the walls, the floor and the ceiling form; None for no walls.
+        boxes: the fixed boxes.
+        movers: the moving boxes.
     """
 
     walls: Box | None = Box((-3.0, -2.2, -1.2), (4.6, 3.1, 1.6))
@@ -162,7 +164,7 @@ class Room:
 
 
 def _meet(ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
-    """Shorten, in place, the beams that hit a body from outside."""
+    """Shorten the ranges of the beams that hit a body from outside, in place."""
     low, high = body.at(time)
     near = _near(body, low, high, beams, origin)
     where = np.flatnonzero(np.broadcast_to(near, ranges.shape))
@@ -187,7 +189,10 @@ def _meet(ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time
 
 
 def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
-    """Return which beams pass the sphere around a body; others cannot hit it."""
+    """Return a mask of the beams that may hit a body.
+
+    All other beams miss the sphere around the body.
+    """
     middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     aside = np.sqrt(sum(np.max(np.square(part)) for part in origin))
     squared = sum(np.square(part) for part in middle) - (body.radius + aside) ** 2
@@ -196,9 +201,9 @@ def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: V
 
 
 def make_room(seed: int = 0) -> Room:
-    """Return a room with boxes and a walking person.
+    """Return a random room with boxes and a walking person.
 
-    Each seed gives a different room, the same one every time.
+    The same seed always gives the same room.
     """
     walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9), (-1.8, 1.2)))
     if seed == 0:
@@ -222,17 +227,18 @@ def read_scene(path: str | Path) -> Room:
     """Return the scene of a TOML file.
 
     Raises:
-        SourceError: if it cannot be read.
-        UsageError: if it is invalid; the message names the key.
+        SourceError: if the file cannot be read.
+        UsageError: if the scene is invalid; the message names the key.
     """
     return parse_scene(read_document(Path(path)), str(path))
 
 
 def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
-    """Return the scene that a table describes; see the module's text.
+    """Return the scene that a TOML table describes; see the module's docstring.
 
     Args:
-        place: the beginning of error messages.
+        table: the table.
+        place: name of the table, for error messages.
 
     Raises:
         UsageError: for an invalid scene.
@@ -244,7 +250,9 @@ def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
             raise UsageError(f"{place}: room: expected one table, [room]")
         walls = _box(table["room"], f"{place}: room")
         if not all(low < 0 < high for low, high in zip(walls.low, walls.high, strict=True)):
-            raise UsageError(f"{place}: room: must contain the sensor, which is at [0, 0, 0]")
+            raise UsageError(
+                f"{place}: room: the room must contain the sensor, which is at [0, 0, 0]"
+            )
     boxes = [_box(entry, where) for entry, where in _entries(table, "box", place)]
     movers = [_mover(entry, where) for entry, where in _entries(table, "mover", place)]
     return Room(walls, tuple(boxes), tuple(movers))
@@ -255,7 +263,8 @@ def _box(table: Mapping[str, Any], place: str) -> Box:
     low, high = (_numbers(table, name, 3, place) for name in ("low", "high"))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise UsageError(
-            f"{place}: expected high above low in each coordinate, got low {low} and high {high}"
+            f"{place}: each coordinate of high must be above that of low, got low {low} and high"
+            f" {high}"
         )
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 

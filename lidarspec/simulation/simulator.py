@@ -1,20 +1,26 @@
 """Make the frames that a sensor would send from a scene, and their times.
 
-The sensor's `sweep` gives the values that are not measured (angles, counters, time). The packets
-are filled with them, `points` gives the directions of the beams, the scene their ranges, and the
-ranges are written through the scale of the fields that they come from (`Measurement`). This needs
-no inverse of `points`: each field in metres is set to a probe value to find the points that depend
-on it. If directions depend on ranges, the measurement is repeated; a beam without a fixed point has
-no return. A frame type with an `encode` of its own gets the measured points and returns the values
-of its fields.
+A block of packets is made in four steps:
 
-The time of each packet comes from the spec, in this order: the declared rate; the sensor's clock,
-which its `sweep` sets; the times of the points, which give the time per point; the speed of the
-serial line, which limits every sensor.
+1. The sensor's `sweep` gives the values that are not measured, such as angles, counters and time.
+   The packets are filled with these values.
+2. The sensor's `points` gives the directions of the beams.
+3. The scene gives the range of each beam.
+4. The ranges are written into the fields that they come from, through the scale of these fields
+   (`Measurement`).
 
-Cartesian points do not give the directions of beams: the spec declares them, and the equations of
-the coordinates, which are linear in the raw values, are solved for the point that a beam hits
-(`PointPlacement`).
+The last step does not need an inverse of `points`. To find the points that depend on a field, each
+field in metres is set to a probe value. If directions depend on ranges, the steps are repeated; a
+beam with a direction that keeps changing gets no return. If the sensor declares a function
+`encode`, it gets the measured points and returns the values of the fields instead.
+
+The directions of beams cannot be calculated from Cartesian points, so the spec declares the
+directions. The coordinates are linear in the raw values of fields, and the equations are solved for
+the point that a beam hits (`PointPlacement`).
+
+The time of each packet comes from the first of these that the spec has: the declared rate; the
+sensor's clock, which `sweep` sets; the times of the points in a packet; the baud rate of the serial
+line.
 """
 
 from __future__ import annotations
@@ -50,29 +56,31 @@ from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
-#: Bits on a serial line for each byte: start, eight, stop.
+#: Number of bits on a serial line for each byte: a start bit, eight data bits and a stop bit.
 BITS_PER_BYTE = 10
-#: Nanoseconds; a clock that deviates less from even steps counts as coarse, and the steps as even.
+#: If a clock deviates from equal steps by less than this, it is considered coarse, and the steps
+#: equal.
 CLOCK_TOLERANCE_NS = 1_000_000
-#: Number of extra packets to simulate, since directions may depend on the next packet.
+#: Number of packets to simulate after the last requested packet, because directions may depend on
+#: the next packet.
 AHEAD = 1
-#: Number of packets that show which fields hold the ranges, and the packet rate.
+#: Maximum number of packets that are made to find the fields with ranges, and the packet rate.
 MAX_PROBED_PACKETS = 256
 #: Number of packets that show the fields of the clock.
 CLOCK_PROBE_PACKETS = 2
-#: Maximum bytes of these packets, and their minimum number.
+#: Maximum total size of these packets. The next constant is their minimum number.
 MAX_PROBED_BYTES = 1 << 21
 MIN_PROBED_PACKETS = 4
 Floats = NDArray[np.float64]
-#: Maximum number of measurements while directions still change.
+#: Maximum number of repeated measurements if directions depend on ranges.
 MAX_ROUNDS = 8
 #: The attributes of points that define beams.
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
 #: The raw value that is set to find the points that depend on a field.
 PROBE_VALUE = 100
-#: Relative tolerance between a range and its field, for rounding errors.
+#: Relative tolerance for rounding errors between a range and the value of its field.
 RANGE_TOLERANCE = 1e-9
-#: Number of frames without points that are made together.
+#: Number of periodic frames without points to make together.
 UNASKED_BATCH = 50
 #: Standard gravity, m/s2.
 GRAVITY = 9.80665
@@ -80,14 +88,14 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, eq=False)
 class RangeField:
-    """A field that gives ranges.
+    """A field that contains ranges.
 
     Attributes:
         path: path of the field.
-        inner: index of the innermost axes of the points that belongs to it.
-        step: metres per raw step; None if each packet has its own, for example from the header or a
-            calibration.
-        zero: metres of raw 0.
+        inner: index in the last axes of the points, for points that the field determines.
+        step: metres per raw step; None if it differs between packets, for example because of a
+            value in the header or a calibration.
+        zero: range of the raw value 0, metres.
     """
 
     path: str
@@ -98,13 +106,19 @@ class RangeField:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a table: arrays that broadcast, with the packets on the first axis.
+    """The beams of a table of packets; the first axis of the arrays is the packet.
+
+    The arrays broadcast against each other.
 
     Attributes:
-        range, azimuth, elevation, time, origin: as in `Polar`; unknown directions are nan.
-        counts: (n,) number of points of each packet.
-        intensity: path of the field with the intensity; "" if there is none.
-        places: x, y and z of Cartesian points, (3, n, ...).
+        range: as in `Polar`.
+        azimuth: as in `Polar`; nan if unknown.
+        elevation: as in `Polar`; nan if unknown.
+        time: as in `Polar`.
+        origin: as in `Polar`.
+        counts: number of points of each packet, (n,).
+        intensity: path of the field with the intensity; "" if the points have no intensity.
+        places: x, y and z of Cartesian points, (3, n, ...); None for polar points.
     """
 
     range: Floats
@@ -124,14 +138,16 @@ class Beams:
 
 
 class Measurement:
-    """Writes ranges into one frame type of a sensor; analysed once, on a table.
-
-    Raises:
-        SpecError: if ranges cannot be traced back to fields and there is no `encode`.
+    """Writes measured ranges into frames of one type of a sensor.
 
     Args:
-        given: paths of the fields that the sensor's `sweep` gives; they are not changed unless they
-            are ranges.
+        sensor: the sensor.
+        frame: the frame type.
+        table: example frames, from which the fields with ranges are found.
+        given: paths of the fields that `sweep` gives. They are not changed unless they are ranges.
+
+    Raises:
+        SpecError: if no fields that determine the ranges are found, and the sensor has no `encode`.
     """
 
     def __init__(
@@ -153,10 +169,7 @@ class Measurement:
     def of(
         cls, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str]
     ) -> Measurement:
-        """Return the measurement of a frame's points.
-
-        It is a `PointPlacement` for Cartesian points, otherwise a `Measurement`.
-        """
+        """Return a `PointPlacement` for Cartesian points, else a `Measurement`."""
         return (
             PointPlacement
             if _result(sensor, frame, table)[0].__class__ is Cartesian
@@ -166,11 +179,13 @@ class Measurement:
     def fill(
         self, table: CompiledTable, numbers: Sequence[int], scene: Scene, times: Floats
     ) -> None:
-        """Measure a table's ranges in the scene, and write them.
+        """Measure the ranges of a table in the scene, and write them into the table.
 
         Args:
-            numbers: numbers of the packets; for parts, of the packets that contain them.
-            times: (n,) seconds since the scene began, of each packet.
+            table: the frames, or the parts of frames.
+            numbers: number of each packet; for parts, of the packet that contains the part.
+            scene: the scene.
+            times: time of each packet, (n,) seconds since the scene began.
         """
         steps = [self._step(table, target) for target in self._targets]
         before = np.zeros(1)
@@ -195,7 +210,7 @@ class Measurement:
             self._fill_intensity(table, written[self._targets[0].path])
 
     def _fill_intensity(self, table: CompiledTable, ranges: NDArray[Any]) -> None:
-        """Write an intensity for each range."""
+        """Write an intensity for each range. Without a return, it is 0."""
         write_raw(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
 
     def beams(self, table: CompiledTable) -> Beams:
@@ -237,7 +252,7 @@ class Measurement:
     def _measure(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
         """Return the range of each beam in metres.
 
-        It is 0 outside the sensor's range limits, and for unknown directions.
+        It is 0 for a range outside the sensor's limits, and for an unknown direction.
         """
         has_direction = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
         seconds = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
@@ -254,7 +269,7 @@ class Measurement:
     def _values(
         self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
-        """Return the raw values of the fields for these ranges."""
+        """Return {path: raw values} of the fields for these ranges."""
         if self._encode is not None:
             polar = Polar(
                 ranges,
@@ -275,7 +290,7 @@ class Measurement:
         return raw_values
 
     def _most(self, table: CompiledTable, path: str) -> float:
-        """Return the largest raw value that a field and the wire form can hold."""
+        """Return the maximum raw value of a field that its wire form can represent."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
         leaves = [
@@ -286,7 +301,7 @@ class Measurement:
         return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
-        """Return the fields in metres that the ranges of the points depend on."""
+        """Return the fields that the ranges of the points depend on."""
         targets: list[RangeField] = []
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(
@@ -299,7 +314,7 @@ class Measurement:
                 part = _part(answer, inner)
                 near = part[
                     np.isclose(part, expected)
-                ]  # a direction with a length of nearly 1 is part of the range
+                ]  # a unit vector whose length is not exactly 1 affects the range
                 if np.allclose(near, expected, RANGE_TOLERANCE, 0):
                     step = info.scale
                 else:
@@ -315,10 +330,10 @@ class Measurement:
         return tuple(targets)
 
     def _linear(self, table: CompiledTable) -> list[RangeField]:
-        """Return the fields that ranges depend on linearly, but not by their own scale.
+        """Return the fields that ranges depend on linearly, but not by the declared scale.
 
-        These are fields in metres that a correction shifts or scales, and elements of arrays
-        without a unit that are proportional to ranges, because the header has the unit.
+        These are fields in metres to which `points` applies a correction, and array elements
+        without a unit, if a field of the header has the unit.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -339,7 +354,10 @@ class Measurement:
         return targets
 
     def _probe(self, table: CompiledTable, paths: Iterable[str], *probes: int) -> list[Beams]:
-        """Return the beams for each of some values of fields, then restore the table."""
+        """Return the beams for each probe value of some fields.
+
+        The table is restored afterwards.
+        """
         before = {path: table.raw(path) for path in paths}
         beams = []
         for probe in probes:
@@ -351,7 +369,10 @@ class Measurement:
         return beams
 
     def _step(self, table: CompiledTable, target: RangeField) -> tuple[Any, Any]:
-        """Return metres per raw step, and of raw 0: numbers, or arrays over points."""
+        """Return metres per raw step, and the range of the raw value 0 in metres.
+
+        Both are numbers, or arrays with a value for each point.
+        """
         if target.step is not None:
             return target.step, target.zero
         once, twice = (
@@ -361,7 +382,7 @@ class Measurement:
         return (twice - once) / PROBE_VALUE, 2 * once - twice
 
     def _inner(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
-        """Return the indices of the axes that points have in addition to the fields."""
+        """Return the indices in the axes that the points have but the fields do not."""
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
             return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
@@ -380,10 +401,10 @@ class Measurement:
 
 
 class PointPlacement(Measurement):
-    """Writes Cartesian points: solves for raw values of the point that a beam hits.
+    """Writes the raw values of the point that each beam hits, for Cartesian points.
 
     Raises:
-        SpecError: if no directions are declared, or no field gives a coordinate of a point.
+        SpecError: if no directions are declared, or no field determines the coordinates of a point.
     """
 
     def fill(
@@ -401,7 +422,7 @@ class PointPlacement(Measurement):
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Return the declared azimuths and elevations of packets, (n, *shape) each.
 
-        They are nan for missing points of shorter packets.
+        They are nan for points that a shorter packet does not have.
         """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
@@ -438,7 +459,7 @@ class PointPlacement(Measurement):
             paths = [target.path for target in self._targets if target.inner == inner]
             infos = [table.schema.fields[path] for path in paths]
             zero, *ones = (_part(places, inner) for places in self._move(table, paths))
-            slopes = np.stack([(one - zero) / PROBE_VALUE for one in ones])
+            slopes = np.stack([(probed - zero) / PROBE_VALUE for probed in ones])
             raw = [
                 round_raw(info, column)
                 for info, column in zip(
@@ -458,9 +479,9 @@ class PointPlacement(Measurement):
         return raw_values
 
     def _move(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
-        """Return coordinates with all fields at 0, then with each at its probe value.
+        """Return the coordinates with all fields at 0, then with each at its probe value.
 
-        Each array has the shape (3, n, ...).
+        Each array has the shape (3, n, ...). The table is restored afterwards.
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
@@ -471,7 +492,10 @@ class PointPlacement(Measurement):
         return [each.places for each in beams if each.places is not None]
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
-        """Return the fields, in metres or without a unit, that coordinates are linear in."""
+        """Return the fields that the coordinates depend on linearly.
+
+        The fields are in metres or have no unit.
+        """
         targets = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
@@ -520,14 +544,14 @@ def _solve(slopes: Floats, aims: Floats) -> Floats:
 
 
 def _name(frame: str, table: CompiledTable) -> str:
-    """Return the name of a table's frame type or parts."""
+    """Return the name of the frame type or parts in a table."""
     if isinstance(table, PartRows):
         return ".".join(filter(None, (frame, *table.place)))
     return frame
 
 
 def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
-    """Return the result of `points` for a table of frames without predecessors."""
+    """Return the result of `points` for a table, as for the first frames of a stream."""
     batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
@@ -543,7 +567,7 @@ def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, B
 
 
 def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
-    """Return a batch of frames, or of parts of them, without predecessors."""
+    """Return a batch of frames or parts, as for the first frames of a stream."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -571,13 +595,15 @@ def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) 
 
 
 class RestingImu:
-    """Writes the readings of an IMU at rest into the fields that `imu` depends on.
+    """Writes the measurements of an IMU at rest into frames of one type.
 
     Args:
-        given: paths of the fields that the frame's `sweep` gives.
+        sensor: the sensor.
+        frame: the frame type.
+        given: paths of the fields that `sweep` gives; they are not changed.
 
     Raises:
-        SpecError: if no field holds a reading.
+        SpecError: if no fields that determine the measurements are found.
     """
 
     def __init__(self, sensor: Sensor, frame: str, given: Container[str]) -> None:
@@ -588,10 +614,11 @@ class RestingImu:
         self._targets: list[str] | None = None
 
     def fill(self, frames: CompiledTable, shake: float, seed: Sequence[int]) -> None:
-        """Write the readings into frames.
+        """Write the measurements into frames.
 
         Args:
-            shake: standard deviation of their noise, m/s2 and rad/s; 0 for none.
+            frames: the frames.
+            shake: standard deviation of the noise, m/s2 and rad/s; 0 for no noise.
             seed: seed of the noise.
         """
         table = PartRows(frames, self._path) if self._path else frames
@@ -624,7 +651,7 @@ class RestingImu:
             table.put_back()
 
     def _find_linear_fields(self, table: CompiledTable) -> list[str]:
-        """Return the fields that the readings are linear in."""
+        """Return the fields that the measurements depend on linearly."""
         zero = self._read_motion(table)
         paths = list[str]()
         for path, info in table.schema.fields.items():
@@ -648,7 +675,7 @@ class RestingImu:
         return paths
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
-        """Return the readings with one field at its probe value, and the others at 0."""
+        """Return the measurements with one field at its probe value, and others at 0."""
         write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
@@ -676,13 +703,16 @@ class RestingImu:
 
 
 class PacketTimes:
-    """The times of a sensor's packets, batch by batch.
+    """Calculates the times of a sensor's packets, one batch after another.
 
     Args:
-        beams: the beams of `table`, the first packets.
+        sensor: the sensor.
+        frame: the frame type.
+        table: the first packets.
+        beams: the beams of these packets.
 
     Attributes:
-        interval: mean ns from one packet to the next; 0 if the spec has no times.
+        interval: mean time between packets, ns; 0 if the spec does not determine times.
     """
 
     def __init__(self, sensor: Sensor, frame: str, table: CompiledTable, beams: Beams) -> None:
@@ -696,10 +726,11 @@ class PacketTimes:
         self.interval = float(times[-1]) / (len(times) - 1)
 
     def times(self, table: CompiledTable, beams: Callable[[], Beams]) -> Times:
-        """Return the times of the packets of a batch after its first, (n,) ns.
+        """Return the time of each packet of a batch since the first, (n,) ns.
 
         Args:
-            beams: returns the beams of the batch, if they are needed.
+            table: the packets.
+            beams: returns the beams of the packets; called only if they are needed.
         """
         if self._rate:
             return np.asarray(np.rint(np.arange(len(table)) * 1e9 / self._rate), np.int64)
@@ -728,7 +759,10 @@ class PacketTimes:
 
 
 def _seconds_per_point(beams: Beams) -> float:
-    """Return the median time between points of a packet; 0 if all have the same time."""
+    """Return the median time between consecutive points of a packet, in seconds.
+
+    Returns 0 if all points have the same time.
+    """
     times = np.broadcast_to(beams.time, beams.range.shape).reshape(len(beams.range), -1)
     steps: NDArray[Any] = np.diff(times, axis=1)
     if (steps > 0).any():
@@ -745,9 +779,12 @@ def _sizes(table: CompiledTable) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class PacketBlock:
-    """Consecutive packets: their bytes and times.
+    """n consecutive packets.
 
-    The times are (n + 1,) int64 ns since the first packet, of each and of the one after them.
+    Attributes:
+        frames: the bytes of each packet.
+        times: times since the first packet, of each packet and of the packet after the last, (n +
+            1,) int64 ns.
     """
 
     frames: list[bytes]
@@ -755,18 +792,20 @@ class PacketBlock:
 
 
 class FrameSimulation:
-    """A data frame type of a sensor, ready to be simulated.
+    """Makes the packets of one data frame type of a sensor.
 
     Args:
-        blocked: whether the rotor does not turn. Then the angles, and the field that separates
-            scans, keep their values of the second frame.
+        sensor: the sensor.
+        frame: the frame type.
+        blocked: whether the rotor does not turn. Angles, and the field that separates scans, then
+            have the values of the second frame in all frames.
 
     Attributes:
-        interval: mean ns from one packet to the next; 0 if the spec has no times.
+        interval: mean time between packets, ns; 0 if the spec does not determine times.
 
     Raises:
         UsageError: if the sensor declares no `sweep`.
-        SpecError: if its ranges cannot be traced back to fields.
+        SpecError: if no fields that determine the ranges are found.
     """
 
     def __init__(self, sensor: Sensor, frame: str, *, blocked: bool = False) -> None:
@@ -821,12 +860,16 @@ class FrameSimulation:
         shake: float = 0.0,
         timeline: ClockTimeline | None = None,
     ) -> PacketBlock:
-        """Return the packets from number `start` on.
+        """Return `count` packets, the first with the number `start`.
 
         Args:
-            since: seconds since the scene began at the first of them.
-            shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
-            timeline: the faults of the sensor's clock; `since` then counts from power-on.
+            start: number of the first packet.
+            count: number of packets.
+            scene: the scene to measure.
+            since: time of the first packet, seconds since the scene began. With a timeline, this is
+                also the time since power-on.
+            shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
+            timeline: the faults of the sensor's clock; None for no faults.
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._sweep_values(numbers))
@@ -851,13 +894,13 @@ class FrameSimulation:
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
 
     def _with_points(self, table: CompiledTable) -> CompiledTable:
-        """Return the rows that have points: frames, or the parts in them."""
+        """Return the rows with points: the frames, or the parts in the frames."""
         if self._parts:
             return PartRows(table, self._parts)
         return table
 
     def _beams(self, table: CompiledTable) -> Beams:
-        """Return the beams of frames and of their parts."""
+        """Return the beams of the frames, or of the parts in the frames."""
         measured = self._with_points(table)
         beams = self._measurement.beams(measured)
         if not isinstance(measured, PartRows):
@@ -866,7 +909,7 @@ class FrameSimulation:
         return replace(beams, counts=counts.astype(np.intp))
 
     def _sweep_values(self, numbers: range) -> list[Mapping[str, Any]]:
-        """Return the values of packets before anything is measured."""
+        """Return the values of packets that are not measured."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
             return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
@@ -884,13 +927,14 @@ class FrameSimulation:
 
 
 class FramesWithoutPoints:
-    """Makes frames of the types without points: replies and periodic frames.
+    """Makes frames without points: replies and periodic frames.
 
-    Each has the defaults of the spec, the values of its `sweep`, and the readings of an IMU at
-    rest.
+    A frame has the defaults of the spec, the values of its `sweep`, and the measurements of an IMU
+    at rest.
 
     Args:
-        shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
+        sensor: the sensor.
+        shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
     """
 
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
@@ -904,7 +948,7 @@ class FramesWithoutPoints:
         self._batches = dict[str, tuple[int, list[bytes]]]()
 
     def use_timeline(self, timeline: ClockTimeline) -> None:
-        """Apply the faults of a clock to the periodic frames from now on."""
+        """Set the faults of the clock for all later periodic frames."""
         self._timeline = timeline
         self._batches.clear()
 
@@ -919,9 +963,9 @@ class FramesWithoutPoints:
         return self._get_maker(name).seal(self._fill(name, range(1), values))[0]
 
     def numbered(self, name: str, number: int) -> bytes:
-        """Return the frame of this number.
+        """Return frame number `number` of a type.
 
-        Frames are made in batches, since a batch takes hardly longer than one frame.
+        Frames are made in batches, because a batch takes hardly longer than a single frame.
         """
         start = number - number % UNASKED_BATCH
         if self._batches.get(name, (-1, []))[0] != start:
@@ -930,7 +974,7 @@ class FramesWithoutPoints:
         return self._batches[name][1][number - start]
 
     def iter_unasked(self) -> Iterator[bytes]:
-        """Yield the periodic frames other than data frames, in the order of their times."""
+        """Yield the periodic frames without points, in the order of their times."""
         rates = {
             name: frame.simulation.rate
             for name, frame in self._sensor.incoming.items()
@@ -967,13 +1011,16 @@ class FramesWithoutPoints:
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
-    """Yield the time in seconds, type and number of each periodic frame, endlessly."""
+    """Yield (time in seconds, type, number) of each periodic frame, without end."""
     return ((number / rate, name, number) for number in itertools.count())
 
 
 @functools.lru_cache(maxsize=64)
 def frame_simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
-    """Return the simulation of a data frame type; cached, as its analysis is slow."""
+    """Return the simulation of a data frame type.
+
+    The result is cached, because making it is slow.
+    """
     return FrameSimulation(sensor, frame, blocked=blocked)
 
 
@@ -985,21 +1032,22 @@ def simulate(
     scene: Scene | None = None,
     clock: ClockFaults | None = None,
 ) -> list[bytes]:
-    """Return the data frames that a sensor in a scene sends, in order.
+    """Return the data frames that a sensor sends in a scene, in order.
 
-    For a sensor without points, it returns its periodic frames (with a `rate`).
+    For a sensor without points, returns the frames that it sends periodically.
 
     Args:
+        sensor: the sensor.
         packets: number of frames.
-        start: the number of the first frame since the sensor was switched on.
-        scene: the surroundings, for example from `read_scene`; by default a room.
-        clock: the faults of the sensor's clock. If it follows a time scale, the sensor is switched
-            on at the start of 1970.
+        start: number of the first frame; frame 0 is sent when the sensor is switched on.
+        scene: the scene to measure, for example from `read_scene`; by default a room.
+        clock: the faults of the sensor's clock. If the clock follows a time scale, the sensor is
+            switched on at the start of 1970.
 
     Raises:
-        UsageError: if the sensor declares no `sweep`, or no `rate` if it has no points, or if its
-            clock cannot have the faults.
-        SpecError: if its ranges cannot be traced back to fields.
+        UsageError: if the sensor declares no `sweep`; or, without points, no `rate`. Also if its
+            frames cannot show the faults of the clock.
+        SpecError: if no fields that determine the ranges are found.
     """
     timeline = ClockTimeline(clock or ClockFaults())
     check_clock_faults(sensor, timeline.faults)
@@ -1009,7 +1057,9 @@ def simulate(
         unasked = makers.iter_unasked()
         frames = list(itertools.islice(unasked, start, start + packets))
         if not frames and packets:
-            raise UsageError(f"{sensor.id}: it sends no frames unasked: none declares a `rate`")
+            raise UsageError(
+                f"{sensor.id} sends no frames periodically, because no frame type declares a `rate`"
+            )
         return frames
     stream = frame_simulation(sensor, sensor.data_frame)
     since = start * stream.interval / 1e9
@@ -1017,7 +1067,7 @@ def simulate(
 
 
 def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
-    """Raise UsageError if the frames of a simulated sensor cannot show the faults of its clock."""
+    """Raise UsageError if a simulated sensor cannot show faults of its clock."""
     if not faults:
         return
     others = FramesWithoutPoints(sensor)
@@ -1027,7 +1077,9 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
     if sensor.has_points:
         frame_simulation(sensor, sensor.data_frame).clock.check(faults)
     elif not any(others.find_clock(name).has_clock for name in unasked):
-        raise UsageError(f"{sensor.id} sends no frames with a clock, so that it cannot have faults")
+        raise UsageError(
+            f"{sensor.id} sends no frames with a clock, so the clock cannot have faults"
+        )
     if not faults.unlocked:
         return
     clock = sensor.clock
@@ -1038,13 +1090,13 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
         others.find_clock(frame).check_status()
     else:
         raise UsageError(
-            f"{sensor.id} cannot lose its lock: its status is in {frame!r} frames, and the"
-            " simulated sensor does not send them by itself"
+            f"{sensor.id} cannot lose its lock, because its status is in {frame!r} frames, which"
+            " the simulated sensor does not send"
         )
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:
-    """Return the frame that has to precede the data frames; b"" if none is needed."""
+    """Return the frame that must precede the data frames; b"" if none must."""
     after = sensor.frames[sensor.data_frame].after
     if after is None:
         return b""

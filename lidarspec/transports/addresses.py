@@ -16,13 +16,13 @@ from urllib.parse import parse_qs
 from lidarspec.errors import UnknownOption, UsageError, suggest
 from lidarspec.transports.protocol import Origin
 
-#: Options of every live SOURCE: the address for commands (by default the address of the data), and
-#: the broadcast address.
+#: Options of every live SOURCE. "control" is the address for commands, by default the address of
+#: the data. "broadcast" is the broadcast address.
 _COMMON_OPTIONS = frozenset({"control", "broadcast"})
 _SWITCH_VALUES = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
-#: Host and port; an IPv6 host is in brackets.
+#: Matches a host and a port; an IPv6 host is in brackets.
 _HOST_AND_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?")
-#: Port used to find the route to a host; nothing is sent.
+#: Port for finding the route to a host; nothing is sent to it.
 _DISCARD_PORT = 9
 
 
@@ -47,8 +47,8 @@ class SourceAddress:
         """Return the parts of a live SOURCE.
 
         Args:
-            text: the SOURCE, "udp://:2368?src=10.0.0.5". If `scheme` is given, the text may be a
-                location with options.
+            text: the SOURCE, "udp://:2368?src=10.0.0.5". If `scheme` is given, the scheme may be
+                omitted.
             scheme: replaces the scheme of the text.
         """
         if "://" in text:
@@ -65,17 +65,18 @@ class SourceAddress:
             text, scheme, location, {name: repeated[-1] for name, repeated in values.items()}
         )
 
-    def check(self, known: Collection[str]) -> None:
+    def check(self, accepted: Collection[str]) -> None:
         """Check the names of the options.
 
         Args:
-            known: the options that the source accepts in addition to the options of every source.
+            accepted: the options that this source accepts, in addition to the options of every live
+                SOURCE.
 
         Raises:
             UnknownOption: for the first unknown option.
         """
-        for name in sorted(set(self.options) - set(known) - _COMMON_OPTIONS):
-            raise UnknownOption(name, [*known, *_COMMON_OPTIONS], place=self.text)
+        for name in sorted(set(self.options) - set(accepted) - _COMMON_OPTIONS):
+            raise UnknownOption(name, [*accepted, *_COMMON_OPTIONS], place=self.text)
 
     def number(self, name: str, low: int, high: int) -> int | None:
         """Return the value of an option as an integer; None if the option is not given.
@@ -121,7 +122,7 @@ class SourceAddress:
 
 
 def with_option(source: str | Path, name: str, value: object) -> str:
-    """Return a SOURCE with an option added, or replaced if it has the option already."""
+    """Return a SOURCE with an added option, which replaces one of the same name."""
     location, _, query = str(source).partition("?")
     options = [
         option for option in query.split("&") if option and not option.startswith(f"{name}=")
@@ -130,7 +131,7 @@ def with_option(source: str | Path, name: str, value: object) -> str:
 
 
 def parse_origin(text: str) -> Origin:
-    """Return the sender that the option `src=` names, with its numeric address.
+    """Return the sender that the value of `src=` names, with a numeric address.
 
     Raises:
         UsageError: for an invalid port or an unknown host.
@@ -140,11 +141,13 @@ def parse_origin(text: str) -> Origin:
 
 
 def resolve_host(host: str, place: str) -> str:
-    """Return the numeric address of a host; IPv4 if the host has IPv4 and IPv6.
+    """Return the numeric address of a host.
+
+    If the host has IPv4 and IPv6 addresses, returns an IPv4 address.
 
     Args:
         host: an address or a name.
-        place: the option or SOURCE that names it, for the message.
+        place: the option or SOURCE that contains the host, for the error message.
 
     Raises:
         UsageError: for an unknown host.
@@ -152,7 +155,7 @@ def resolve_host(host: str, place: str) -> str:
     for family in (socket.AF_INET, socket.AF_INET6):
         with contextlib.suppress(OSError, ValueError):
             return socket.inet_ntop(family, socket.inet_pton(family, host.partition("%")[0]))
-    # The system resolves an incomplete address, for example 192.168.1, to another address.
+    # The system accepts an incomplete address, such as 192.168.1, but resolves it to another one.
     is_incomplete_address = re.fullmatch(r"[\d.]*", host) is not None
     if not is_incomplete_address:
         for family in (socket.AF_INET, socket.AF_INET6):
@@ -165,7 +168,7 @@ def resolve_host(host: str, place: str) -> str:
 
 
 def find_own_address(host: str) -> str | None:
-    """Return this computer's address on the route to a host; None without a route."""
+    """Return the address of this computer on the route to a host; None if no route."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

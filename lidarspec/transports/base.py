@@ -1,4 +1,4 @@
-"""Functions of all live transports: reading a stream, waiting, system errors."""
+"""Functions that live transports share: reading a stream, waiting, system errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from lidarspec.spec.links import Link
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
-#: Pause after a read, in which bytes accumulate: without it, a fast line causes one read per byte.
+#: Pause after a read, in which bytes accumulate. Without it, each byte of a fast line would cause a
+#: read.
 READ_PAUSE_S = 0.002
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
@@ -26,10 +27,10 @@ _Selector = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class StreamTransport(LiveTransport):
-    """A byte stream that is read as it arrives, with a short pause after each read.
+    """Base class for byte streams; pauses for a short time after each read.
 
     Attributes:
-        gone: the exceptions that a disconnected line raises.
+        gone: the exceptions that reading raises if the line is disconnected.
     """
 
     gone: tuple[type[BaseException], ...] = (OSError, ValueError)
@@ -67,7 +68,11 @@ def sleep_until(end_s: float) -> None:
 
 
 def wait_readable(descriptor: int, timeout: float) -> bool:
-    """Wait until a descriptor has input or was hung up; return False on timeout."""
+    """Wait until a descriptor has input or is closed at the other end.
+
+    Returns:
+        False if the timeout has passed.
+    """
     return bool(wait_ready([descriptor], [], timeout)[0])
 
 
@@ -77,8 +82,8 @@ def wait_ready(
     """Wait until a descriptor is ready, at most `timeout` seconds.
 
     Returns:
-        The descriptors of `reading` that have input or were hung up, and the descriptors of
-        `writing` that have room.
+        The descriptors of `reading` that have input or are closed at the other end, and the
+        descriptors of `writing` that can be written to.
     """
     with _Selector() as selector:
         for descriptor in {*reading, *writing}:
@@ -95,7 +100,7 @@ def wait_ready(
 
 
 def source_error(text: str, command: str) -> SourceError:
-    """Return a SourceError with the next command to type."""
+    """Return a SourceError that suggests a command."""
     return suggest(SourceError(text), command)
 
 
@@ -105,7 +110,7 @@ def disconnected_error(label: str, error: BaseException | str) -> Disconnected:
 
 
 def system_reason(error: BaseException | str) -> str:
-    """Return the system's text for an error, without the words that pyserial adds."""
+    """Return the system's text for an error, without text that pyserial adds."""
     if isinstance(error, BaseException):
         numbers = error_numbers(error)
     else:
@@ -116,7 +121,7 @@ def system_reason(error: BaseException | str) -> str:
 
 
 def error_numbers(error: BaseException) -> list[int]:
-    """Return the system's error numbers among the arguments of an exception."""
+    """Return the system error numbers in the arguments of an exception."""
     return [number for number in error.args if isinstance(number, int)]
 
 

@@ -16,14 +16,17 @@ from lidarspec.transports.outlets import LOCALHOST, Outlet, OutletLine, PtyLine,
 def make_simulated_outlet(
     sensor: Sensor, destination: str, link: str | Path | None = None
 ) -> Outlet:
-    """Return the outlet of a simulated sensor, with lines for all links with commands.
+    """Return the outlet of a simulated sensor.
+
+    The outlet has a line for the data, and one for each further link over which the sensor receives
+    commands.
 
     Args:
         sensor: the sensor.
         destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
-            port. Without a UDP port, data frames go to the first port that the sensor declares, and
-            all other frames to the second port.
-        link: a symbolic link to the pseudo-terminal.
+            port. If the UDP port is omitted, data frames are sent to the first port that the sensor
+            declares, and all other frames to the second.
+        link: path of a symbolic link to the pseudo-terminal; None for no link.
 
     Raises:
         UsageError: if the destination is invalid, or cannot carry the sensor's frames.
@@ -38,8 +41,9 @@ def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> O
 
     Args:
         destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
-            port. Without a UDP port, each datagram goes to the port at which it was recorded.
-        datagrams: whether datagrams were recorded.
+            port. If the UDP port is omitted, each datagram is sent to the port to which it was sent
+            when it was recorded.
+        datagrams: whether the recording contains datagrams.
         port: the port for datagrams that were recorded without a port.
 
     Raises:
@@ -126,7 +130,7 @@ def _make_udp_data_line(sensor: Sensor, destination: str) -> UdpLine:
 
 
 def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
-    """Return a line on this computer for each link with commands except the data link."""
+    """Return a line for each link with commands, except the data link."""
     lines = {}
     for name in {command.link for command in sensor.commands.values()} - {"data"}:
         line = _make_control_line(sensor.links[name])
@@ -136,9 +140,9 @@ def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
 
 
 def _make_control_line(link: Link) -> OutletLine | None:
-    """Return a line at the declared port, or at any free port if that one is in use.
+    """Return a line at the declared port, or at a free port if that is in use.
 
-    None for a link type that only a plugin supports.
+    Returns None for a link type that only a plugin supports.
     """
     for port in (_declared_port(link), 0):
         with contextlib.suppress(OSError, SourceError):
@@ -167,7 +171,8 @@ def _declared_port(link: Link) -> int:
 def _parse_host_and_port(destination: str) -> tuple[str, int | None]:
     """Return host and port of a destination.
 
-    The default host is this computer. The port is None if omitted, and 0 for any free TCP port.
+    The default host is this computer. The port is None if it is omitted. TCP port 0 selects any
+    free port.
     """
     address = SourceAddress.parse(destination)
     address.check(())

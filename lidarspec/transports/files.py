@@ -2,8 +2,8 @@
 
 `open_file` detects the format of a file by its content: a recording, a capture, a robotics log (see
 `robotics_logs`), hexadecimal text or raw bytes. A file is read as fast as the caller requests
-chunks. Recordings and captures yield the original arrival times, and count the data that they skip.
-Raw bytes have no times.
+chunks. The chunks of recordings and captures have the recorded arrival times, and data that cannot
+be read is counted. Raw bytes have no times.
 """
 
 from __future__ import annotations
@@ -38,24 +38,25 @@ from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
 from lidarspec.transports.robotics_logs import BagTransport, find_log_kind
 
-#: Events that interrupt the stream: an incomplete frame does not continue after them.
+#: Events that interrupt the stream. An incomplete frame before such an event is discarded.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: Number of bytes that are read at once.
 BLOCK_BYTES = 1 << 18
 #: Suffixes of hexadecimal text.
 HEX_SUFFIXES = {".hex", ".txt"}
-#: Suffixes of files that are read as hexadecimal text only if their content is hexadecimal.
+#: Suffixes of files that are read as hexadecimal text if their content is hexadecimal.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
     """Reads the received data of a recording.
 
-    Sent commands and events are skipped. An event in `INTERRUPTIONS` sets `Chunk.gap`.
+    Sent data and events are skipped. After an event in `INTERRUPTIONS`, the next chunk has `gap`
+    set.
 
     Args:
         path: the file.
-        file: the open file; by default `path` is opened.
+        file: the open file; None to open `path`.
         sender: yield only datagrams from this "ADDRESS" or "ADDRESS:PORT"; None for all senders.
         salvage: whether to continue after damaged parts.
 
@@ -85,11 +86,10 @@ class RecordingTransport(Transport):
         self._has_skipped = False
 
     def known_sensor(self) -> Sensor:
-        """Return the recorded sensor, configured with the recorded options.
+        """Return the sensor of the recording, configured with the recorded options.
 
         Raises:
-            UsageError: if the recording names no sensor, or if the user has to give an option
-                again.
+            UsageError: if the recording names no sensor, or if an option must be passed again.
             UnknownSensor: if the sensor is not installed.
         """
         try:
@@ -141,7 +141,7 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _accepts(self, record: Record) -> bool:
-        """Return whether a record is from the requested sender; count other datagrams."""
+        """Return whether a record is from the requested sender; count it if not."""
         if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
@@ -150,7 +150,7 @@ class RecordingTransport(Transport):
     def _interrupts(self, record: Record) -> bool:
         """Return whether an event interrupts the stream.
 
-        Also counts disconnects and invalid events, and warns if the clock was set.
+        Also counts disconnections and invalid events, and adds a warning if the clock was set.
         """
         try:
             event = json.loads(record.data)
@@ -171,28 +171,25 @@ class RecordingTransport(Transport):
 
 
 def _describe_damage(recording: Recording) -> str:
-    """Return a warning with the damaged offset and the number of unread bytes."""
+    """Return a warning with the offset of the damage and the number of unread bytes."""
     lost = f"{recording.leftover} bytes were not read"
     if recording.salvage:
         return _describe_skipped(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
-        return f"{recording.path} is truncated in its last record: {lost}, all earlier bytes were"
-    mending = f"lidarspec record {quote(str(recording.path))} --salvage -o repaired.lsr"
-    return f"{recording.path} is corrupt at byte {recording.offset}: {lost}; next: {mending}"
+        return f"{recording.path} is truncated in its last record: {lost}"
+    repair = f"lidarspec record {quote(str(recording.path))} --salvage -o repaired.lsr"
+    return f"{recording.path} is corrupt at byte {recording.offset}: {lost}; next: {repair}"
 
 
-def _describe_skipped(path: str, places: int, size: int) -> str:
-    """Return a warning with the numbers of damaged places and of unread bytes."""
-    return (
-        f"{path} is corrupt in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
-        " all others were"
-    )
+def _describe_skipped(path: str, count: int, size: int) -> str:
+    """Return a warning with the numbers of damaged parts and of unread bytes."""
+    return f"{path} is corrupt in {count} place{'s' * (count > 1)}: {size} bytes were not read"
 
 
 def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
     """Return whether a compressed file was decompressed to its end.
 
-    If not, add a warning and the number of unread bytes to the transport.
+    If it was not, adds a warning, and the number of unread bytes, to the transport.
     """
     fault = find_damage(file)
     if fault is not None:
@@ -238,7 +235,7 @@ class FileTransport(Transport):
             self.file.close()
 
     def _warn(self, stats: CaptureStats) -> None:
-        """Add a warning for each kind of data that was not read from a capture."""
+        """Add a warning for each kind of data in a capture that was not read."""
         self.unread = stats.lost
         if stats.damaged:
             self.warnings.append(_describe_skipped(self._path, stats.damaged, stats.lost))
@@ -282,7 +279,10 @@ def _list_counts(counts: Counter[str]) -> str:
 
 
 class HexTransport(FileTransport):
-    """Reads hexadecimal text, with the times in it; lines without digits are skipped."""
+    """Reads the bytes, and times, of hexadecimal text.
+
+    Lines without digits are skipped.
+    """
 
     def chunks(self) -> Iterator[Chunk]:
         yield from hex_chunks(self._path, self.file.readline)
@@ -349,7 +349,7 @@ class CaptureTransport(FileTransport):
 
 
 class StreamCaptureTransport(CaptureTransport):
-    """Reads a capture of a byte stream, one chunk per packet."""
+    """Reads the capture of a byte stream; each packet is a chunk."""
 
     datagrams = False
     in_batches = StreamBatches
@@ -365,11 +365,11 @@ class StreamCaptureTransport(CaptureTransport):
 def open_file(
     path: str, *, sender: str | None = None, member: str = ""
 ) -> FileTransport | RecordingTransport | BagTransport:
-    """Open a file with the transport for its content.
+    """Open a file, and return the transport for its format.
 
     Args:
         path: a file, "-" for standard input, or the folder of a ROS 2 bag.
-        sender: yield only data from this address or topic; None for all.
+        sender: yield only data from this address or topic; None for all data.
         member: name of a file in a zip archive; "" if the archive has only one capture or
             recording.
 
@@ -391,7 +391,7 @@ def open_file(
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
                 f"{name} is {log.description}{' in a compressed file' * (file is not plain)},"
-                " which cannot be read this way: pass the file itself"
+                " which cannot be read this way: pass the path of the log itself"
             )
         refuse_container(name, start)
         if log is not None and is_remote(path):
@@ -410,7 +410,7 @@ def open_file(
 def _open_by_content(
     path: str, name: str, file: BinaryIO, start: bytes, sender: str | None
 ) -> FileTransport | RecordingTransport:
-    """Return the transport for a file that begins with the bytes `start`."""
+    """Return the transport for an open file that begins with the bytes `start`."""
     if start.startswith(MAGIC):
         return RecordingTransport(path, file, sender=sender)
     if is_stream_capture(start):

@@ -1,7 +1,7 @@
 """The clock of this computer for arrival times.
 
-`HostClock` reads the wall clock once and continues with a steady clock. The interval between two
-times is therefore right even if the wall clock is set in between.
+`HostClock` reads the wall clock once and then adds the time of a steady clock. The interval between
+two arrival times is therefore correct even if the wall clock is set in between.
 """
 
 from __future__ import annotations
@@ -9,32 +9,33 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-#: A wall clock that differs by more than this was set; smaller differences are adjustments.
+#: If the wall clock differs by more than this from the expected time, it was set. Smaller
+#: differences are gradual adjustments.
 _SET_CLOCK_NS = 50_000_000
-#: Number of attempts to read two clocks at one moment.
+#: Maximum number of attempts to read two clocks at the same moment.
 _READ_ATTEMPTS = 10
 #: If reading both clocks takes longer than this, they are read again.
 _MAX_READ_TIME_NS = _SET_CLOCK_NS // _READ_ATTEMPTS
-#: If two readings are further apart than this, the thread was suspended in between. A reading takes
+#: If the time between two readings is longer, the thread was suspended in between. A reading takes
 #: less than a thousandth of this time.
 _SUSPENDED_NS = 200_000
 _CLOCK_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 class HostClock:
-    """The wall clock at the start, continued by a steady clock.
+    """A clock that starts at the wall-clock time and never jumps.
 
-    Intervals between its times are right even if the wall clock is set or the computer is
+    Intervals between its times are correct even if the wall clock is set or the computer is
     suspended.
 
     Args:
-        wall: the wall clock, ns since 1970.
+        wall: returns the time of the wall clock, ns since 1970.
     """
 
     def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
         self._wall = wall
         self._offset_ns = 0
-        self._lead_ns = 0  # lead of the wall clock when `find_step` last reported a step
+        self._lead_ns = 0  # how far the wall clock was ahead when `find_step` last reported a step
         for _ in range(_READ_ATTEMPTS):
             self._offset_ns, read_time_ns = self._read_offset()
             if read_time_ns < _MAX_READ_TIME_NS:
@@ -45,9 +46,10 @@ class HostClock:
         return steady_ns() + self._offset_ns
 
     def now_and_wall(self) -> tuple[int, int]:
-        """Return this clock and the wall clock at one moment, ns since 1970.
+        """Return the times of this clock and of the wall clock, ns since 1970.
 
-        If the thread is suspended between the two readings, both are repeated.
+        Both are read at the same moment. If the thread is suspended between the readings, they are
+        repeated.
         """
         closest: tuple[int, int, int] | None = None
         for _ in range(_READ_ATTEMPTS):
@@ -62,9 +64,9 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return the lead of the wall clock in ns if it was set; None if it was not.
+        """Return how far the wall clock is ahead of this clock, ns, if it was set.
 
-        Each step of more than 50 ms is reported once.
+        Returns None if it was not set. Each step of more than 50 ms is reported once.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns
@@ -74,7 +76,7 @@ class HostClock:
         return lead_ns
 
     def _read_offset(self) -> tuple[int, int]:
-        """Return the wall clock minus the steady clock, and the duration of the reading."""
+        """Return wall clock minus steady clock, and the duration of the reading, ns."""
         before = steady_ns()
         wall = self._wall()
         return wall - before, steady_ns() - before

@@ -1,7 +1,8 @@
 """Send requests to the web server of a sensor.
 
-Messages are frames of `HttpRequest` (method, path, body) and `HttpReply` (status, body). The time
-of a request and the size of its reply are limited. Requests are sent one after another.
+A request is a frame of `HttpRequest` (method, path, body), and a reply is a frame of `HttpReply`
+(status, body). The duration of a request and the size of its reply are limited. A request is sent
+when the reply to the previous one has arrived.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 
 
 class HttpTransport(LiveTransport):
-    """Sends requests to a host, in the thread that calls `read`.
+    """Sends HTTP requests to a host, in the thread that calls `read`.
 
-    If a request fails, there is no reply, and `warnings` has the reason.
+    If a request fails, `read` returns no reply, and `warnings` has the reason.
 
     Args:
         host: name or address of the sensor.
-        link: the port, and the limits of time and size.
+        link: the declared link, with its port and its limits of time and size.
     """
 
     datagrams = True
@@ -56,7 +57,7 @@ class HttpTransport(LiveTransport):
             return []
         if location:
             self.warnings = [
-                f"{self.label}{path}: status {status}, moved to {location}, which is not followed"
+                f"{self.label}{path}: status {status}; the redirection to {location} was ignored"
             ]
         reply = HttpReply.build({"status": status, "size": len(body), "body": body})
         return [Chunk(reply, self._clock.now(), (self._host, self._link.port))]
@@ -72,7 +73,7 @@ class HttpTransport(LiveTransport):
         self._requests.put(data)
 
     def reopen(self) -> None:
-        """Do nothing: each request opens a connection."""
+        """Do nothing, because each request opens its own connection."""
 
     def peer(self) -> str | None:
         return self._host
@@ -81,7 +82,7 @@ class HttpTransport(LiveTransport):
         self.closed = True
 
     def _send_request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
-        """Return the status and the body of the reply, and the target of a redirection.
+        """Return the status, the body and the target of a redirection of the reply.
 
         Raises:
             OSError, HTTPException: if the connection fails.
@@ -92,8 +93,8 @@ class HttpTransport(LiveTransport):
         )
         with contextlib.closing(connection):
             connection.connect()
-            # The timeout of the connection restarts with every byte, so it does not limit the
-            # duration of the whole request.
+            # The timeout of the connection applies to each read, so it does not limit the duration
+            # of the whole request.
             limit = threading.Timer(self._link.timeout, _hang_up, [connection.sock])
             limit.daemon = True
             limit.start()

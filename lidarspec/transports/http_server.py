@@ -1,8 +1,8 @@
-"""Serve HTTP in the place of a sensor.
+"""Serve HTTP requests to a simulated sensor.
 
-The standard library's server parses each request in a separate thread. The thread passes the
-request on as a frame of `HttpRequest`, and waits until the simulated sensor sends a frame of
-`HttpReply`. If no reply arrives in time, the status is 504.
+The server of the standard library parses each request in a separate thread. The thread passes the
+request to the simulated sensor as a frame of `HttpRequest`, and waits until the sensor sends a
+frame of `HttpReply`. If no reply arrives in time, the status is 504.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lidarspec.transports.protocol import Chunk
 
 _MAX_BODY_BYTES = 1 << 20
 _REPLY_TIMEOUT_S = 2.0
-#: Interval at which requests are fetched from the threads.
+#: Maximum time until a request is passed from its thread to the simulated sensor.
 _REQUEST_POLL_S = 0.01
 _SHUTDOWN_POLL_S = 0.05
 
@@ -43,7 +43,7 @@ class HttpLine(OutletLine):
     def __init__(self, host: str, port: int) -> None:
         self._lock = threading.Lock()
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        # One for each unanswered request, in order. Requests that timed out are removed.
+        # One queue for each request without a reply, in order. Requests that timed out are removed.
         self._reply_queues: deque[_ReplyQueue] = deque()
         self._server = ThreadingHTTPServer((host, port), partial(_Handler, self))
         self._server.daemon_threads = True
@@ -77,7 +77,7 @@ class HttpLine(OutletLine):
         self._server.server_close()
 
     def handle_request(self, request: bytes) -> bytes | None:
-        """Return the simulated sensor's reply to a request; None if it is not in time."""
+        """Return the reply of the simulated sensor to a request; None if it is too late."""
         reply = _ReplyQueue()
         with self._lock:
             self._reply_queues.append(reply)
@@ -128,4 +128,4 @@ class _Handler(BaseHTTPRequestHandler):
         return self.rfile.read(int(size))
 
     def log_message(self, format: str, *args: object) -> None:
-        """Print nothing: the simulator prints the commands that it recognizes."""
+        """Print nothing, because the simulator prints the commands that it recognizes."""

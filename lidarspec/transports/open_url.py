@@ -23,12 +23,13 @@ from lidarspec.transports.base import source_error
 from lidarspec.transports.files import open_file
 from lidarspec.transports.protocol import LiveTransport, Transport
 
-#: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
+#: scheme -> module of lidarspec.transports. Its function `connect(address, sensor)` opens the
+#: transport.
 SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
-#: options of a file, after "?": the sender, and the file in an archive.
+#: options of a file, after "?": the sender of datagrams, and the name of a file in an archive.
 FILE_OPTIONS = {"src", "file"}
 _SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
-#: names of serial ports: COM4 on Windows, and all names on POSIX systems.
+#: matches the name of a serial port, on Windows or on POSIX systems.
 _PORT_NAME = re.compile(
     r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE
 )
@@ -41,7 +42,7 @@ def open_transport(source: str | Path, sensor: Sensor | None = None) -> Transpor
 
     Args:
         source: a file, "-", a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: supplies defaults: baud rate, control lines, ports.
+        sensor: gives the defaults of baud rate, control lines and ports; None for no defaults.
 
     Raises:
         UsageError: for an unknown scheme, or an option that this kind of source does not accept.
@@ -70,7 +71,7 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
 
     Args:
         source: a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: supplies defaults: baud rate, control lines, ports.
+        sensor: gives the defaults of baud rate, control lines and ports; None for no defaults.
 
     Raises:
         UsageError: for a file, an unknown scheme, or an option that this kind of source does not
@@ -85,7 +86,7 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
 
 
 def resolve(source: str | Path) -> str:
-    """Return the SOURCE of a device in `lidarspec.toml`; return other text unchanged."""
+    """Return the SOURCE of a device in `lidarspec.toml`; any other text unchanged."""
     device = find_device(source)
     if device is None:
         return str(source)
@@ -93,7 +94,7 @@ def resolve(source: str | Path) -> str:
 
 
 def is_live(source: str | Path) -> bool:
-    """Return whether a SOURCE, or the device with this name, is not a file."""
+    """Return whether a SOURCE, or a device of `lidarspec.toml`, is not a file."""
     return live_address(resolve(source)) is not None
 
 
@@ -125,10 +126,10 @@ def has_control(source: str | Path) -> bool:
 
 
 def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
-    """Open the transport of a link that carries commands but no data.
+    """Open the transport of a link that is used for commands but not for data.
 
     Args:
-        source: the SOURCE of the data; its ``control=HOST[:PORT]`` has priority over `host`.
+        source: the SOURCE of the data. Its option ``control=HOST[:PORT]`` has priority over `host`.
         name: the name of the link.
         link: the link, as declared by the sensor.
         host: the sensor's address; None if it is unknown.
@@ -192,16 +193,19 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
 
 def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
-    """Open a SOURCE that has a scheme; a plugin opens unknown schemes."""
+    """Open a SOURCE with a scheme.
+
+    Schemes that are not built in are opened by plugins.
+    """
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)
         return opened
     plugged = registry().call("lidarspec_source", url=address.text, sensor=sensor)
     if plugged is None:
-        known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
+        schemes = ", ".join(f"{scheme}:" for scheme in SCHEMES)
         raise UsageError(
-            f"unknown scheme {address.scheme!r}: expected a file, - (standard input), {known}"
+            f"unknown scheme {address.scheme!r}: expected a file, - (standard input), {schemes}"
         )
     if not isinstance(plugged, Transport):
         raise SpecError(

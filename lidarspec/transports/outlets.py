@@ -1,12 +1,12 @@
 """Send bytes like a sensor, over pseudo-terminals, UDP, TCP and HTTP.
 
-Simulated sensors and replays use the same mechanism. An `OutletLine` is the sensor's end of one
-link: it sends without waiting and returns the commands that have arrived. An `Outlet` holds the
-line of the data and the lines of the sensor's other links, and waits for all of them in one loop.
+Simulated sensors and replays use outlets. An `OutletLine` is the sensor's end of one link. It sends
+bytes without waiting, and returns the commands that have arrived. An `Outlet` contains the line of
+the data link and the lines of the sensor's other links, and waits for all of them together.
 
-Like a real sensor, an outlet also sends without a listener, and counts the bytes that were not
-read. With `patient=True` it waits for a slow reader instead. Replays need this because all bytes
-have to arrive, and simulated sensors need it if they run as fast as they are read.
+Like a real sensor, an outlet also sends if no program listens, and counts the bytes that were not
+read. With `patient=True`, it waits for a slow reader instead of dropping bytes. This is used by
+replays, in which all bytes must arrive, and by simulated sensors that run as fast as they are read.
 """
 
 from __future__ import annotations
@@ -31,29 +31,31 @@ try:
     import fcntl
     import termios
     import tty
-except ImportError:  # not a POSIX system; `has_terminals` checks this
+except ImportError:  # not a POSIX system; `has_terminals` then returns False
     termios = None  # type: ignore[assignment]
 
 LOCALHOST = "127.0.0.1"
 _LOOPBACK_BROADCAST = "127.255.255.255"
 _READ_BYTES = 1 << 16
-#: Maximum number of bytes that wait for a slow reader; further bytes are dropped.
+#: Maximum number of bytes that wait for a slow reader of a TCP connection; further bytes are
+#: dropped. The next constant is the maximum for a pseudo-terminal.
 _MAX_CONNECTION_BACKLOG_BYTES = 1 << 20
 _MAX_PTY_BACKLOG_BYTES = 1 << 18
 _SEND_BUFFER_BYTES = 1 << 20
-#: Number of attempts to send a datagram if the buffer is full or the receiver refuses it.
+#: Number of attempts to send a datagram if the buffer is full or an ICMP error has arrived.
 _SEND_ATTEMPTS = 2
-#: A replay begins when a reader has had the port open for this time: many readers drop bytes that
-#: arrive while they open a port.
+#: A replay begins when a reader has had the port open for this time, because many readers drop
+#: bytes that arrive while they open a port.
 _READER_SETTLE_S = 0.25
 _LISTENER_POLL_S = 0.02
-#: Interval at which a pseudo-terminal without a reader is checked.
+#: Time between two checks whether a program has opened a pseudo-terminal.
 _ABSENT_READER_POLL_S = 0.005
-#: Time limit for readers to fetch the last bytes.
+#: Maximum time to wait until readers have read the last bytes.
 FETCH_TIMEOUT_S = 5.0
-#: After this number of checks without waiting bytes, a pseudo-terminal has been read completely.
+#: Number of consecutive checks without unread bytes after which a pseudo-terminal is considered
+#: read.
 _EMPTY_CHECKS = 3
-#: Port for the lookup of a host's address; nothing is sent to it.
+#: Port for looking up the address of a host; nothing is sent to it.
 _DISCARD_PORT = 9
 
 
@@ -61,7 +63,7 @@ class OutletLine:
     """The sensor's end of one link.
 
     Attributes:
-        local_source: the SOURCE string with which a program on this computer opens the link.
+        local_source: the SOURCE with which a program on this computer opens the link.
         port: the port that the line listens on; 0 if it does not listen.
         has_listener: whether a program listens; True if this is unknown.
         unsent_bytes: number of bytes that were not read in time.
@@ -79,21 +81,21 @@ class OutletLine:
 
     @property
     def max_wait_s(self) -> float:
-        """The longest time between two calls of `receive`, in seconds."""
+        """The maximum time between two calls of `receive`, in seconds."""
         return math.inf
 
     def readable(self) -> Collection[int | socket.socket]:
-        """Return the descriptors from which input may arrive."""
+        """Return the descriptors on which input can arrive."""
         return ()
 
     def writable(self) -> Collection[int | socket.socket]:
-        """Return the descriptors to which bytes wait to be written."""
+        """Return the descriptors that have bytes waiting to be written."""
         return ()
 
     def receive(self) -> list[bytes]:
-        """Return the commands that have arrived, without blocking.
+        """Return the commands that have arrived, without waiting.
 
-        This also writes waiting bytes, and accepts and closes connections.
+        Also writes waiting bytes, and accepts and closes connections.
         """
         return []
 
@@ -101,7 +103,7 @@ class OutletLine:
         """Send chunks in order.
 
         Args:
-            patient: whether to wait until there is room, instead of dropping bytes.
+            patient: whether to wait for a slow reader, instead of dropping bytes.
 
         Raises:
             SourceError: if nothing can be sent.
@@ -118,9 +120,9 @@ class OutletLine:
         """
 
     def await_listener(self) -> None:
-        """Wait for a new listener, so that it receives everything from the beginning.
+        """Wait for a new listener, so that it receives all bytes from the beginning.
 
-        Returns at once if listeners are unknown, as over UDP.
+        For links without connections, such as UDP, this returns at once.
         """
 
     def unplug(self) -> None:
@@ -138,11 +140,11 @@ class OutletLine:
 
 
 class _SendBuffer:
-    """Bytes that wait until a slow reader has room for them.
+    """Bytes that wait for a slow reader.
 
     Args:
-        write: writes without blocking, and returns the number of bytes written.
-        max_bytes: limit for `has_room`.
+        write: writes without waiting, and returns the number of bytes that were written.
+        max_bytes: maximum number of waiting bytes, for `has_room`.
     """
 
     def __init__(self, write: Callable[[bytearray], int], max_bytes: int) -> None:
@@ -163,7 +165,7 @@ class _SendBuffer:
         self._waiting.clear()
 
     def flush(self) -> None:
-        """Write as many bytes as the reader has room for.
+        """Write as many bytes as possible without waiting.
 
         Raises:
             OSError: if the reader has disconnected.
@@ -174,14 +176,15 @@ class _SendBuffer:
 
 
 class UdpLine(OutletLine):
-    """UDP datagrams to one host, or to the sender of the last command.
+    """Sends UDP datagrams to a host, or to the sender of the last command.
 
-    It is made by `UdpLine.to` or `UdpLine.replying`.
+    `UdpLine.to` and `UdpLine.replying` make a line.
 
     Attributes:
-        takes_commands: whether commands are sent to this line. Then the data goes to the sender of
+        takes_commands: whether the line receives commands. If so, the data is sent to the sender of
             the last command.
-        waits_for_address: whether a command names the port; before it, datagrams are lost.
+        waits_for_address: whether the destination port is unknown until a command contains it.
+            Datagrams before this command are lost.
     """
 
     takes_commands = False
@@ -203,8 +206,8 @@ class UdpLine(OutletLine):
         self._default_port = default_port
         self._last_sender: Sender | None = None
         self._is_redirected = False
-        for one in sockets:
-            one.setblocking(False)
+        for opened in sockets:
+            opened.setblocking(False)
 
     @classmethod
     def to(
@@ -219,9 +222,9 @@ class UdpLine(OutletLine):
 
         Args:
             host: name or address.
-            ports: if this is a single port, all datagrams go to it; otherwise each datagram goes to
-                the port of its `receiver`.
-            default_port: the port for datagrams without a receiver; 0 for none.
+            ports: the destination ports. If there is one port, all datagrams are sent to it.
+                Otherwise, each datagram is sent to the port of its `receiver`.
+            default_port: the destination port of datagrams without a receiver; 0 for none.
             takes_commands: whether commands are sent to this line.
 
         Raises:
@@ -257,7 +260,7 @@ class UdpLine(OutletLine):
     def replying(cls, host: str, port: int) -> UdpLine:
         """Return a line that replies to the sender of the last command.
 
-        It also receives broadcasts within this computer.
+        The line also receives broadcasts that are sent on this computer.
 
         Args:
             host: the address to listen on.
@@ -279,7 +282,7 @@ class UdpLine(OutletLine):
     def source(self) -> str:
         """The SOURCE for the destination computer.
 
-        It names no host, because the datagrams may arrive at any interface of that computer.
+        It contains no host, because datagrams may arrive at any interface of that computer.
         """
         if not self._host or self._host == LOCALHOST:
             return self.local_source
@@ -290,10 +293,10 @@ class UdpLine(OutletLine):
 
     def receive(self) -> list[bytes]:
         commands = []
-        for one in self._sockets:
-            # An earlier datagram to a closed port also raises an error here.
+        for opened in self._sockets:
+            # An error can be the reply to an earlier datagram that was sent to a closed port.
             with contextlib.suppress(OSError):
-                data, sender = one.recvfrom(_READ_BYTES)
+                data, sender = opened.recvfrom(_READ_BYTES)
                 if not self._host:
                     self._last_sender = sender
                     commands.append(data)
@@ -315,8 +318,8 @@ class UdpLine(OutletLine):
         self._is_redirected = True
 
     def close(self) -> None:
-        for one in self._sockets:
-            one.close()
+        for opened in self._sockets:
+            opened.close()
 
     def _listen_for_commands(self) -> None:
         """Choose a port, and add it to the SOURCE if the listener is on this computer."""
@@ -336,12 +339,12 @@ class UdpLine(OutletLine):
         if not port and self.waits_for_address:
             return None
         if not port:
-            text = "the recording has no port for the datagrams: specify one, as in"
+            text = "the recording does not contain the destination port: specify one, as in"
             raise UsageError(f"{self.local_source}: {text} udp://{self._host}:2368")
         return self._host, port
 
     def _send(self, data: bytes, receiver: Sender, *, patient: bool) -> bool:
-        """Send a datagram, and return whether that succeeded."""
+        """Send a datagram, and return whether it was sent."""
         attempts = itertools.count() if patient else range(_SEND_ATTEMPTS)
         for _ in attempts:
             try:
@@ -374,7 +377,9 @@ class UdpLine(OutletLine):
 
 
 class TcpLine(OutletLine):
-    """TCP connections to one address; new ones receive only bytes sent from then on.
+    """Sends to all TCP connections at an address.
+
+    A new connection receives only the bytes that are sent after it was opened.
 
     Args:
         host: the address to listen on.
@@ -449,10 +454,11 @@ class TcpLine(OutletLine):
         self._listener = listen(self._host, self.port)
 
     def finish(self) -> None:
-        """Disconnect all clients after the last bytes have been delivered.
+        """Disconnect all clients after they have received the last bytes.
 
-        Closing a socket with unread input would discard bytes that have not been delivered yet, so
-        input is read and ignored until the client closes the connection or the time is over.
+        Closing a socket with unread input would discard bytes that were not yet received. Input is
+        therefore read and ignored until the client closes the connection, or `FETCH_TIMEOUT_S` has
+        passed.
         """
         limit = time.monotonic() + FETCH_TIMEOUT_S
         for client in list(self._clients):
@@ -503,16 +509,16 @@ class TcpLine(OutletLine):
 class PtyLine(OutletLine):
     """A pseudo-terminal that programs open by its path, POSIX only.
 
-    If no program has it open, sent bytes are lost, as on a serial cable.
+    If no program has opened it, sent bytes are lost, as on a serial cable.
 
     Args:
-        link: a symbolic link to the terminal, created and removed with the terminal.
+        link: path of a symbolic link to the terminal. It is created and removed with the terminal.
 
     Attributes:
         path: the path of the terminal; it changes with each `plug`.
 
     Raises:
-        SourceError: if there is no free terminal, or the link cannot be made.
+        SourceError: if no terminal is available, or the link cannot be created.
     """
 
     def __init__(self, link: str | Path | None = None) -> None:
@@ -524,7 +530,10 @@ class PtyLine(OutletLine):
 
     @property
     def max_wait_s(self) -> float:
-        """The interval of checks for a reader: opening the terminal causes no event."""
+        """The maximum time between two checks for a reader, in seconds.
+
+        The checks are necessary because opening the terminal causes no event.
+        """
         if self._master >= 0 and not self.has_listener:
             return _ABSENT_READER_POLL_S
         return math.inf
@@ -540,7 +549,7 @@ class PtyLine(OutletLine):
         return []
 
     def plug(self) -> None:
-        """Make a terminal in raw mode that no program has open."""
+        """Create a terminal in raw mode."""
         if not has_terminals():
             raise _missing_terminal_error("this system has no pseudo-terminals")
         try:
@@ -601,7 +610,7 @@ class PtyLine(OutletLine):
             self._flush()
 
     def await_listener(self) -> None:
-        """Wait until a reader has had the terminal open for a moment."""
+        """Wait until a reader has had the terminal open for `_READER_SETTLE_S`."""
         since = time.monotonic()
         while time.monotonic() - since < _READER_SETTLE_S:
             wait_for([self], _LISTENER_POLL_S)
@@ -610,7 +619,7 @@ class PtyLine(OutletLine):
                 since = time.monotonic()
 
     def finish(self) -> None:
-        """Wait until all bytes are read, because closing the terminal discards the rest."""
+        """Wait until all bytes are read, because closing discards unread bytes."""
         limit = time.monotonic() + FETCH_TIMEOUT_S
         empty_checks = 0
         while empty_checks < _EMPTY_CHECKS and time.monotonic() < limit and not self._is_alone():
@@ -620,7 +629,7 @@ class PtyLine(OutletLine):
             time.sleep(_LISTENER_POLL_S)
 
     def _is_alone(self) -> bool:
-        """Return whether no program has the terminal open."""
+        """Return whether no other program has opened the terminal."""
         poller = select.poll()
         poller.register(self._master, select.POLLIN)
         return any(event & select.POLLHUP for _, event in poller.poll(0))
@@ -635,7 +644,7 @@ class PtyLine(OutletLine):
             self._handle_hangup()
 
     def _handle_hangup(self) -> None:
-        """Discard the waiting bytes, which the next reader must not receive."""
+        """Discard the waiting bytes, so that the next reader does not receive them."""
         self.unsent_bytes += len(self._backlog)
         self._backlog.clear()
         if not self.has_listener:
@@ -673,8 +682,7 @@ class Outlet:
 
     Args:
         data: the line of the data link.
-        controls: the lines of the other links by name, over which the sensor receives commands and
-            sends replies.
+        controls: name of each other link for commands and replies -> its line.
     """
 
     def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
@@ -684,7 +692,7 @@ class Outlet:
 
     @property
     def local_source(self) -> str:
-        """The SOURCE string with which a program on this computer opens the data link."""
+        """The SOURCE with which a program on this computer opens the data link."""
         return self.data.local_source
 
     @property
@@ -708,7 +716,7 @@ class Outlet:
         return self.data.unsent_bytes
 
     def receive(self, wait: float) -> list[tuple[str, bytes]]:
-        """Wait for commands on all links; return the link and the bytes of each.
+        """Wait for commands on all links, and return (name of the link, bytes) of each.
 
         Args:
             wait: maximum time, in seconds.
@@ -721,13 +729,13 @@ class Outlet:
         self._lines[link].send(chunks, patient=patient)
 
     def deliver(self, chunk: Chunk) -> None:
-        """Send a chunk over the data link, and wait until the listener has room for it.
+        """Send a chunk over the data link; wait for a slow listener.
 
         Commands from the listener are ignored.
 
         Raises:
             Disconnected: if the listener has disconnected.
-            SourceError, UsageError: the same as `OutletLine.send`.
+            SourceError, UsageError: if `OutletLine.send` raises them.
         """
         self.data.receive()
         if self.data.has_listener:
@@ -760,7 +768,7 @@ class Outlet:
 
 
 def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
-    """Wait until a line has input, or has room for waiting bytes.
+    """Wait until a line has input, or can send waiting bytes.
 
     Args:
         lines: the lines.
@@ -815,7 +823,7 @@ def _bind_udp(host: str, port: int) -> socket.socket:
 
 
 def _format_ports(ports: Sequence[int]) -> str:
-    """Return the ports in the form that follows the host in a SOURCE."""
+    """Return ports as text that follows the host in a SOURCE."""
     if not ports:
         return ""
     if len(ports) == 1:

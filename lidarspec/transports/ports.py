@@ -1,4 +1,4 @@
-"""List the serial and UDP ports of this computer, their permissions and their users."""
+"""List the ports of this computer, their permissions, and the programs that use them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ except ImportError:  # no POSIX
     grp = None  # type: ignore[assignment]
 
 _PROCESSES = Path("/proc")
-#: files with the tables of UDP sockets (Linux).
+#: files of Linux with the tables of open UDP sockets.
 _UDP_TABLES = ("/proc/net/udp", "/proc/net/udp6")
 
 
@@ -25,11 +25,11 @@ class SerialPort:
     """A serial port.
 
     Attributes:
-        path: "/dev/ttyUSB0" or "COM4".
+        path: the name of the port, such as "/dev/ttyUSB0" or "COM4".
         description: the system's description of the device.
-        lasting: a name that does not depend on the USB socket; "" if there is none.
-        allowed: whether this user may open the port.
-        users: the programs that have the port open, if the system shows them.
+        lasting: a name of the port that does not depend on the USB socket; "" if it has none.
+        allowed: whether the current user may open the port.
+        users: the programs that have opened the port, as far as the system shows them.
     """
 
     path: str
@@ -41,7 +41,7 @@ class SerialPort:
 
 @dataclass(frozen=True)
 class PortUser:
-    """A program that has a port open."""
+    """A program that has opened a port."""
 
     pid: int
     name: str
@@ -76,7 +76,7 @@ def list_serial_ports() -> list[SerialPort]:
 
 
 def find_lasting_path(port: str) -> str:
-    """Return the name of a port under /dev/serial/by-id; "" if it has none there."""
+    """Return the name of a port in /dev/serial/by-id; "" if it has none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
     return next(
         (str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), ""
@@ -84,13 +84,13 @@ def find_lasting_path(port: str) -> str:
 
 
 def is_allowed(port: str) -> bool:
-    """Return whether this user may open a port; True if it is not a file."""
+    """Return whether the user may open a port; True if the port is not a file."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def find_group(port: str) -> str:
-    """Return the group that may open a port; "" if unknown, or only root may open it."""
+    """Return the group that may open a port; "" if unknown or if only root may."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:
@@ -99,9 +99,9 @@ def find_group(port: str) -> str:
 
 
 def find_users(port: str) -> tuple[PortUser, ...]:
-    """Return the other programs that have a serial port open.
+    """Return the other programs that have opened a serial port.
 
-    Without root permissions, only programs of this user are visible.
+    Without root permissions, only programs of the same user are visible.
     """
     path = os.path.realpath(port)
     if os.path.exists(path):
@@ -112,7 +112,7 @@ def find_users(port: str) -> tuple[PortUser, ...]:
 
 
 def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
-    """Return the other programs that have a UDP port open; None if the port is free.
+    """Return the other programs that have opened a UDP port; None if the port is free.
 
     Returns:
         An empty tuple if the port is in use by a program of another user, which is not visible.
@@ -130,7 +130,7 @@ def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
 
 
 def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
-    """Yield the other programs that have a file open for which `wanted` returns True."""
+    """Yield the other programs that have opened a file that `wanted` accepts."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue
@@ -142,17 +142,17 @@ def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
 
 
 def _read_links(folder: Path) -> Iterator[str]:
-    """Yield the targets of a process's open files."""
+    """Yield the paths of the open files of a process, given its folder in /proc."""
     for name in os.listdir(folder):
         with contextlib.suppress(OSError):
             yield os.readlink(folder / name)
 
 
 def received_per_interface() -> dict[str, int]:
-    """Return the number of packets received so far by each network interface.
+    """Return the number of packets that each network interface has received.
 
     Returns:
-        Interface -> number; empty if the system does not report it.
+        Name of the interface -> number; empty if the system does not report it.
     """
     received = {}
     with contextlib.suppress(OSError, ValueError, IndexError):
@@ -163,9 +163,9 @@ def received_per_interface() -> dict[str, int]:
 
 
 def filters_senders(interface: str) -> bool:
-    """Return whether an interface drops packets from senders without a route back.
+    """Return whether an interface drops packets of senders in other networks.
 
-    This is the setting rp_filter = 1 (strict) of Linux.
+    This is the case for the setting rp_filter = 1 (strict) of Linux.
     """
     with contextlib.suppress(OSError):
         values = [

@@ -1,7 +1,7 @@
 """Base classes for transports and file formats, which plugins can add.
 
-A `Transport` does all input and output: it yields `Chunk`s and sends bytes. A `LiveTransport` does
-not end by itself. Derived classes override the attributes that differ from the defaults here.
+A `Transport` yields `Chunk`s and sends bytes. A `LiveTransport`, such as a port, does not end by
+itself. Derived classes override the attributes that differ from the defaults.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
-#: time between two checks for a request to stop.
+#: maximum time of a wait, after which a loop checks whether it must stop.
 POLL_S = 0.05
-#: address and port of a sender of datagrams.
+#: (address, port) of a sender of datagrams.
 Sender = tuple[str, int]
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The sender that the user requests: an address with or without a port.
+    """A requested sender: an address with or without a port.
 
-    ``sender in origin`` is True for every matching `Sender`.
+    ``sender in origin`` is True if a `Sender` matches.
     """
 
     host: str
@@ -36,7 +36,7 @@ class Origin:
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """Return the origin for ADDRESS or ADDRESS:PORT.
+        """Return the origin for a text ADDRESS or ADDRESS:PORT.
 
         Examples are "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368".
 
@@ -60,30 +60,30 @@ class Origin:
 
 
 def endpoint(sender: Sender) -> str:
-    """Return a sender in the form of `src=`: "192.168.1.201:2368", "[fe80::1]:2368"."""
+    """Return a sender as text: "192.168.1.201:2368" or "[fe80::1]:2368"."""
     if ":" in sender[0]:
         return f"[{sender[0]}]:{sender[1]}"
     return f"{sender[0]}:{sender[1]}"
 
 
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
-    """Return a name for each sender: its address, with the port if that is ambiguous.
+    """Return a name for each sender: its address, or ADDRESS:PORT if necessary.
 
-    An address is ambiguous if several of its ports send to the same port. The name of an unknown
-    sender is "".
+    The port is necessary if several ports of the address send to the same receiving port. The name
+    of an unknown sender is "".
 
     Args:
-        ends: the sender and the receiver of each datagram.
+        ends: (sender, receiver) of each datagram.
     """
-    known = dict.fromkeys(ends)
+    pairs = dict.fromkeys(ends)
     ports = defaultdict[tuple[str, int | None], set[int]](set)
-    for sender, receiver in known:
+    for sender, receiver in pairs:
         if sender is not None:
             ports[sender[0], receiver and receiver[1]].add(sender[1])
     shared = {host for (host, _), sending in ports.items() if len(sending) > 1}
     return {
         sender: "" if sender is None else endpoint(sender) if sender[0] in shared else sender[0]
-        for sender, _ in known
+        for sender, _ in pairs
     }
 
 
@@ -93,12 +93,14 @@ class Format:
 
     Args:
         suffix: the suffix including the dot, ".csv".
-        description: a few words for lists.
-        write: writes scans to a path; with `every_point`, also points without a return.
-        holds: the optional features of the format. "organized": points in rows and columns; `write`
-            is called with `organized=True` and a single scan. "scans": scans are stored separately,
-            and always organized. "beams": planar scans as ROS messages. "frame-id": the frame_id of
-            ROS messages. "packets": raw packets, which `write` gets as `packets=`.
+        description: a short description for lists.
+        write: writes scans to a path. With `every_point`, it also writes points without a return.
+        holds: the names of optional features that the format supports:
+            "organized": points in rows and columns. `write` takes `organized=True` and one scan.
+            "scans": each scan is stored separately, and organized if its points are.
+            "beams": planar scans are also written as LaserScan messages.
+            "frame-id": messages contain a frame_id.
+            "packets": raw packets, which `write` takes as `packets=`.
     """
 
     suffix: str
@@ -120,9 +122,8 @@ class Chunk:
         at: arrival time, ns since 1970; None if unknown.
         sender: (address, port) of the sender of a datagram; None for a stream, or if unknown.
         receiver: (address, port) to which a datagram was sent; None for a stream, or if unknown.
-        gap: whether data is missing before this chunk, so that an incomplete frame does not
-            continue in it.
-        quiet: whether the line was silent before this chunk, so that an incomplete frame was
+        gap: whether data is missing before this chunk. An incomplete frame before it is discarded.
+        quiet: whether the line was silent before this chunk. An incomplete frame before it is
             discarded.
     """
 
@@ -160,12 +161,13 @@ class Transport(ABC):
         datagrams: whether each chunk is one datagram.
         baud: the baud rate of a serial line; None for all other sources.
         warnings: the warnings so far, for example about a damaged file or a small receive buffer.
-        foreign: number of datagrams so far from senders other than the requested sender.
-        kernel_drops: number of datagrams so far that the system dropped because they were not read
-            in time.
-        disconnects: number of interruptions so far that a recording reports.
-        unread: number of bytes so far that could not be read from a damaged file.
-        stored: the open file before decompression; None if the source is not a file.
+        foreign: number of datagrams from senders other than the requested sender.
+        kernel_drops: number of datagrams that the system dropped because they were not read in
+            time.
+        disconnects: number of interruptions that a recording reports.
+        unread: number of bytes that could not be read from a damaged file.
+        stored: the open file as it is stored, before decompression; None if the source is not a
+            file.
     """
 
     datagrams: bool = False
@@ -187,9 +189,9 @@ class Transport(ABC):
 
     @property
     def progress(self) -> tuple[int, int] | None:
-        """The number of bytes read from a file, and its size; None if unknown.
+        """(number of bytes read, size) of a file; None if unknown.
 
-        For a compressed file, both count compressed bytes.
+        Both are numbers of compressed bytes if the file is compressed.
         """
         stored: Any = self.stored
         if stored is None or not stored.seekable():
@@ -200,7 +202,7 @@ class Transport(ABC):
         return stored.tell(), size
 
     def skip_until(self, time_ns: int) -> bool:
-        """Skip everything that arrived before a time, if the source can seek.
+        """Skip data that arrived before a time, if the source can seek.
 
         Args:
             time_ns: ns since 1970.
@@ -224,7 +226,7 @@ class Transport(ABC):
 
 
 def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
-    """Return the text of the error for a file without bytes.
+    """Return the error message for a file without bytes.
 
     Args:
         warnings: the warnings of the file's transport, which may give the reason.
@@ -233,9 +235,9 @@ def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
 
 
 class Disconnected(SourceError):
-    """Raised if the device of a live source disappears.
+    """The device of a live source has disappeared.
 
-    `LiveTransport.reopen` opens the device again when it is back.
+    `LiveTransport.reopen` opens the device when it is available again.
     """
 
 
@@ -244,11 +246,11 @@ class LiveTransport(Transport):
 
     Attributes:
         label: the SOURCE as given by the user, for messages.
-        closed: whether the transport was closed, which ends `chunks`.
-        overflow: the default policy of a full queue: "drop_oldest", or "block" for a source that
-            waits for its reader.
+        closed: whether the transport was closed. `chunks` then ends.
+        overflow: default behaviour if the queue of read chunks is full: "drop_oldest", or "block"
+            for a source that waits for its reader.
         silence: seconds without a byte after which an incomplete frame is discarded.
-        other_sender: the sender of the last `foreign` datagram; None if there was none.
+        other_sender: the sender of the last `foreign` datagram; None for no such datagram.
     """
 
     label: str = ""
@@ -261,7 +263,7 @@ class LiveTransport(Transport):
     def addressed(self) -> bool:
         """Whether `write` has a destination.
 
-        It is False only for a datagram source while the address of the sensor is unknown.
+        It has none only for a datagram source, while the address of the sensor is unknown.
         """
         return True
 
@@ -285,9 +287,9 @@ class LiveTransport(Transport):
         """
 
     def accept(self, sender: Sender) -> None:
-        """Use a sender as the destination of `write`, because it is the sensor.
+        """Set the destination of `write` to the sender that is the sensor.
 
-        Sources with a fixed destination do nothing.
+        A source with a fixed destination ignores this.
         """
 
     @abstractmethod
@@ -295,10 +297,10 @@ class LiveTransport(Transport):
         """Return the chunks that have arrived.
 
         Args:
-            timeout: seconds to wait for the first chunk.
+            timeout: maximum time to wait for the first chunk, in seconds.
 
         Returns:
-            An empty list if nothing arrived in time, or if the transport was closed.
+            The chunks; an empty list if nothing arrived in time, or if the transport was closed.
 
         Raises:
             Disconnected: if the device disappeared.
@@ -310,7 +312,7 @@ class LiveTransport(Transport):
         """Open the device again after `Disconnected`.
 
         Raises:
-            SourceError: if the device is not back yet.
+            SourceError: if the device is not available yet.
         """
 
     def chunks(self) -> Iterator[Chunk]:
@@ -322,7 +324,7 @@ class LiveTransport(Transport):
         """Set the control lines of a serial port; None leaves a line unchanged.
 
         Raises:
-            UsageError: if there are no control lines.
+            UsageError: if the source has no control lines.
         """
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
@@ -330,7 +332,7 @@ class LiveTransport(Transport):
         """Open the transport of another link of the same device.
 
         Returns:
-            The transport, or None if the caller has to open the link at its own address.
+            The transport; None if the caller must open the link at its own address.
         """
         return None
 

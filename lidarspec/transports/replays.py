@@ -1,7 +1,7 @@
 """Send a recording again, byte for byte, at its recorded times or at another speed.
 
-Each chunk has a deadline on the monotonic clock. Deadlines are computed from the first chunk, not
-from the previous one, so that late wake-ups do not add up. A late chunk is sent at once.
+Each chunk has a deadline on the monotonic clock, which is computed from the deadline of the first
+chunk, so that delays do not add up. A late chunk is sent at once.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
 
 _SECOND_NS = 1_000_000_000
-#: If a chunk is sent later than this after its deadline, it counts as late.
+#: A chunk is counted as late if it is sent more than this time after its deadline.
 LATE_NS = 20_000_000
-#: If recorded times go back further than this, the clock of the recording computer was set.
+#: If a recorded time is earlier than a previous time by more than this, the clock of the recording
+#: computer was set.
 _MAX_REORDERING_NS = _SECOND_NS
 
 
 class Deadlines:
     """The deadline of each chunk of a replay, in ns of the monotonic clock.
 
-    If the recorded time goes back by at most a second, because datagrams were reordered, the
-    deadline has already passed. If it goes back further, because a clock was set, the following
-    deadlines count from the new time.
+    If a recorded time is earlier than a previous time by at most one second, because datagrams were
+    reordered, the chunk is sent at once. If it is earlier by more, because a clock was set, the
+    following deadlines are computed from the new time.
 
     Args:
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
@@ -47,8 +48,8 @@ class Deadlines:
         """Return the deadline of the next chunk.
 
         Args:
-            at: the recorded arrival time of the chunk, ns; None if unknown, for a chunk that is due
-                at the start.
+            at: the recorded arrival time of the chunk, ns. None if it is unknown; the chunk is then
+                due at the start.
         """
         if self._speed is None or at is None:
             return self._start
@@ -69,7 +70,7 @@ def iter_paced(
     now: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Chunk, int]]:
-    """Yield each chunk at its deadline, with its delay after the deadline in ns.
+    """Yield each chunk at its deadline, with its delay in ns.
 
     Args:
         chunks: the recorded chunks.
@@ -92,13 +93,13 @@ class Replay:
 
     Args:
         file: the SOURCE of a recording, capture or raw file.
-        destination: an outlet, or a new file; it stays open.
+        destination: an outlet, or a new file; it is not closed.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        needs_times: whether a file without times is an error; if False, such a file is sent as fast
-            as possible.
+        needs_times: whether a file without times is an error. If not, it is sent as fast as
+            possible.
         loop: whether to start again at the end. Each listener receives the file from the beginning.
-        source: the transport of the file, if it is already open, as for standard input. It is used
-            for the first pass only, and closed.
+        source: the transport of the file if it is already open, for example standard input. It is
+            used for the first pass, and then closed.
         times: the arrival times of the part to send, as in `Selection`.
 
     Attributes:
@@ -148,7 +149,9 @@ class Replay:
         return set(sender_names(self._endpoints).values()) - {""}
 
     def run(self) -> Iterator[str]:
-        """Send the file once, or repeatedly; yield a message or "" after each chunk.
+        """Send the file once, or repeatedly if `loop` is set.
+
+        Yields a message for the user, or "", after each chunk.
 
         Raises:
             UsageError: if the file has no times, but they are required.
@@ -190,7 +193,10 @@ class Replay:
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        """Yield the chunks; if one has no time, raise or set `is_timed` to False."""
+        """Yield the chunks; handle a chunk without a time.
+
+        The chunk is an error if times are required; else `is_timed` is set to False.
+        """
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:

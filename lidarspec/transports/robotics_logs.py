@@ -1,15 +1,17 @@
 """Read packets from robotics logs: ROS 1 bags, ROS 2 bags and MCAP files.
 
-A driver publishes each packet as a message, or the packets of a scan as one message with a list.
-The type of a message with packets has a list `packets`, or has "packet" in its name. Each packet
-has its bytes in `data` or `buf` (only the first `size` bytes are used, if it has this field), and
-may have a `stamp`. Most logs contain the definitions of their messages. Some do not, for example
-ROS 2 bags in SQLite of releases before Iron. Their messages are read with the definition in
-`FALLBACK_DEFINITIONS` that matches the length of the message.
+A driver publishes each packet as a message, or all packets of a scan as a list in one message. A
+message type contains packets if it has a field `packets`, or "packet" in its name. The bytes of a
+packet are in its field `data` or `buf`. If the packet has a field `size`, only this number of bytes
+is used. A packet may have a field `stamp`.
 
-lidarspec and its ROS 2 node write packets as std_msgs/UInt8MultiArray, because this is the only
-message type for bytes that every ROS release has. The padding before the bytes, of `data_offset`
-bytes, is the arrival time; the label of the dimension is `DATAGRAM` or `STREAM`.
+Most logs contain the definitions of their messages. Some do not, for example ROS 2 bags in SQLite
+of releases before Iron. Their messages are read with the definition in `FALLBACK_DEFINITIONS` that
+matches the length of the message.
+
+lidarspec and its ROS 2 node write packets as std_msgs/UInt8MultiArray, because every ROS release
+has this message type. The first `data_offset` bytes of the data are the arrival time. The label of
+the dimension is `DATAGRAM` or `STREAM`.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 _RULE = "=" * 80
 _LIST = f"std_msgs/Header header\nPacket[] packets\n{_RULE}\nMSG: {{package}}/Packet\n"
-#: definitions to try if a log has none. The definitions with lengths come first, because they
-#: rarely fit by chance.
+#: message definitions to try if a log has none. Definitions with lengths come first, because they
+#: rarely match by coincidence.
 FALLBACK_DEFINITIONS = (
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[] data",
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[] data\nuint32 size",
@@ -43,8 +45,8 @@ FALLBACK_DEFINITIONS = (
 DATA_FIELDS = ("data", "buf")
 #: maximum number of topics in a warning.
 MAX_LISTED_TOPICS = 6
-#: packets written by lidarspec: the message type, the arrival time as int64 ns, and the labels of
-#: the dimension for datagrams and for a byte stream.
+#: message type of packets that lidarspec writes. The next constants are the encoding of the arrival
+#: time, int64 ns, and the labels of the dimension for datagrams and for a byte stream.
 RAW = "std_msgs/msg/UInt8MultiArray"
 STAMP = struct.Struct("<q")
 DATAGRAM = "datagram"
@@ -55,10 +57,10 @@ class LogKind(NamedTuple):
     """A kind of log.
 
     Attributes:
-        description: its name in messages.
-        module: the module of rosbags that reads it.
-        reader: the class in this module.
-        form: the serialization of its messages.
+        description: name of the kind, for messages to the user.
+        module: name of the module of rosbags that reads the log.
+        reader: name of the class in this module.
+        form: serialization of the messages in the log: "cdr" or "ros1".
     """
 
     description: str
@@ -77,7 +79,7 @@ LOGS = {
         "an SQLite database (ROS 2 bag)", "rosbags.rosbag2.storage_sqlite3", "Sqlite3Reader"
     ),
 }
-#: a folder with metadata.yaml.
+#: kind of log that is a folder with metadata.yaml.
 FOLDER = LogKind("a ROS 2 bag", "rosbags.rosbag2", "Reader")
 
 
@@ -96,11 +98,11 @@ def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
 
 
 class BagTransport(Transport):
-    """The packets of a robotics log, in the order of its messages.
+    """Reads the packets of a robotics log, in the order of its messages.
 
-    The time of a packet is its own stamp, else the stamp of its message, else the time in the log.
-    The topics of one namespace belong to one sensor. If several namespaces have packets, the
-    `sender` of each chunk is its namespace.
+    The time of a packet is its own stamp. If it has none, it is the stamp of its message, or the
+    log time of the message. All topics of a namespace belong to one sensor. If several namespaces
+    have packets, the `sender` of each chunk is its namespace.
 
     Args:
         path: the file or folder.
@@ -151,7 +153,7 @@ class BagTransport(Transport):
     def chunks(self) -> Iterator[Chunk]:
         namespaces = {_namespace(link.topic) for link in self._links}
         with self._failures():
-            for link, at, raw in self._log.messages(self._links) if self._links else ():
+            for link, log_time_ns, raw in self._log.messages(self._links) if self._links else ():
                 if len(namespaces) > 1:
                     sender = (_namespace(link.topic), 0)
                 else:
@@ -160,7 +162,7 @@ class BagTransport(Transport):
                 if link.msgtype == RAW:
                     yield raw_chunk(message)
                     continue
-                message_ns = _read_stamp(getattr(message, "header", None)) or at
+                message_ns = _read_stamp(getattr(message, "header", None)) or log_time_ns
                 for packet in getattr(message, "packets", [message]) if message is not None else ():
                     data = next(
                         getattr(packet, name) for name in DATA_FIELDS if hasattr(packet, name)
@@ -189,7 +191,7 @@ class BagTransport(Transport):
     def _deserialize(self, link: Any, raw: bytes) -> Any:
         """Return a message, read with the first definition that fits; None if none fits.
 
-        All following messages of the connection use the same definition.
+        The definition is then used for all following messages of the connection.
         """
         stores = self._type_stores[link.id]
         for store in stores:
@@ -208,7 +210,7 @@ class BagTransport(Transport):
 
     @contextmanager
     def _failures(self) -> Iterator[None]:
-        """Convert every exception to SourceError: damaged files cause all kinds of them."""
+        """Convert every exception to SourceError, because damaged files cause many types."""
         try:
             yield
         except LidarSpecError:
@@ -290,7 +292,7 @@ def _element_type(field: Any) -> Any:
     """Return the element type of an array field; None for other fields.
 
     Returns:
-        The name of a message type, or for numbers a tuple of number type and length.
+        The name of a message type; for numbers, a tuple (number type, length).
     """
     if field is not None and field[0].name in ("ARRAY", "SEQUENCE"):
         return field[1][0][1]

@@ -1,11 +1,11 @@
 """Read and write serial ports.
 
-A port is opened exclusively, read as bytes arrive, and opened again after it was unplugged.
+A port is opened exclusively. After the device was unplugged, the port can be opened again. If the
+device disappears, pyserial raises SerialException, OSError, `termios.error` (which is not an
+OSError), or TypeError if the port is closed at the same time.
 
-If the device disappears, pyserial raises SerialException, OSError, `termios.error` (which is not an
-OSError), or TypeError if the port is closed at the same time. On POSIX the port is read through its
-descriptor: wait, then read everything available, then pause, so that a fast line does not wake the
-thread for every byte.
+On POSIX systems, the port is read through its descriptor. After each read, the thread pauses, so
+that it does not wake up for every byte of a fast line.
 """
 
 from __future__ import annotations
@@ -43,23 +43,25 @@ except ImportError:  # no POSIX
 GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
 #: maximum number of bytes per read.
 MAX_READ_BYTES = 1 << 16
-#: time limit for a device to accept written bytes.
+#: maximum time until a device has accepted written bytes.
 WRITE_TIMEOUT_S = 2.0
 #: options of a serial SOURCE.
 OPTIONS = ("baud", "dtr", "rts")
 
 
 class SerialTransport(StreamTransport):
-    """A serial port, 8N1.
+    """A serial port with 8 data bits, no parity and 1 stop bit.
 
     Args:
         port: the name of the port, "/dev/ttyUSB0" or "COM4".
-        baud: any rate that the port supports.
-        dtr, rts: levels of the control lines while the port is open; None does not set a line.
-        sensor: the sensor, for the length of a silence and for messages; None if unknown.
+        baud: the baud rate.
+        dtr: level of the control line DTR while the port is open; None does not set it.
+        rts: level of the control line RTS while the port is open; None does not set it.
+        sensor: the sensor; None if unknown. Its longest frame determines `silence`.
 
     Raises:
-        SourceError: if the port is missing, in use or not permitted, or does not support the rate.
+        SourceError: if the port is missing or in use, if the user may not open it, or if it does
+            not support the baud rate.
     """
 
     baud: int
@@ -81,7 +83,7 @@ class SerialTransport(StreamTransport):
             longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
         else:
             longest = 0
-        # Longer than the duration of a frame on the line, with 10 bits per byte.
+        # The silence is longer than the transmission of a frame, with 10 bits per byte.
         self.silence = max(self.silence, 2 * longest * 10 / baud)
         self._port = self._open()
 
@@ -97,7 +99,7 @@ class SerialTransport(StreamTransport):
     def _send(self, descriptor: int, left: memoryview) -> None:
         """Write all bytes through the descriptor.
 
-        pyserial is not used, because it calls `select`, which supports no descriptor above 1,023.
+        pyserial is not used for this, because its `select` supports only descriptors up to 1,023.
         """
         limit = time.monotonic() + WRITE_TIMEOUT_S
         while left:
@@ -147,7 +149,7 @@ class SerialTransport(StreamTransport):
         return port
 
     def _make_open_error(self, error: Exception) -> SourceError:
-        """Return the error for a port that cannot be opened, with the next command."""
+        """Return the error for a port that cannot be opened; it suggests a command."""
         number = error.errno if isinstance(error, OSError) else None
         source = f"serial://{self.label}{sensor_option(self._sensor)}"
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
@@ -179,7 +181,7 @@ class SerialTransport(StreamTransport):
         with contextlib.suppress(BlockingIOError):
             if data := os.read(descriptor, MAX_READ_BYTES):
                 return data
-        # An empty read may mean that the device has disappeared, which only a wait detects.
+        # If no bytes are read, the device may have disappeared, which only a wait detects.
         if not wait_readable(descriptor, timeout):
             return b""
         data = os.read(descriptor, MAX_READ_BYTES)
@@ -195,10 +197,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
 
     Args:
         address: the SOURCE.
-        sensor: supplies defaults: baud rate and control lines.
+        sensor: gives the defaults of the baud rate and the control lines; None for no defaults.
 
     Raises:
-        UsageError: if the baud rate is unknown, or for an option that ports do not have.
+        UsageError: if the baud rate is unknown, or for an unknown option.
         SourceError: if the port cannot be opened.
     """
     address.check(OPTIONS)

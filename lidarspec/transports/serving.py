@@ -1,7 +1,7 @@
 """Run a simulated sensor at an outlet, in real time.
 
-One loop gets the bytes that the device has sent by now, passes them to the outlet, waits until the
-device sends again or a command arrives, and passes the commands to the device. `serve` runs the
+A loop passes the bytes that the device sends to the outlet, and the commands that arrive to the
+device. In between, it waits until the device sends again or a command arrives. `serve` runs the
 loop in the calling thread, and `Served` runs it in a new thread.
 """
 
@@ -21,21 +21,22 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.outlets import LOCALHOST, Outlet
 from lidarspec.transports.protocol import POLL_S, Chunk, ClosingContext, Sender
 
-#: Shortest time between two passes, in which the frames of a fast sensor accumulate.
+#: Minimum time between two passes of the loop, in which the frames of a fast sensor accumulate.
 _MIN_PAUSE_S = 0.001
 _PASS_TIMEOUT_S = 0.1
-#: How long a virtual clock waits for a program to open the port.
+#: Maximum time that a virtual clock waits until a program opens the port.
 _LISTENER_TIMEOUT_S = 10.0
 
 
-#: The steps of a virtual clock. The simulated device requires less than a second.
+#: Step of a virtual clock. It must be less than the second that a simulated device can be advanced
+#: by.
 _VIRTUAL_STEP_NS = 20_000_000
 
 
 class VirtualClock:
-    """A clock that only moves when it is advanced, for tests that do not wait.
+    """A clock that moves only when `advance` is called, for tests that do not wait.
 
-    The serving thread moves it in steps, and sends at each step what is due.
+    The serving thread moves the clock in steps, and sends the data that is due at each step.
     """
 
     def __init__(self) -> None:
@@ -48,27 +49,28 @@ class VirtualClock:
 
     @property
     def is_behind(self) -> bool:
-        """Whether steps are left."""
+        """Whether the clock has not reached the time that it was advanced to."""
         return self._now_ns < self._end_ns
 
     def advance(self, seconds: float) -> None:
-        """Let the steps of some seconds follow."""
+        """Advance the clock by some seconds, in later steps."""
         self.advance_to(self._end_ns + int(seconds * SECOND))
 
     def advance_to(self, end_ns: int) -> None:
-        """Let steps follow until a time."""
+        """Advance the clock to a time, in later steps."""
         self._end_ns = max(self._end_ns, end_ns)
 
     def step(self) -> None:
-        """Move by one step, but not beyond the end."""
+        """Move the clock by one step, but not beyond the time that it was advanced to."""
         self._now_ns = min(self._now_ns + _VIRTUAL_STEP_NS, self._end_ns)
 
 
 class FairLock:
-    """A lock for the simulating threads, which get it in the order of their requests.
+    """A lock that threads get in the order in which they request it.
 
-    With a plain lock, or without a lock, a hundred simulating threads make hardly any progress,
-    because each waits for all others whenever it needs the interpreter lock.
+    It is used by threads that simulate sensors. With an ordinary lock, or without a lock, a hundred
+    such threads make hardly any progress, because each often waits for all others to release the
+    interpreter lock.
     """
 
     def __init__(self) -> None:
@@ -77,10 +79,10 @@ class FairLock:
 
     @contextlib.contextmanager
     def hold(self, stop: threading.Event) -> Iterator[bool]:
-        """Wait for the lock and hold it; yield False if `cancel` was called.
+        """Hold the lock during the block; yield False if `cancel` was called instead.
 
         Args:
-            stop: identifies the waiting thread for `cancel`.
+            stop: the event that `cancel` identifies the waiting thread by.
         """
         ticket = threading.Event()
         with self._lock:
@@ -95,7 +97,7 @@ class FairLock:
                 self._wake_first()
 
     def cancel(self, stop: threading.Event) -> None:
-        """Set `stop`, and end the wait of the thread with this event."""
+        """Set `stop`, and wake the thread that waits with this event."""
         stop.set()
         with self._lock:
             if stop in self._tickets:
@@ -126,10 +128,10 @@ def serve(
         device: the simulated device.
         outlet: the outlet.
         seconds: the duration; None for no limit.
-        stop: ends the loop when it is set.
+        stop: the loop ends when this event is set.
         on_pass: called in every pass of the loop, at least every 50 ms.
-        patient: whether the device is switched on only when there is a listener.
-        clock: the device's time; None for real time.
+        patient: whether to switch the device on only when a program listens.
+        clock: the clock of the device; None for real time.
 
     Raises:
         SourceError: if nothing can be sent any more.
@@ -153,7 +155,7 @@ def serve(
     while not stop.is_set():
         if on_pass is not None:
             on_pass()
-        # In virtual time nothing is sent before a program can receive it.
+        # In virtual time, nothing is sent until a program can receive it.
         is_waiting = clock is not None and device.present and not outlet.has_listener
         if clock is not None and not is_waiting:
             clock.step()
@@ -185,7 +187,9 @@ def _send_due(
     *,
     patient: bool = False,
 ) -> None:
-    """Send the frames that are due; if `rate` is inf, send as fast as they are read.
+    """Send the frames that are due.
+
+    If the rate of the device is infinite, frames are sent as fast as they are read.
 
     Args:
         patient: whether to wait until the data is read.
@@ -200,7 +204,7 @@ def _send_due(
 
 
 def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
-    """Return the seconds until the device sends again, at most `POLL_S`."""
+    """Return the time until the device sends again, at most `POLL_S` seconds."""
     deadline = device.deadline
     if deadline is None:
         return POLL_S
@@ -218,7 +222,7 @@ def due_chunks(
     Args:
         device: the simulated device.
         now: the device's time, ns.
-        arrival_ns: the arrival time of all chunks, ns since 1970; None to leave it unknown.
+        arrival_ns: the arrival time of all chunks, ns since 1970; None if unknown.
     """
     sensor = device.sensor
     chunks: dict[str, list[Chunk]] = {}
@@ -231,10 +235,10 @@ def due_chunks(
 
 
 def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
-    """Return the address and port of a datagram.
+    """Return the address and port that a simulated datagram is sent to.
 
-    Data frames use the first declared port. All other frames use the second port, if it is
-    declared.
+    This is the first declared port for data frames, and the second declared port for all other
+    frames.
     """
     link = sensor.links.get("data")
     ports = link.ports[:2] if isinstance(link, Udp) else ()
@@ -248,10 +252,13 @@ class Served(ClosingContext):
     """Runs a simulated sensor at an outlet in a separate thread; a context manager.
 
     Args:
-        patient: whether the device is switched on only when there is a listener.
+        device: the simulated device.
+        outlet: the outlet.
+        patient: whether to switch the device on only when a program listens.
+        clock: the clock of the device; None for real time.
 
     Attributes:
-        device: the simulated device; its `commands_received` are the recognized commands.
+        device: the simulated device. Its attribute `commands_received` has the recognized commands.
         outlet: the outlet.
     """
 
@@ -283,19 +290,19 @@ class Served(ClosingContext):
         return self.outlet.source
 
     def unplug(self) -> None:
-        """Unplug the sensor: its port disappears."""
+        """Disconnect the sensor, so that its port disappears."""
         self._call_in_thread(self.device.unplug)
 
     def plug(self) -> None:
-        """Plug the sensor in again: its port reappears, and it starts as after power-up."""
+        """Connect the sensor again: its port reappears, and it starts as after power-up."""
         get_now = self._clock or time.monotonic_ns
         self._call_in_thread(lambda: self.device.start(get_now()))
 
     def jump_clock(self, seconds: float) -> None:
-        """Let the sensor's clock jump, from a packet within the next quarter of a second on.
+        """Let the sensor's clock jump, at a packet within the next quarter of a second.
 
         Args:
-            seconds: how far, forward or back.
+            seconds: size of the jump; negative to jump back.
 
         Raises:
             UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
@@ -314,9 +321,9 @@ class Served(ClosingContext):
             raise failures[0]
 
     def advance(self, seconds: float) -> None:
-        """Let virtual time pass: return when everything that is due has been sent.
+        """Advance the virtual clock, and wait until all data that is due was sent.
 
-        It waits until a program has the port open.
+        Before, waits until a program opens the port.
 
         Raises:
             UsageError: if the port runs in real time.
@@ -335,7 +342,7 @@ class Served(ClosingContext):
         self._call_in_thread(lambda: None)
 
     def stop_sending(self) -> None:
-        """Send no further bytes; bytes that were already sent can still be read."""
+        """Stop sending. Bytes that were already sent can still be read."""
         _SIMULATION_LOCK.cancel(self._stop)
         self._thread.join()
 
@@ -351,14 +358,14 @@ class Served(ClosingContext):
             raise self._failure
 
     def _call_in_thread(self, function: Callable[[], None]) -> None:
-        """Call a function between two passes of the loop; return after the next pass."""
+        """Call a function between two passes of the loop, and wait for the next pass."""
         self._calls.put(function)
         while not self._calls_done.acquire(timeout=_PASS_TIMEOUT_S):
             if not self._thread.is_alive():
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Call the queued functions, and report the calls of the last pass as done."""
+        """Call the queued functions; report the calls before the last pass as done."""
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

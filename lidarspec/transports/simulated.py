@@ -1,4 +1,4 @@
-"""``sim:ID``: a simulated sensor as a live source in this process."""
+"""``sim:ID``: a simulated sensor in this process, as a live source."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: options of a ``sim:`` SOURCE.
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
-#: Shortest time between two reads, in which the packets of a fast sensor accumulate.
+#: Minimum time between two reads, in which the packets of a fast sensor accumulate.
 _MIN_READ_INTERVAL_NS = 2_000_000
 
 
 class SimulatedTransport(LiveTransport):
-    """One link of a simulated device.
+    """A link of a simulated device.
 
-    Opening the data link switches the device on, and reading it advances the device's time for all
-    links.
+    Opening the data link switches the device on. Reading the data link advances the time of the
+    device.
 
     Args:
         label: the SOURCE, for messages.
@@ -65,7 +65,9 @@ class SimulatedTransport(LiveTransport):
         self._clock = HostClock()
         self._next_read_ns = 0
         self._changed: threading.Condition
-        self._unread: dict[str, list[bytes]]  # link -> sent bytes that were not read yet
+        self._unread: dict[
+            str, list[bytes]
+        ]  # link -> bytes that the device has sent and that were not read yet
         if data is None:
             self._changed = threading.Condition()
             self._unread = {}
@@ -106,7 +108,7 @@ class SimulatedTransport(LiveTransport):
                 raise source_error(f"{self.label}: the simulated sensor is disconnected", "wait")
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Do nothing: control lines have no effect on a simulated device."""
+        """Do nothing, because control lines have no effect on a simulated device."""
 
     @property
     def own_port(self) -> int | None:
@@ -123,9 +125,10 @@ class SimulatedTransport(LiveTransport):
             self._changed.notify_all()
 
     def _next_data_ns(self) -> float:
-        """Return the time at which the device sends again, ns; inf if it is unknown.
+        """Return the time at which the device sends data again, ns; inf if unknown.
 
-        It is unknown for other links, which receive data only when the data link is read.
+        It is unknown for links other than the data link, because they get bytes only when the data
+        link is read.
         """
         if self._name == "data":
             deadline = self.device.deadline
@@ -136,7 +139,10 @@ class SimulatedTransport(LiveTransport):
         return max(deadline, self._next_read_ns)
 
     def _take(self, now: int) -> list[Chunk]:
-        """Return the unread bytes of this link; the data link first advances the device."""
+        """Return the unread bytes of this link.
+
+        For the data link, first advances the device.
+        """
         if self._name == "data":
             for link, data in self.device.outgoing(now):
                 if link in self._unread:
@@ -158,8 +164,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
 
     Args:
         address: the SOURCE.
-        sensor: the sensor that reads the source. If it has the same id, it is simulated with its
-            options.
+        sensor: the sensor to read the source with. If it has the id in the SOURCE, it is simulated,
+            with its options.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.
@@ -168,7 +174,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
     address.check(OPTIONS)
     if not address.location and sensor is None:
         raise UsageError(
-            f"{address.text}: expected a sensor, as in sim:ID; lidarspec sensors lists them"
+            f"{address.text}: expected the id of a sensor, as in sim:ID; lidarspec sensors lists"
+            " all ids"
         )
     if sensor is None or (address.location and named_sensor(address.location).id != sensor.id):
         sensor = named_sensor(address.location)
@@ -176,7 +183,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
 
 
 def parse_rate(text: str) -> float:
-    """Return the speed relative to real time; inf for "max" and "0".
+    """Return the speed relative to real time; infinity for "max" and "0".
 
     Raises:
         UsageError: if the text is not a number above 0, "max" or "0".
@@ -193,7 +200,7 @@ def parse_rate(text: str) -> float:
 
 
 def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
-    """Return a device for options like ``{"rate": "2", "scene": "hall.toml"}``."""
+    """Return the simulated device for the options of a SOURCE, such as {"rate": "2"}."""
     if "scene" in options:
         scene = read_scene(options["scene"])
     else:

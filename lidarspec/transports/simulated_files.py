@@ -1,7 +1,7 @@
 """Write the bytes of a simulated sensor to a file, without waiting.
 
-The times in the file are the times of the simulated device. The file has the same content as a
-recording that begins when the device is switched on and opened.
+The arrival times in the file are those of the simulated device. The file is like a recording that
+begins when the device is switched on and opened.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.serving import due_chunks
 
-#: Step of the device's time between two writes; each write also checks the file for errors.
+#: Step of the device's time between two writes to the file.
 _STEP_NS = SECOND // 100
 
 _Transfer = tuple[Chunk, Literal["in", "out"]]
@@ -32,14 +32,14 @@ def write_file(
 ) -> int:
     """Write the bytes that a device sends in a period after its start.
 
-    The commands that open the device are sent to it and recorded. No file is created if the device
-    sends nothing.
+    The commands that a program sends to open the device are sent and recorded as well. If the
+    device sends no data, no file is created.
 
     Args:
         device: the simulated device.
         path: an .lsr, .pcap, .pcapng or .bin file.
-        seconds: the length of the period.
-        overwrite: whether the file may exist.
+        seconds: the duration of the period.
+        overwrite: whether an existing file may be replaced.
 
     Returns:
         The number of bytes that the device sent.
@@ -47,7 +47,7 @@ def write_file(
     Raises:
         UnknownFormat, UsageError: if the file exists, if its format cannot contain the bytes, or if
             nothing is sent in this time.
-        SpecError: if the sensor's declaration never starts its data.
+        SpecError: if the declared commands do not start the data of the sensor.
         SourceError: if the file cannot be written.
     """
     transfers = _simulate_opened(device, seconds)
@@ -70,7 +70,7 @@ def write_file(
 
 
 def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
-    """Return the transfers up to the device's first data; empty if there is no data."""
+    """Return the transfers up to the first data of the device; empty if it sends none."""
     taken = []
     for transfer in transfers:
         taken.append(transfer)
@@ -80,7 +80,7 @@ def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
 
 
 def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Transfer]:
-    """Yield a device's transfers over the data link, and the commands that open it."""
+    """Yield the data of a device over the data link, and the commands that open it."""
     sensor = device.sensor
     start_ns = time.time_ns()
     opening = _commands_on_open(sensor)
@@ -99,12 +99,12 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
 
 
 def _commands_on_open(sensor: Sensor) -> list[str]:
-    """Return the commands for opening, without commands that only set control lines."""
+    """Return the commands that open a device, without mere settings of control lines."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
 
 def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
-    """Return the error with the reason why a device has sent no data."""
+    """Return an error with the reason why a device has sent no data."""
     sensor = device.sensor
     sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:
@@ -113,14 +113,14 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     if device.deadline is not None:
         due = f"its next frame is due after {device.deadline / SECOND:g} s"
         return UsageError(
-            f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g}"
+            f"nothing was written: the simulated {sensor.id} sends no data in the first {seconds:g}"
             f" s; {due}"
         )
     recognized = ", ".join(device.commands_received) or "no command"
     missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
     cause = f"no command starts its data after {recognized}"
     if missed:
-        cause = f"{missed[0]!r} was sent, but it recognized {recognized}"
+        cause = f"the command {missed[0]!r} was sent, but the sensor recognized {recognized}"
     return SpecError(
         f"nothing was written: the simulated sensor sends nothing; {cause}",
         path="on_open",

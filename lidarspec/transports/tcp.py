@@ -25,12 +25,12 @@ from lidarspec.transports.protocol import Disconnected
 
 #: maximum number of bytes per read.
 MAX_READ_BYTES = 1 << 18
-#: timeout of the first connection, and of writing.
+#: timeout of the first connection attempt, and of writing.
 CONNECT_TIMEOUT_S = 5.0
 #: timeout of each attempt to connect again.
 RECONNECT_TIMEOUT_S = 0.5
-#: time without a byte after which an incomplete frame is discarded. It is long because TCP sends
-#: lost segments again after 0.2 s, 0.4 s, 0.8 s ...
+#: time without a byte after which an incomplete frame is discarded. It is long because TCP
+#: retransmits lost segments only after 0.2 s, 0.4 s, 0.8 s ...
 SILENCE_S = 10.0
 
 
@@ -147,8 +147,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
 
     Args:
         address: the SOURCE.
-        sensor: supplies the port if the SOURCE has none. If the sensor reports the port, the
-            connection is opened later.
+        sensor: gives the default of the port; None for no default. If the sensor reports the port,
+            the connection is opened later.
 
     Raises:
         UsageError: if host or port is missing, or for an option: TCP has none.

@@ -1,18 +1,18 @@
 """Receive the UDP datagrams of a sensor, with arrival times and drop counts from the kernel.
 
 Sensors send to the address of this computer or to the broadcast address. Sockets are therefore
-bound to all interfaces ("udp://"), unless the SOURCE names one ("udp://127.0.0.1:2368"). Nothing is
-sent until `write` is called.
+bound to all interfaces ("udp://"), unless the SOURCE contains the address of one
+("udp://127.0.0.1:2368"). Nothing is sent until `write` is called.
 
-Linux stores the arrival time with each datagram, and the number of datagrams that the socket
-dropped before it. A short pause after each read, in which datagrams accumulate, therefore costs no
-accuracy. The receive buffer stores datagrams while the program does not read. The kernel may grant
-a smaller buffer than requested, so its size is read back.
+Linux stores the arrival time of each datagram, and the number of datagrams that the socket has
+dropped before it. Arrival times are therefore exact although a short pause follows each read, in
+which datagrams accumulate. The receive buffer stores datagrams while the program does not read. The
+kernel may grant a smaller buffer than requested, so its size is read back.
 
-`ReceiveSlots` fetches many datagrams with one system call, recvmmsg. It uses ctypes because Python
-has no function for this call. Each socket call in Python releases the interpreter lock, and getting
-it back takes milliseconds if another thread computes. One call per datagram would therefore be too
-slow for a fast sensor.
+`ReceiveSlots` fetches many datagrams with one system call, recvmmsg. It uses ctypes, because Python
+has no function for this call. A call for each datagram would be too slow for a fast sensor: each
+socket call in Python releases the interpreter lock, and it takes milliseconds to get it back if
+another thread computes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Origin, Sender
 
 #: Maximum number of datagrams that one system call fetches.
 SLOT_COUNT = 256
-#: Buffer sizes per datagram, in bytes. Pages that are never written to need no memory.
+#: Size of the buffer for the payload of a datagram. Unused parts need no memory. The next constants
+#: are the sizes of the buffers for its address and its control messages.
 PAYLOAD_SLOT_BYTES = 1 << 16
 ADDRESS_SLOT_BYTES = 32
 CONTROL_SLOT_BYTES = 128
@@ -58,15 +59,15 @@ _CONTROL_WITH_TWO_INTEGERS = struct.Struct("@Niiqq")
 _CONTROL_ALIGNMENT = struct.calcsize("@N")
 #: Requested size of the receive buffer.
 REQUESTED_BUFFER_BYTES = 8 << 20
-#: Maximum number of datagrams that are fetched from one socket before the other sockets are read.
+#: Maximum number of datagrams to fetch from a socket before the other sockets are read.
 MAX_DATAGRAMS_PER_READ = 1024
-#: Pause between two reads if the kernel records arrival times. One wake-up per datagram would cost
-#: more than all other work.
+#: Pause between two reads if the kernel records arrival times. Waking up for each datagram would
+#: take more time than all other work.
 READ_PAUSE_S = 0.002
-#: Longest time that a datagram may have waited in the kernel. Longer times mean that the clock was
-#: set.
+#: Maximum time that a datagram may have waited in the kernel. A longer time means that the clock
+#: was set.
 MAX_KERNEL_DELAY_NS = 60_000_000_000
-#: Socket options without a name in Python (Linux, asm-generic/socket.h).
+#: Numbers of socket options of Linux that have no name in Python (asm-generic/socket.h).
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -98,17 +99,18 @@ class _ReceivedDatagram(ctypes.Structure):
     _fields_ = (("message", _MessageHeader), ("size", ctypes.c_uint))
 
 
-#: Index of the first datagram's size in the array of headers, and the step to the next datagram, in
-#: units of c_uint.
+#: Index of the size of the first datagram in the array of headers, in units of c_uint. The next
+#: constant is the step to the next datagram.
 _SIZE_INDEX = _ReceivedDatagram.size.offset // ctypes.sizeof(ctypes.c_uint)
 _SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_uint)
-#: The same for the size of its control messages, in units of c_size_t.
+#: Index of the size of its control messages, in units of c_size_t, and the step to the next
+#: datagram.
 _CONTROL_SIZE_INDEX = _MessageHeader.control_size.offset // ctypes.sizeof(ctypes.c_size_t)
 _CONTROL_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_size_t)
 
 
 class ReceiveSlots:
-    """Buffers for many datagrams, which each call of `fill` reuses.
+    """Buffers for many datagrams. Each call of `fill` overwrites them.
 
     Raises:
         OSError: if the system has no recvmmsg.
@@ -135,7 +137,7 @@ class ReceiveSlots:
         self._vectors = (_Vector * SLOT_COUNT)()
         self._headers = ctypes.create_string_buffer(SLOT_COUNT * ctypes.sizeof(_ReceivedDatagram))
         self._datagrams = (_ReceivedDatagram * SLOT_COUNT).from_buffer(self._headers)
-        # Access to ctypes fields by name is too slow to do for each datagram.
+        # Reading ctypes fields by name would be too slow for each datagram.
         self._sizes = memoryview(self._headers).cast("B").cast("I")
         self._control_sizes = memoryview(self._headers).cast("B").cast("P")
         for index in range(SLOT_COUNT):
@@ -153,7 +155,7 @@ class ReceiveSlots:
         self._senders: dict[bytes, tuple[str, int]] = {}  # cache of `_parse_address`
 
     def fill(self, descriptor: int) -> int:
-        """Fetch the datagrams that wait in a socket, and return their number.
+        """Fetch the waiting datagrams of a socket, and return their number.
 
         Returns:
             At most `SLOT_COUNT`; 0 if no datagram waits.
@@ -161,7 +163,7 @@ class ReceiveSlots:
         Raises:
             OSError: if the system call fails.
         """
-        # The previous call has overwritten the sizes.
+        # The previous system call has overwritten the sizes.
         ctypes.memmove(self._headers, self._initial_headers, len(self._initial_headers))
         count: int = self._call(descriptor, self._datagrams, SLOT_COUNT, socket.MSG_DONTWAIT, None)
         if count < 0:
@@ -187,10 +189,10 @@ class ReceiveSlots:
         return data, sender
 
     def single_control_message(self, index: int) -> tuple[int, int, int] | None:
-        """Return type and values of the only control message of a datagram.
+        """Return the type and the two values of a datagram's only control message.
 
-        Returns None if the datagram has not exactly one control message with two 64-bit integers.
-        This is a fast path of `control_messages` for datagrams with only an arrival time.
+        Returns None unless the datagram has one control message with two 64-bit integers. This is
+        faster than `control_messages`, for datagrams with only an arrival time.
         """
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
         if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
@@ -203,7 +205,7 @@ class ReceiveSlots:
         return None
 
     def control_messages(self, index: int) -> list[tuple[int, memoryview]]:
-        """Return type and value of each control message (socket level) of a datagram."""
+        """Return (type, value) of each control message at socket level of a datagram."""
         start = index * CONTROL_SLOT_BYTES
         messages = []
         end = start + self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
@@ -220,7 +222,7 @@ class ReceiveSlots:
 
 
 def _parse_address(name: bytes) -> tuple[str, int]:
-    """Return host and port of a socket address in the layout of the kernel."""
+    """Return (host, port) of a socket address in the format of the kernel."""
     family = int.from_bytes(name[:2], sys.byteorder)
     port = int.from_bytes(name[2:4], "big")
     if family == socket.AF_INET6:
@@ -238,12 +240,12 @@ class UdpTransport(LiveTransport):
         ports: the ports to listen on; 0 for any free port.
         host: address of the interface; "" for all interfaces.
         group: multicast group to join; None for none.
-        sender: accept only datagrams from this "HOST" or "HOST:PORT", and count others as
-            `foreign`; None to accept all.
+        sender: accept only datagrams from this "HOST" or "HOST:PORT"; others are counted in
+            `foreign`. None to accept all.
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
         sensor: the sensor, for suggested commands in messages.
-        remote: the destination of `write`. The default is `sender` if it has a port, else the
-            sender passed to `accept`.
+        remote: the destination of `write`. By default, it is `sender` if this has a port, else the
+            sender that is passed to `accept`.
         broadcast: whether `remote` is a broadcast address, which the sender passed to `accept`
             replaces.
 
@@ -344,7 +346,7 @@ class UdpTransport(LiveTransport):
             self._remote = sender
 
     def reopen(self) -> None:
-        """Do nothing: a socket stays open when the sensor disappears."""
+        """Do nothing, because a socket stays open when the sensor disappears."""
 
     def peer(self) -> str | None:
         if self._origin:
@@ -360,7 +362,7 @@ class UdpTransport(LiveTransport):
             opened.socket.close()
 
     def _fetch(self, opened: _Socket, chunks: list[Chunk]) -> None:
-        """Append the datagrams that wait in a socket, up to a limit, to `chunks`."""
+        """Append the waiting datagrams of a socket, up to a limit, to `chunks`."""
         start = len(chunks)
         try:
             origin = self._origin
@@ -422,7 +424,7 @@ class UdpTransport(LiveTransport):
 
 
 class _Socket:
-    """One socket and its kernel statistics.
+    """A socket and the statistics that the kernel reports for it.
 
     Args:
         slots: buffers to fetch many datagrams at once; None to fetch single datagrams.
@@ -447,12 +449,13 @@ class _Socket:
                 self.is_timed |= option == SO_TIMESTAMPNS
 
     def iter_datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
-        """Yield the waiting datagrams with sender and arrival time, and update `drops`.
+        """Yield (data, sender, arrival time) of the waiting datagrams; update `drops`.
 
         Args:
             now: the current time of the transport's clock, ns since 1970. Arrival times are
                 converted to this clock.
-            wall: the wall-clock time at the same moment, ns. The kernel uses the wall clock.
+            wall: the time of the wall clock at the same moment, ns since 1970. The kernel uses the
+                wall clock.
 
         Raises:
             OSError: if the system call fails.
@@ -497,9 +500,9 @@ class _Socket:
 def _order_times(chunks: list[Chunk], start: int) -> None:
     """Correct arrival times that are later than the times of following chunks.
 
-    For some milliseconds after a socket is opened, Linux records the time at which a datagram is
-    fetched instead of its arrival time. This time can be later than the times of the next
-    datagrams.
+    In the first milliseconds after a socket was opened, Linux reports the time at which a datagram
+    is fetched instead of its arrival time. This time can be later than the arrival times of the
+    next datagrams.
 
     Args:
         start: index of the first chunk to correct.
@@ -514,9 +517,9 @@ def _order_times(chunks: list[Chunk], start: int) -> None:
 
 
 def _convert_time(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
-    """Convert a wall-clock time to the transport's clock.
+    """Convert a time of the wall clock to a time of the transport's clock.
 
-    The result is limited to the last `MAX_KERNEL_DELAY_NS` before `now`.
+    The result is at most `now`, and at least `now - MAX_KERNEL_DELAY_NS`.
 
     Args:
         now: the current time of the transport's clock, ns.
@@ -533,11 +536,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
     Args:
         address: the SOURCE.
-        sensor: supplies the ports if the SOURCE names none.
+        sensor: gives the default of the ports; None for no default.
 
     Raises:
-        UsageError: if neither SOURCE nor sensor names a port, or for an option that UDP does not
-            have.
+        UsageError: if neither the SOURCE nor the sensor gives a port, or for an unknown option.
         SourceError: if a socket cannot be opened.
     """
     address.check(OPTIONS)
@@ -582,7 +584,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
 
 def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | None, bool]:
-    """Return the address for commands over the data link, and whether it is a broadcast.
+    """Return the address for commands on the data link, and whether it is a broadcast.
 
     The address is None if it is unknown until the sensor sends data.
     """
@@ -600,7 +602,7 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return a warning, with the command that fixes it, if a buffer is too small.
+    """Return a warning if a receive buffer is smaller than requested; else [].
 
     Args:
         requested: the requested size, in bytes.
@@ -613,7 +615,12 @@ def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
 
 
 def describe_small_buffer(requested: int, granted: int) -> str:
-    """Return the problem of a receive buffer that is smaller than requested, in bytes."""
+    """Return a message about a receive buffer that is smaller than requested.
+
+    Args:
+        requested: the requested size, in bytes.
+        granted: the size that the kernel granted, in bytes.
+    """
     return (
         f"the system granted a receive buffer of {granted >> 10} KiB instead of"
         f" {requested >> 10}: packets may be lost under load"
@@ -621,7 +628,7 @@ def describe_small_buffer(requested: int, granted: int) -> str:
 
 
 def enlarge_buffer_command(requested: int) -> str:
-    """Return the command that lets programs request a buffer of this size, in bytes."""
+    """Return the command that allows programs to request a buffer of this size, bytes."""
     return f"sudo sysctl -w net.core.rmem_max={requested}"
 
 

@@ -55,10 +55,7 @@ def test_a_damaged_capture_is_read_with_a_warning(verb: str, tmp_path: Path) -> 
     done = ran(
         verb, path, *target, "-s", M1, *(["--packets", "--json"] if verb == "read" else []), code=1
     )
-    assert (
-        f"{path} is corrupt in 1 place: {len(some[700])} bytes were not read, all others were"
-        in done.stderr
-    )
+    assert f"{path} is corrupt in 1 place: {len(some[700])} bytes were not read" in done.stderr
     if verb == "read":
         assert done.stdout.count("\n") == 1299
 

@@ -187,7 +187,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
                 patient=True,
             )
             assert receiver.recv(9) == bytes([number])
-        with pytest.raises(UsageError, match="the recording has no port"):
+        with pytest.raises(UsageError, match="the recording does not contain the destination port"):
             target.send([Chunk(b"nowhere")], patient=True)
 
 

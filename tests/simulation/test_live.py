@@ -129,7 +129,7 @@ def test_a_scene_is_seen(tmp_path: Path) -> None:
     ("source", "said"),
     [
         ("sim:ldrobot-stl27", "did you mean 'ldrobot-stl27l'"),
-        ("sim:", "expected a sensor"),
+        ("sim:", "expected the id of a sensor"),
         ("sim:ldrobot-stl27l?error=0.1", "did you mean 'errors'"),
         ("sim:ldrobot-stl27l?rate=-1", "rate must be a number above 0"),
         ("sim:ldrobot-stl27l?rate=nan", "rate must be a number above 0"),
@@ -306,7 +306,7 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             SimulatedDevice(slow),
             0.1,
             UsageError,
-            "sends nothing in the first 0.1 s; its next frame is due after 0.5 s",
+            "sends no data in the first 0.1 s; its next frame is due after 0.5 s",
         ),
         (
             SimulatedDevice(stl(), faults=Faults(loss=1.0)),

@@ -203,13 +203,13 @@ REFUSED = {
     "uint16_t frame[] = {0x542c};": "expected bytes such as 0x54 in an array, got '0x542c'",
     ":10010000214601360121470136007EFE09D2190140": "it is Intel HEX",
     "0000000 2c54 0e10 0868": "words in host byte order",
-    "000000 54 2c 10 0e 54 2c 41 20": "it begins either with an offset or with zeros",
+    "000000 54 2c 10 0e 54 2c 41 20": "it begins with an offset or with zeros",
     "00000000: 0e102c54 20412c54  T,..T,A ": (
         "the characters after the bytes, 'T,..T,A', do not match them"
     ),
     "00000000  54 2c 10 0e  |T,..|\n*\n00000020": "replaces repeated lines",
     "00000000  54 2c 10 0e  |T,..|\n00000020  54": "offset 00000020 does not follow 0x4 bytes",
-    "00000000  54 2c 10 0e  |T,..|\n54 2c": "the lines before have",
+    "00000000  54 2c 10 0e  |T,..|\n54 2c": "the lines before it have offsets",
     "can0 123 [2] 11 22\ncan0 124 [2] 11 22": "CAN frames of can0 123 and of can0 124",
     "can0 123 [3] 11 22": "a CAN frame with length 3 has 2 bytes",
     "Time [s],Value\n0.1,84": "expected a byte such as 0x54, got '84'",
