@@ -243,7 +243,7 @@ def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:
     found = vlp16.split([data for _, data in device.outgoing(SECOND // 10)])
     first = next(vlp16.parse(item.data) for item in found if item.frame == "data")
     assert first.timestamp == 5_000_000
-    with pytest.raises(UsageError, match="no share of a day"):
+    with pytest.raises(UsageError, match="does not divide a day"):
         simulate(SHAPES["shape-columns"], 1, clock=parse_clock_faults("utc"))
 
 

@@ -319,7 +319,7 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             SimulatedDevice(mistaken),
             0.1,
             SpecError,
-            "'start' was sent, but it recognized wake",
+            "'start' was sent, but the sensor recognized wake",
         ),
     ):
         with pytest.raises(error, match=said):
