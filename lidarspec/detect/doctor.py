@@ -41,6 +41,7 @@ from lidarspec.transports.udp import (
     describe_small_buffer,
     enlarge_buffer_command,
 )
+from lidarspec.transports.usb_adapters import list_missing_drivers
 
 LOOPBACK = "lo"
 #: the reported facts that identify a device.
@@ -99,6 +100,7 @@ def examine_computer() -> Iterator[Diagnosis]:
             "no serial port found: check the cable and the driver",
             "sudo dmesg | tail",
         )
+    yield from _check_usb_drivers()
     for port in serial_ports:
         yield from _check_permission(port.path)
         yield from _check_serial_users(port.path)
@@ -141,6 +143,7 @@ def _examine_serial(
             f"{port}: no such port; check that the device is connected and its driver is loaded",
             "lidarspec ports",
         )
+        yield from _check_usb_drivers()
         return
     problems = [*_check_permission(port), *_check_serial_users(port)]
     if problems:
@@ -148,6 +151,12 @@ def _examine_serial(
         return
     yield Diagnosis(True, f"{port} exists and can be opened")
     yield from _examine_bytes(source, sensor, seconds)
+
+
+def _check_usb_drivers() -> Iterator[Diagnosis]:
+    """Yield a finding for each known USB serial adapter without a driver."""
+    for driver in list_missing_drivers():
+        yield Diagnosis(False, driver.text, driver.fix)
 
 
 def _check_permission(port: str) -> Iterator[Diagnosis]:

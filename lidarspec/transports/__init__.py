@@ -15,6 +15,7 @@ Modules in reading order:
 * `hex_text`: reads bytes from hexadecimal text.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: the serial and UDP ports of this computer, and the programs that use them.
+* `usb_adapters`: USB serial adapters without a driver.
 
 These modules send data like a sensor:
 

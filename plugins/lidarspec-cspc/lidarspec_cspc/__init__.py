@@ -356,11 +356,11 @@ class Turning:
         return self.exposure
 
 
-def change_speed(sweep: Any, i: int, hertz: float) -> Turning:
+def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
     """Return the values from packet i on, with another speed after the current revolution.
 
     Args:
-        sweep: the `Turning` so far.
+        sweep: the values so far.
         hertz: revolutions per second; the sensor measures as many points per second as before.
     """
     values = map(sweep, itertools.count(i))
