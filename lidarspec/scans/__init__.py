@@ -2,7 +2,8 @@
 
 A scan is one revolution or frame period, by the sensor's declared rule.
 
-In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules in reading order:
+Batches of packets are converted to `Scan`, and these to `LaserScan`, which is a planar scan as in
+ROS. Modules in reading order:
 
 * `scan`: `Scan`, the points of one revolution.
 * `laserscan`: `LaserScan`, and the nearest return at each angle of a grid.

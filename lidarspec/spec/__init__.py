@@ -3,23 +3,24 @@
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
     Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. In: the facts of a manual. Out: a
-`Sensor`, which is checked when it is made. All other packages are functions of its description.
-Nothing in this package reads a stream. Modules in reading order:
+A plugin imports only from this package and from `lidarspec`. It makes a `Sensor` from the facts in
+a manual, and the `Sensor` is checked when it is made. All other packages use this description.
+Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
-* `sensor`: `SensorDescription`, which combines all of these; `Sensor`, in
-  `lidarspec.sensor_operations`, is a description with the engines as methods.
-* `options`: the values that options of `configure` take, from their annotations.
+* `sensor`: `SensorDescription`, which combines these values. `Sensor`, in
+  `lidarspec.sensor_operations`, is a description with methods that decode, build and so on.
+* `options`: the values that options of `configure` accept, from their annotations.
 * `arguments`: arguments of commands, and values filled in when a command is sent.
 * `fields`: units, checksums and parts, as members of a struct.
-* `checksums`: checksum algorithms as values, for one message at a time.
-* `wire_forms`: frames without fixed field offsets: tokens, lines, escapes.
+* `checksums`: checksum algorithms as values.
+* `wire_forms`: the encodings of frames without fixed field offsets: tokens, lines, escapes.
 * `links`: the connections of a sensor.
 * `timing`: clocks and dates, counters, ends of scans.
 * `results`, `vocabulary`: the return values of `points` functions, and functions for them.
 * `tree`: a frame type as a tree of nodes.
-* `syntax`, `bits`: from construct to the tree; the layout of bit blocks, found by probing.
+* `syntax`: converts a construct struct to the tree.
+* `bits`: finds the layout of bit blocks by probing.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 An argument is a number in a range, a text, an address, a port or bytes. Each kind describes the
 values that it accepts and packs them into the bytes of the frame. `Count`, `Address`, `Port` and
-`Template` among the `values` of a command are filled in when it is sent: with a running number,
-this computer's address and port, and a text with values that are known by then.
+`Template` among the `values` of a command are replaced when the command is sent, by a running
+number, by this computer's address or port, and by a text with values that are known then.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Port(Range):
 class Text:
     """A text of at most `size` bytes.
 
-    If its field has a fixed size, it is filled up with `fill`.
+    If the field of the text has a fixed size, the text is padded with the byte `fill`.
 
     Raises:
         SpecError: for a size below 1, or a fill that is not one byte.
@@ -86,8 +86,9 @@ class Text:
 class Address:
     """An IP address, for example "192.168.1.10".
 
-    Its field has 4 bytes, an array of 4 numbers or a number of 32 bits; 16 bytes for IPv6. Among
-    the `values` of a command it is this computer's own address, as seen by the sensor.
+    The field of an IPv4 address is 4 bytes, an array of 4 numbers or a number of 32 bits; the field
+    of an IPv6 address is 16 bytes. In the `values` of a command, `Address()` is this computer's own
+    address, as seen by the sensor.
     """
 
     def words(self, room: int | None) -> str:
@@ -102,7 +103,7 @@ class Address:
         """Return the bytes of an address.
 
         Raises:
-            ValueError: for a value that is not an address, or does not fit.
+            ValueError: for a value that is not an address, or has another size than the field.
         """
         from ipaddress import ip_address  # a slow import
 
@@ -129,7 +130,7 @@ class Octets:
         """Return the bytes.
 
         Raises:
-            ValueError: for another type, or another length than the field has.
+            ValueError: for another type, or if the length differs from that of the field.
         """
         if not isinstance(value, bytes | bytearray) or room not in (None, len(value)):
             raise ValueError
@@ -144,7 +145,7 @@ class Count:
     """A running number in `Command.values`; each command that is sent has the next number.
 
     Args:
-        bits: the width of the number; after the largest number it continues with 0.
+        bits: the width of the number in bits; the largest number is followed by 0.
         first: the number of the first command.
 
     Raises:
@@ -216,13 +217,13 @@ class Template:
         return sum(len(text) for text, _, _, _ in string.Formatter().parse(self.text))
 
     def fill(self, values: Mapping[str, Any]) -> bytes:
-        """Return the text with its values.
+        """Return the text with the names replaced by values.
 
         Args:
             values: a text or a number for each name.
 
         Raises:
-            ValueError: for a value with other characters than a value may have.
+            ValueError: for a value with a character that is not allowed.
         """
         texts = {name: _format_value(values[name]) for name in self.names}
         for name, text in texts.items():
@@ -233,7 +234,7 @@ class Template:
         return self.text.format_map(texts).encode()
 
     def match(self, data: Any) -> dict[str, str] | None:
-        """Return the values of a text that has this form, by name; None for another text."""
+        """Return the values in a text of this form, by name; None for any other text."""
         if not isinstance(data, bytes):
             return None
         matched = self._pattern.fullmatch(data.decode("latin-1"))
@@ -256,7 +257,7 @@ def _format_value(value: Any) -> str:
     return str(value)
 
 
-#: a value of a command that is not known until it is sent.
+#: A value of a command that is known only when the command is sent.
 Filled = Count | Address | Port | Template
 
 
@@ -265,15 +266,15 @@ class Argument:
     """An argument of a command.
 
     Attributes:
-        path: the path of its field, with indices for elements of arrays: "ports[1]".
-        kind: the values that it accepts.
+        path: the path of the field, with an index for an element of an array, such as "ports[1]".
+        kind: the values that the argument accepts.
     """
 
     path: str
     kind: Taken
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the field, and the range or other accepted values, as JSON data."""
+        """Return the path of the field and the accepted values as JSON data."""
         own = {
             name: value.decode("latin-1") if isinstance(value, bytes) else value
             for name, value in vars(self.kind).items()

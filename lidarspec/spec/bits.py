@@ -1,9 +1,9 @@
 """Find the bits of each value of a bit block by probing its parser.
 
-A block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any nesting) is
-linear in its bits: value = sum of bit * weight. Parsing it once with no bit set and once with each
-single bit set gives the weights; random blocks then confirm them. This way only the probed parser
-contains rules about the order of bits.
+The values in a block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any
+nesting) are linear functions of its bits: value = sum of bit * weight. The block is parsed once
+with no bit set, and once with each single bit set, which gives the weights. Random blocks then
+confirm them. This module therefore needs no rules about the order of bits.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal
 
-#: number of random blocks that have to agree with a probed layout.
+#: The number of random blocks that have to confirm a probed layout.
 CONFIRMATIONS = 8
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of bits of one byte that is part of a value.
+    """Adjacent bits of one byte that are part of a value.
 
-    It adds ``((byte & mask) >> low) << target`` to the value.
+    The segment adds ``((byte & mask) >> low) << target`` to the value.
     """
 
     byte: int
@@ -35,11 +35,11 @@ class BitField:
     """One value of a bit block.
 
     Attributes:
-        keys: field names and array indices that lead to it in the parsed block.
-        segments: its bits.
-        width: number of bits.
+        keys: the field names and array indices that lead to the value in the parsed block.
+        segments: the bits of the value.
+        width: the number of bits.
         signed: whether the top bit is a sign bit.
-        flag: whether it is parsed as False or True.
+        flag: whether the value is parsed as False or True.
     """
 
     keys: tuple[str | int, ...]
@@ -50,10 +50,10 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The value as consecutive bits of whole bytes, None if it is not.
+        """The position of the value as consecutive bits of an integer.
 
-        It is a tuple of the byte order ("<" or ">"), the first byte, the number of bytes, and the
-        lowest bit.
+        This is a tuple of the integer's byte order ("<" or ">"), first byte and number of bytes,
+        and of the lowest bit of the value. It is None if the bits are not consecutive.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first = parts[0].byte
@@ -66,7 +66,7 @@ class BitField:
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether it consists of whole consecutive bytes."""
+        """Whether the value consists of whole consecutive bytes."""
         return self.run is not None and (self.run[2] * 8, self.run[3]) == (self.width, 0)
 
     def value(self, block: bytes | memoryview) -> int:
@@ -77,7 +77,7 @@ class BitField:
         return total
 
     def masks(self, size: int) -> bytes:
-        """Return a mask for each byte of a block of `size` bytes: the bits of this value."""
+        """Return a mask of the bits of this value, for a block of `size` bytes."""
         result = bytearray(size)
         for segment in self.segments:
             result[segment.byte] |= segment.mask
@@ -96,16 +96,16 @@ def whole_bytes(size: int, order: Literal["little", "big"], *, signed: bool) -> 
     )
 
 
-#: parses a block of bytes; returns its values by the keys that lead to them.
+#: A function that parses a block of bytes, and returns its values by their keys.
 Parse = Callable[[bytes], Mapping[tuple[str | int, ...], Any]]
 
 
 def probe(parse: Parse, size: int) -> list[BitField] | None:
-    """Return the bit fields of a block, or None if it is not linear in its bits.
+    """Return the bit fields of a block; None if its values are not linear in its bits.
 
     Args:
-        parse: returns the values of a block; it must accept every pattern.
-        size: of the block in bytes.
+        parse: a function that returns the values of a block; it must accept any bytes.
+        size: the size of the block in bytes.
     """
     base = parse(bytes(size))
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
@@ -127,9 +127,14 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
 def _field(
     keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool
 ) -> BitField | None:
-    """Return a field from pairs of (bit of the block, weight).
+    """Return the field with the given bits.
 
     Returns None unless each of the weights 1, 2, 4 ... occurs exactly once.
+
+    Args:
+        keys: the keys of the field.
+        pairs: pairs of a bit of the block and its weight.
+        flag: whether the field is parsed as False or True.
     """
     width = len(pairs)
     signed = any(weight < 0 for _, weight in pairs)
@@ -147,7 +152,11 @@ def _field(
 
 
 def _segments(targets: dict[int, int]) -> Iterator[Segment]:
-    """Yield runs of bits that keep their order within one byte."""
+    """Yield runs of bits that are in one byte, and in the same order as in the value.
+
+    Args:
+        targets: the bit of the value, by bit of the block.
+    """
     runs: dict[tuple[int, int, int], list[int]] = {}
     for number, bit in enumerate(sorted(targets)):
         runs.setdefault((bit // 8, bit - number, targets[bit] - bit), []).append(bit)

@@ -1,13 +1,13 @@
 """Checksum algorithms as values, and the CRCs in common use by name.
 
-An algorithm is immutable, hashable and equal to another with the same parameters. It is called with
-the bytes of one message. `single` returns a faster function for many calls;
-`lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the names
-of CRC catalogues.
+An algorithm is immutable and hashable, and equal to another algorithm with the same parameters. It
+is called with the bytes of one message. `single` returns a function that is faster for many calls.
+`lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the
+common CRCs, by the names of CRC catalogues.
 
-The register of a CRC is kept in wire order: its low byte is combined with the next byte of data.
-With `refin` this is the usual reflected register, otherwise the usual register aligned left with
-its bytes swapped. So one formula is enough for both.
+The low byte of a CRC register is combined with the next byte of data. For this, the register of a
+CRC with `refin` is the usual reflected register, and the register of a CRC without `refin` is the
+usual register, aligned left, with its bytes in reverse order. This form is called wire order.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Checksum(ABC):
     """A checksum algorithm: an immutable, hashable value.
 
     Attributes:
-        width: its size in bits.
-        order: its byte order if its field is plain bytes; an integer field has its own.
+        width: the size of the checksum in bits.
+        order: the byte order of a checksum in a field of bytes; an integer field has its own order.
     """
 
     width: int
@@ -56,13 +56,10 @@ class Checksum(ABC):
         """Return a short name to display, for example "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """Return the checksum of each row; by default with one call for each row.
+        """Return the checksum of each row, (n,) uint64, by one call for each row.
 
         Args:
-            rows: frames of one length, shape (n, m).
-
-        Returns:
-            uint64, shape (n,).
+            rows: frames of one length, (n, size).
         """
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
 
@@ -72,12 +69,12 @@ class Crc(Checksum):
     """A cyclic redundancy check, with the parameters of CRC catalogues.
 
     Args:
-        width: bits of the register, 1 to 64.
-        poly: the polynomial without its highest term, highest power first.
+        width: the number of bits of the register, 1 to 64.
+        poly: the polynomial without its highest term; the highest bit is the highest power.
         init: the register before the first byte, not reflected.
-        refin: each byte is processed lowest bit first.
-        refout: the result is reflected.
-        xorout: is XORed onto the result.
+        refin: whether each byte is processed from its lowest bit on.
+        refout: whether the result is reflected.
+        xorout: the number that is XORed with the result.
 
     Raises:
         ValueError: for an invalid parameter.
@@ -123,7 +120,7 @@ class Crc(Checksum):
         return mirrored_bytes(start)
 
     def left(self, register: int) -> int:
-        """Return the checksum for the register, in wire order, after the last byte."""
+        """Return the checksum, given the register in wire order after the last byte."""
         if not self.refin:
             size = REGISTER_BYTES[self.width]
             register = (
@@ -173,9 +170,9 @@ class WordXor(Checksum):
     """The XOR of words of one or two bytes, low byte first, zero-extended to 16 bits.
 
     Args:
-        head: number of bytes at the start that are always two-byte words.
-        groups: sizes of the words after them, 1 or 2 bytes each, repeated; a word cut short by the
-            end counts as one byte.
+        head: the number of bytes at the start that are always two-byte words.
+        groups: the sizes of the following words, 1 or 2 bytes each, which are repeated. If the data
+            ends in a word of two bytes, the remaining byte is a word of its own.
 
     Raises:
         ValueError: for invalid sizes.
@@ -220,11 +217,11 @@ class WordXor(Checksum):
 class Fold15(Checksum):
     """A 15-bit sum of words, each added to twice the sum so far.
 
-    The words are little-endian. At the end the bits above bit 14 are added to the low 15 bits. If
-    the length is odd, the last word is extended by a zero byte. Bits shifted past bit 29 are lost,
-    so only the last 30 words count.
+    The words are little-endian. At the end, the bits above bit 14 are added to the low 15 bits. If
+    the length is odd, a zero byte is appended. Bits that are shifted past bit 29 are lost, so only
+    the last 30 words count.
 
-    Source: the trailer of many vacuum cleaners' lidars; agrees with captures of two makes.
+    Source: lidars of many vacuum cleaners; confirmed by captures of two makes.
     """
 
     width = 15
@@ -242,10 +239,10 @@ class Fold15(Checksum):
 
 @dataclass(frozen=True)
 class Fletcher(Checksum):
-    """Two 8-bit sums: that of all bytes, and that of the first sum after each byte.
+    """Two 8-bit sums, modulo 256.
 
-    Both are modulo 256. The low byte of the checksum is the first sum, so that a little-endian
-    field has the first sum first.
+    The first sum, in the low byte of the checksum, is the sum of all bytes. The second sum, in the
+    high byte, adds the first sum after each byte.
 
     Source: RFC 1145; UBX checksum of u-blox.
     """
@@ -268,9 +265,10 @@ class Fletcher(Checksum):
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
-    """Another algorithm over the data, padded with zeros to a multiple of `to` bytes.
+    """Another algorithm, applied to the data after padding it with zeros.
 
-    Hardware that processes whole words computes checksums this way.
+    The data is padded to a multiple of `to` bytes, for checksums of hardware that processes whole
+    words.
     """
 
     algorithm: Checksum
@@ -303,7 +301,7 @@ def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
 def _xor(data: Bytes) -> int:
     """Return the XOR of all bytes.
 
-    The data is one large integer, which is folded in halves down to its low byte.
+    The data is converted to one large integer, whose halves are XORed until one byte is left.
     """
     value = int.from_bytes(data, "little")
     for power in _powers(8, len(data)):
@@ -313,11 +311,11 @@ def _xor(data: Bytes) -> int:
 
 @lru_cache(maxsize=4096)
 def _powers(bits: int, count: int) -> tuple[int, ...]:
-    """Return the shifts that fold all parts of an integer into its lowest by XOR.
+    """Return the shifts that XOR all parts of an integer into its lowest part.
 
     Args:
-        bits: size of a part.
-        count: number of parts.
+        bits: the size of a part.
+        count: the number of parts.
     """
     return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
 
@@ -334,7 +332,7 @@ def mirrored_bytes(register: int) -> int:
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """Return the register after one byte, by the XOR of that byte and the low byte."""
+    """Return the table of a CRC: the XOR of a byte and the low byte -> the next register."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):
@@ -348,7 +346,7 @@ def _crc(width: int, poly: int, init: int = 0, *, reflected: bool = False, xorou
 
 _ONES = 0xFFFF_FFFF
 
-#: name -> parameters, the most used first.
+#: The common CRCs by name, the most used first.
 CRCS: dict[str, Crc] = {
     "CRC-32": _crc(32, 0x04C11DB7, _ONES, reflected=True, xorout=_ONES),
     "CRC-16/MODBUS": _crc(16, 0x8005, 0xFFFF, reflected=True),
@@ -395,17 +393,17 @@ CRCS: dict[str, Crc] = {
     "CRC-32/XFER": _crc(32, 0x000000AF),
 }
 _NAMES = {crc: name for name, crc in CRCS.items()}
-#: width -> the polynomials in use.
+#: The polynomials in use, by width.
 KNOWN = {width: {crc.poly for crc in CRCS.values() if crc.width == width} for width in (8, 16, 32)}
 
 
 def name_of(crc: Crc) -> str:
-    """Return the catalogue name of a CRC, "" if it has none."""
+    """Return the name of a CRC in catalogues; "" without a name."""
     return _NAMES.get(crc, "")
 
 
 def single(algorithm: Checksum) -> Single:
-    """Return a function from bytes to their checksum, for single frames."""
+    """Return a fast function that computes the checksum of a single frame."""
     kind = type(algorithm)  # not isinstance: a subclass may compute another checksum
     if kind is Xor:
         return _xor
@@ -420,7 +418,7 @@ def single(algorithm: Checksum) -> Single:
 
 
 def _zlib_crc(algorithm: Crc) -> Single | None:
-    """Return a CRC computed by zlib, None if zlib does not have its polynomial."""
+    """Return a function that computes a CRC by zlib; None if zlib lacks its polynomial."""
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (
         32,
         0x04C11DB7,
@@ -476,9 +474,9 @@ def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes
 
 @lru_cache(maxsize=256)
 def _single_word_xor(algorithm: WordXor) -> Single:
-    """Return the function of a `WordXor`.
+    """Return a fast function that computes a `WordXor`.
 
-    It XORs the groups of words as wholes, and then only splits the result into words.
+    It XORs whole groups of words, and then splits the result into words.
     """
     head = algorithm.head
     groups = algorithm.groups

@@ -1,7 +1,7 @@
-"""The message types and commands of a sensor, and facts for its simulation, as values.
+"""The frame types and commands of a sensor, and facts for its simulation, as values.
 
-Everything here is immutable, checks itself when it is made, and has no engine. `spec.sensor` puts
-these values together into a `SensorDescription`.
+All values are immutable, and are checked when they are made. `spec.sensor` combines them to a
+`SensorDescription`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import Node, Sealed, children
 from lidarspec.spec.wire_forms import WireForm
 
-#: one item that a sensor sends for a command, see `Simulation.answers`.
+#: An item that a sensor sends after a command, see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
 #: a function of the number of a frame: the physical values of its fields, by path.
 Sweep = Callable[[int], Mapping[str, Any]]
@@ -59,7 +59,7 @@ def reject_unknown_arguments(described: type[_Described]) -> type[_Described]:
 
 
 def _unknown_argument(owner: str, name: str, known: Iterable[str]) -> str:
-    """Return the message about an argument that a class does not have."""
+    """Return the error message for an argument that a class does not have."""
     if name in Simulation.__dataclass_fields__:
         suggestion = f"; write {owner}(simulation=Simulation({name}=...))"
     else:
@@ -81,20 +81,22 @@ class Simulation:
     """Additional facts for the simulation of a sensor, or of one of its frame types.
 
     Args:
-        sweep: a function of the frame number i that returns the physical values, by path, of the
-            fields that are not measured: angles, counters, time.
-        encode: a function from the measured `Polar` of a batch to the raw values of its fields, by
-            path; needed if ranges have no field of their own.
-        rate: frames a second. Needed for data if neither the clock nor the times of the points
-            give it, and for other frames that the sensor sends periodically.
-        answers: command -> everything that the sensor sends for it before any data, in order: a
-            frame by name, (name, physical values by path), bytes, or the seconds of a pause, in
-            which it sends its fillers; or a function from the raw fields of the request to these.
-            The fields contain the values of a `Template` as texts, by name in braces: "{handle}",
-            and the port at which the simulated sensor serves its data: "{data_port}".
-            The default for a command is its reply. Only for a sensor, not for a frame type.
-        directions: a function of the frame number i that returns the azimuths and elevations of
-            its points, radians: two arrays that broadcast to the points of a frame. Needed for
+        sweep: a function of the frame number i that returns the physical values, by path, of fields
+            that do not depend on the scene, such as angles, counters and time.
+        encode: a function of the measured `Polar` of a batch that returns the raw values of its
+            fields, by path. Needed if no field contains the range alone.
+        rate: the number of frames per second. Needed for data frames if neither the clock nor the
+            times of the points determine it, and for other frames that the sensor sends
+            periodically.
+        answers: for each command, a list of the items that the sensor sends before any data, or a
+            function that returns this list for the raw fields of the request. An item is a frame by
+            name, (name, physical values by path), bytes, or a pause in seconds in which the sensor
+            sends its fillers. The raw fields contain the values of a `Template` as texts, by name in
+            braces: "{handle}", and "{data_port}" is the port at which the simulated sensor serves
+            its data. The default for a command is its reply. Only for a sensor, not for a frame
+            type.
+        directions: a function of the frame number i that returns the azimuths and elevations of its
+            points, radians, as two arrays that broadcast to the points of a frame. Needed for
             `Cartesian` points.
         effects: command -> a function that returns the sweep from the command on. Its arguments are
             the sweep so far and the number of the next frame; the new sweep counts from 0. Only for
@@ -115,37 +117,38 @@ class Simulation:
 @reject_unknown_arguments
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One message type.
+    """One type of message.
 
     Args:
-        struct: its construct struct, usually in a `Checksummed`.
-        direction: "in" if the sensor sends it, "out" if we send it.
-        data: whether it has the points.
-        points: a `points` function for this frame type, for sensors with several data frames. For
-            points in parts of the frame (`Parts`): the path of the parts and their function,
-            {"modules": points}, {"tlvs.points": points}.
-        imu: a function of `Fields` that returns `Imu` samples, of a data frame or another frame;
-            with a path if they are in parts, as for `points`.
-        clock: the clock of a frame that is not data, if it does not have the sensor's clock.
-        max_length: the maximum length in bytes; longer candidates are not frames. The default is
-            the size of the struct, if that is fixed.
+        struct: the construct struct of the message, usually in a `Checksummed`.
+        direction: "in" if the sensor sends the message, "out" if the host sends it.
+        data: whether the frame contains the points.
+        points: the `points` function of this frame type, if the sensor has several data frames. If
+            the points are in parts of the frame (`Parts`), a dict with the path of the parts and
+            their function, such as {"modules": points} or {"tlvs.points": points}.
+        imu: a function of `Fields` that returns the `Imu` samples of this frame type; a dict as for
+            `points` if they are in parts.
+        clock: the clock of this frame type, if it is not the clock of the sensor; not for data
+            frames.
+        max_length: the maximum length in bytes. The default is the size of the struct, if this is
+            fixed.
         plausible: a function of `Fields` that is False for values that no sensor sends; reduced
             with `all` per packet.
-        after: a frame type. This one is a candidate only while that one is the last seen of all
-            that any `after` names.
+        after: the name of another frame type, after which this frame type is valid. Of all frame
+            types that are named in an `after`, that one must have arrived last.
         confirm: the number of consecutive valid frames that are needed to accept any of them.
         simulation: facts for the simulation of this frame type. Needed if the sensor has several
             data frames, if random values never make a valid frame, or if the sensor sends this
             frame periodically.
-        acknowledged: findings of `lidarspec check` that are accepted: "LS204" or
-            "LS205 path.of.a.field" -> the reason.
-        wire: the wire form, if the fields have no fixed offsets on the wire: `Tokens`, `Lines`,
-            `Escaped`, or a form of a plugin. Then the struct describes the decoded content, and
-            `max_length`, in bytes on the wire, is required.
+        acknowledged: the reasons to accept findings of `lidarspec check`, by "LS204" or "LS205
+            path.of.a.field".
+        wire: the wire form, if the frame is encoded so that its fields have no fixed offsets:
+            `Tokens`, `Lines`, `Escaped`, or a form of a plugin. The struct then describes the
+            decoded content, and `max_length`, in encoded bytes, is required.
 
     Raises:
-        SpecError: if the struct cannot describe a frame, such as a part without an end, a part
-            that loses bytes, or two fields of one name.
+        SpecError: if the struct cannot describe a frame, for example because it has two fields of
+            one name.
     """
 
     struct: Construct
@@ -172,13 +175,13 @@ class Frame:
         if self.direction not in ("in", "out"):
             raise SpecError(f"direction must be 'in' or 'out', not {self.direction!r}")
         if self.max_length < 0 or self.confirm < 1:
-            raise SpecError("max_length and confirm must be at least 1")
+            raise SpecError("max_length and confirm must each be at least 1")
         check_simulation(self.simulation)
         freeze(self, "acknowledged")
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
                 raise SpecError(
-                    f"{name} must name parts of one kind, not {', '.join(own) or 'none'}",
+                    f"{name} must have one path of parts, got {', '.join(own) or 'none'}",
                     path=name,
                 )
         if self.data and self.clock is not None:
@@ -217,7 +220,8 @@ class Frame:
     def room(self) -> int:
         """The maximum size of the struct in bytes.
 
-        In a wire form, two characters can encode a number of eight bytes.
+        With a wire form, this is more than the maximum length of the encoded frame, because two
+        characters can encode a number of eight bytes.
         """
         if self.wire is None:
             return self.max_length
@@ -225,7 +229,7 @@ class Frame:
 
     @cached_property
     def tree(self) -> Node:
-        """The frame as nodes; made on first use.
+        """The struct of the frame as a tree of nodes; made on first use.
 
         Raises:
             SpecError: for a constant that its Enum does not have.
@@ -239,35 +243,37 @@ class Command:
 
     Args:
         frame: the outgoing frame; None for a command that only sets control lines.
-        values: values of its fields, by path; `Count(16)` is a running number, `Address()` and
-            `Port()` are this computer's own address and the port at which it expects the data,
-            `Template(...)` is a text that contains arguments and values of earlier replies.
-        args: argument name -> (field path, lowest, highest), in the field's unit; (path, Text(16)),
-            (path, Address()), (path, Port()) or (path, bytes). A path may be an element of an
-            array, "ports[1]", or the field of a `Template` that has the name of the argument.
-        reply: the frame that answers, or a tuple of the possible ones; None if no answer is
-            documented.
-        matches: values that fields of the reply must have for it to answer this command; with
-            several replies, each is compared in the fields that it has.
-        echoes: fields of the reply that repeat the field of the same path in the request.
-        refusal: the frame that the sensor sends in place of the reply if it refuses; its values
-            are reported, names of an `Enum` in words.
-        timeout: seconds to wait for the reply, each time that the command is sent.
-        retries: how often it is sent again if no reply comes; only for commands that may arrive
-            twice.
-        settle: seconds that the sensor needs after it before the next command.
-        link: the link that it goes over.
-        lines: levels of control lines that are set with it, {"dtr": False}.
-        starts, stops: whether it makes the sensor start or stop sending data.
-        only_stopped: whether the sensor answers it only while it sends no data, and ignores it
-            otherwise.
+        values: the values of fields of the frame, by path. `Count(16)` is a running number.
+            `Address()` and `Port()` are this computer's own address and the port at which it expects
+            the data. `Template(...)` is a text with arguments and values of earlier replies.
+        args: the arguments by name, each as (path of the field, lowest, highest) in the field's
+            unit, (path, Text(16)), (path, Address()), (path, Port()) or (path, bytes). A path may
+            have an index, such as "ports[1]", or may lead to a `Template` with the name of the
+            argument.
+        reply: the frame type of the reply, or a tuple of several possible types; None if no reply
+            is documented.
+        matches: the values, by path, that fields of the reply must have. With several frame types,
+            each reply is compared in the fields that it has.
+        echoes: the paths of fields that have the same value in the request and in the reply.
+        refusal: the frame type that the sensor sends instead of the reply if it refuses the
+            command. The error shows the labels of its `Enum` fields.
+        timeout: the seconds to wait for the reply each time that the command is sent.
+        retries: the number of times that the command is sent again without a reply. Only for
+            commands that do no harm if they arrive twice.
+        settle: the seconds that the sensor needs after this command before the next one.
+        link: the name of the link that the command is sent on.
+        lines: the levels of control lines that are set with the command, such as {"dtr": False}.
+        starts: whether the sensor starts to send data.
+        stops: whether the sensor stops sending data.
+        only_stopped: whether the sensor ignores the command while it sends data.
         learns: a function of the reply, as `Sensor.parse` returns it, that returns options for
-            `configure`, by name: numbers, or bytes and texts, which become `Learned`. They are
-            applied if the command is in `on_open`.
-        provides: a function of the reply, as `learns`, that returns numbers and texts by name.
-            Later commands use them in a `Template`, and a link may use them (`Tcp(reported=)`). The
-            command fails if it raises ValueError; the text of the error is the reason.
-        every: seconds after which it is sent again, repeatedly (a heartbeat); 0: never.
+            `configure` by name. Values are numbers, or bytes and texts, which become `Learned`. The
+            options are applied if the command is in `on_open`.
+        provides: a function of the reply, as for `learns`, that returns numbers and texts by name.
+            Later commands use them in a `Template`, and a link may use them (`Tcp(reported=)`). If
+            the function raises ValueError, the command fails with the text of this error.
+        every: the seconds after which the command is sent again and again (a heartbeat); 0 to send
+            it once.
     """
 
     frame: str | None = None
@@ -303,7 +309,7 @@ class Command:
 
     @property
     def filled(self) -> Mapping[str, Filled]:
-        """The values that are filled in when it is sent, by path."""
+        """The values that are filled in when the command is sent, by path."""
         return {path: value for path, value in self.values.items() if isinstance(value, Filled)}
 
     @property
@@ -313,7 +319,7 @@ class Command:
 
     @property
     def placeholders(self) -> frozenset[str]:
-        """The names in its templates that are not arguments."""
+        """The names in the templates of the command that are not arguments."""
         names = {name for template in self.templates.values() for name in template.names}
         return frozenset(names - set(self.args))
 
@@ -324,13 +330,13 @@ class Command:
 
     @property
     def has_own_port(self) -> bool:
-        """Whether it contains the port at which this computer expects the data."""
+        """Whether the command contains the port at which this computer expects the data."""
         has_port = any(isinstance(value, Port) for value in self.values.values())
         return has_port or OWN_PORT in self.placeholders
 
     @property
     def has_own_address(self) -> bool:
-        """Whether it contains this computer's address."""
+        """Whether the command contains this computer's address."""
         has_address = any(isinstance(value, Address) for value in self.values.values())
         return has_address or OWN_ADDRESS in self.placeholders
 
@@ -338,14 +344,14 @@ class Command:
     def fixed(self) -> Mapping[str, Any]:
         """The values that are the same in every frame, by path.
 
-        They are neither filled in nor arguments.
+        All values are fixed except for arguments and values that are filled in.
         """
         taken = {*self.filled, *(one.path.partition("[")[0] for one in self.arguments.values())}
         return {path: value for path, value in self.values.items() if path not in taken}
 
     @property
     def replies(self) -> tuple[str, ...]:
-        """The frames that may answer; empty if no answer is documented."""
+        """The frame types of possible replies; empty if no reply is documented."""
         if isinstance(self.reply, str):
             return (self.reply,)
         return tuple(self.reply or ())
@@ -356,8 +362,8 @@ class Relative:
     """A related model, installed or not, with packets of the same form.
 
     Args:
-        difference: the difference, in words.
-        sends: a function of the data frame's `Fields` that is True for packets that only the
+        difference: a text that describes the difference to this sensor.
+        sends: a function of the data frame's `Fields` that returns True for packets that only the
             related model sends.
     """
 
@@ -420,6 +426,6 @@ class FrameTypes(dict[str, Frame]):
 
 
 def freeze(value: object, *names: str) -> None:
-    """Replace mappings in fields of a frozen dataclass by read-only copies."""
+    """Replace the mappings in some fields of a frozen dataclass by read-only copies."""
     for name in names:
         object.__setattr__(value, name, MappingProxyType(dict(getattr(value, name))))

@@ -1,7 +1,8 @@
-"""Additions to construct: units, checksums, sizes and parts of variable size.
+"""Additions to construct for units, checksums, sizes and parts of variable size.
 
-All are ordinary members of a struct and can be nested in anything. None of them changes the raw
-integers of the wire. Units are plain names; the few that a user may type are converted exactly.
+They are ordinary members of a struct and can be nested in any construct. The raw integers of a
+frame stay the same. Units are names; the units that can be used on the command line are converted
+exactly.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def is_unit(unit: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Split a text into number and unit: "324.27deg" into "324.27" and "deg".
+    """Split a text such as "324.27deg" into number and unit.
 
     The unit is "" for a bare number.
     """
@@ -142,17 +143,17 @@ def share(text: str) -> float:
 class Scaled(layer.DescribedField):
     """A number with a unit: ``physical = raw * scale + offset``.
 
-    It parses and builds the raw number. Scale and unit are applied only if physical values are
-    requested.
+    The field parses and builds the raw number. Scale and unit are applied only if physical values
+    are requested.
 
     Args:
         subcon: a construct field that parses to a number.
-        scale: the size of one raw step, in `unit`.
-        unit: "m", "s", "deg", "deg/s", "Hz", ... ("" for a pure number).
-        offset: physical value of raw 0, in `unit`.
+        scale: the physical size of a raw step of 1, in `unit`.
+        unit: the unit, such as "m", "s", "deg", "deg/s" or "Hz"; "" for a plain number.
+        offset: the physical value of the raw value 0, in `unit`.
 
     Raises:
-        SpecError: if the scale is 0 or not a number, or arguments are in another order.
+        SpecError: if the scale is 0 or not a number, or if the arguments are in another order.
     """
 
     def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
@@ -183,18 +184,18 @@ class Scaled(layer.DescribedField):
 class SizeOf(layer.SizeField):
     """The size of another part of the frame, in bytes.
 
-    `build` fills it in and ignores a given value. A parsed frame is invalid if the part has another
-    size.
+    `build` computes the size and ignores a given value. A parsed frame is invalid if the part has
+    another size.
 
     Args:
         subcon: a field that parses to an integer, such as Int16ub.
-        part: the path of the part from the struct that contains this field: "body", "body.tags". ""
-            is that struct itself, "_." leads to the outer struct ("_.body"), and "_" is the outer
-            struct itself.
-        plus: is added to the number of bytes; negative if some bytes do not count.
+        part: the path of the part, starting from the struct that contains this field, such as
+            "body" or "body.tags". A path that starts with "_." starts from the outer struct. "" is
+            the struct itself, and "_" is the outer struct itself.
+        plus: a number that is added to the number of bytes; negative if some bytes do not count.
 
     Raises:
-        SpecError: if arguments are in another order.
+        SpecError: if the arguments are in another order.
     """
 
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
@@ -207,18 +208,19 @@ class SizeOf(layer.SizeField):
 
 
 class Checksummed(layer.SealedStruct):
-    """A struct with a checksum in one of its own fields, at any position in it.
+    """A struct with a checksum in one of its own fields, which may be anywhere in it.
 
-    It can be nested, also directly around another `Checksummed`, each with its own field.
+    It can be nested. A `Checksummed` around another `Checksummed` is a struct with two checksums.
 
     Args:
         struct: a construct Struct.
-        field: dotted name of the field (or fields, low bits first) that holds the checksum.
-        algorithm: a `Checksum`; if left out, a ``lidarspec_checksum`` hook has to supply it.
-        over: names of consecutive fields that the checksum covers; by default all bytes of the
-            struct except those that contain a bit of `field`.
-        absent: values of the field that mean "not filled": they are valid, and kept when a frame is
-            built.
+        field: the path of the field with the checksum, or the paths of several fields, low bits
+            first.
+        algorithm: the `Checksum`; if None, a ``lidarspec_checksum`` hook has to return it.
+        over: the names of consecutive fields that the checksum covers. The default is all bytes of
+            the struct, except for bytes with a bit of `field`.
+        absent: the values of the field that mean that the sensor has computed no checksum. They are
+            valid, and are kept when a frame is built.
     """
 
     def __init__(
@@ -293,7 +295,8 @@ class Checksummed(layer.SealedStruct):
     def _marked(self) -> Construct:
         """The struct with recorded member offsets.
 
-        A frame prepares its struct; the struct may also be used on its own.
+        The struct of a frame has recorded offsets already. Here they are added if the struct is
+        used without a frame.
         """
         if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct):
             return self.subcon
@@ -314,8 +317,8 @@ class Checksummed(layer.SealedStruct):
 
         Args:
             obj: one parsed struct.
-            size: of the struct in bytes.
-            base: its offset in the parsed stream.
+            size: the size of the struct in bytes.
+            base: the offset of the struct in the parsed stream.
         """
         if self.over is not None:
             spans = [self._span(obj, name) for name in self.over]
@@ -371,7 +374,7 @@ class Checksummed(layer.SealedStruct):
     def _span(self, obj: Any, name: str) -> tuple[int, int]:
         """Return the byte range of a dotted field in the parsed stream.
 
-        The range of a bit field has all bytes that contain its bits.
+        The range of a bit field includes all bytes that contain its bits.
         """
         con = self._marked
         parts = name.split(".")
@@ -389,23 +392,21 @@ layer.SealedStruct.plugin_class = Checksummed
 
 
 class Parts(layer.Partition):
-    """Consecutive structs, each with its own size.
+    """Consecutive structs of different sizes, such as the modules of a telegram.
 
-    Examples are the modules of a telegram, or tags with a type and a length. In the struct they are
-    a list. In `points` each part is a packet of its own (``Frame(points={"modules": points})``):
-    its fields are ``f.distance``, and fields of the outer frame ``f.frame.counter``. Expressions of
-    a part refer to the latter as ``this._.counter``. After the parts, ``this.modules.size`` is
-    their total size in bytes.
+    In a parsed frame the parts are a list. In the function ``Frame(points={"modules": points})``
+    each part is a packet of its own: ``f.distance`` is a field of the part, and ``f.frame.counter``
+    is a field of the outer frame. In expressions of a part, this field is ``this._.counter``. In
+    fields after the parts, ``this.modules.size`` is the total size of the parts in bytes.
 
     Args:
-        kinds: a Struct; or several by name, for parts that are distinguished by their constants.
-            The first one with matching constants is used, so a last struct without constants takes
-            unknown parts.
+        kinds: the Struct of a part, or a dict of several Structs by name. The first Struct with
+            matching constants is used, so a last Struct without constants matches all other parts.
         count: the number of parts.
-        size: the bytes of the first part of a chain, 0 for none; requires `following`.
-        following: an expression of a part's own fields for the bytes of the next part; 0 after the
-            last one.
-        within: the total bytes of all parts.
+        size: the size of the first part in bytes, 0 if there are no parts; requires `following`.
+        following: an expression of the fields of a part for the size of the next part in bytes; 0
+            after the last part.
+        within: the total size of all parts in bytes.
 
     Raises:
         SpecError: unless exactly one of `count`, `size` with `following`, and `within` is given, or
@@ -477,10 +478,10 @@ class Parts(layer.Partition):
         raise SizeofError("the size of the parts depends on their content", path=path)
 
     def _rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
-        """Return a function from the parts so far to the bytes of the next one.
+        """Return a function from the parts so far to the size of the next part in bytes.
 
-        It returns 0 if there is no further part, and -1 if the struct of the part determines its
-        size.
+        The function returns 0 if there is no further part, and -1 if the struct of the part
+        determines its size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
         bounds = (
@@ -531,7 +532,7 @@ class Parts(layer.Partition):
         parsed.spans.append((kind, *span))
 
     def _kind(self, stream: Any, context: Any, path: str) -> str:
-        """Return the first kind with matching constants, as far as there are bytes.
+        """Return the first kind with constants that match the next bytes.
 
         Raises:
             MismatchError: if no kind matches.
@@ -564,7 +565,11 @@ class Parts(layer.Partition):
         return names[-1]
 
     def _build_part(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
-        """Build a part as the first kind that accepts it; return kind, value and bytes."""
+        """Build a part as the first kind that accepts its values.
+
+        Returns:
+            The kind, the value of the part and its bytes.
+        """
         faults = list[ConstructError]()
         for name, case in self.cases.items():
             stream = io.BytesIO()

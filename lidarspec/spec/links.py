@@ -1,4 +1,4 @@
-"""The connections of a sensor, as declared: facts only; nothing here opens a port."""
+"""The declared connections of a sensor. The package `transports` opens them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from lidarspec.spec.syntax import has_member
 
 
 class Link:
-    """A kind of connection; other kinds derive from it.
+    """The base class of all kinds of connection.
 
-    The hook `lidarspec_link` opens a link of another kind.
+    If a plugin declares a kind of its own, the hook `lidarspec_link` opens it.
 
     Attributes:
         datagrams: whether each datagram is a frame.
@@ -29,8 +29,10 @@ class Serial(Link):
     """A UART or USB serial port, 8N1.
 
     Args:
-        bauds: the baud rate, or all rates that models with this id use, the most likely first.
-        dtr, rts: levels of the control lines while the port is open; None does not set them.
+        bauds: the baud rate, or several rates that sensors of this model use, the most likely
+            first.
+        dtr: the level of the control line DTR while the port is open; None to leave it unchanged.
+        rts: the level of the control line RTS while the port is open; None to leave it unchanged.
     """
 
     bauds: tuple[int, ...]
@@ -52,19 +54,19 @@ class Serial(Link):
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """The fields of a datagram that is a fragment of a message.
+    """The rule that joins datagrams, each of which is a fragment of a message.
 
     Args:
-        struct: the construct Struct of a fragment, or of its header alone.
-        key: the field, or fields, that identify a message, such as a counter; no two of 16
-            consecutive messages have the same key.
-        index: the field with the number of the fragment in its message.
-        count: the field with the number of fragments of the message.
-        payload: the field of bytes with the fragment's part of the message; "" if that is
-            everything after the struct.
+        struct: the construct Struct of a datagram, or of its header alone.
+        key: the path of the field, or the paths of several fields, that identify the message, such
+            as a counter. Any 16 consecutive messages must have different keys.
+        index: the path of the field with the index of the fragment in its message.
+        count: the path of the field with the number of fragments of the message.
+        payload: the path of the bytes that belong to the message; "" if they are all bytes after
+            the struct.
         first: the index of the first fragment.
-        in_bytes: whether `index` is the offset of the fragment in the message and `count` the size
-            of the message, both in bytes.
+        in_bytes: whether `index` is the offset of the fragment in the message, and `count` is the
+            size of the message, in bytes.
 
     Raises:
         SpecError: for a field that the struct does not have.
@@ -91,24 +93,25 @@ class Assembled:
         return tuple(self.key)
 
     def wrong(self, reason: str) -> SpecError:
-        """Return an error with the path of this declaration."""
+        """Return the error for a mistake in this declaration."""
         return SpecError(reason, path="links.data.assembled")
 
 
 @dataclass(frozen=True, init=False)
 class Udp(Link):
-    """UDP datagrams: one frame each, or pieces of a byte stream.
+    """UDP datagrams, which are frames or pieces of a byte stream.
 
     Args:
-        ports: the default destination ports. For data they are only hints, since constants and
-            length identify a frame; commands are sent to this port of the sensor.
-        stream: whether the datagrams are a byte stream, for telegrams that span several.
-        assembled: the rule that joins datagrams to messages, if a message does not fit into one;
-            other datagrams are passed on unchanged.
-        broadcast: the port to which commands are broadcast while the address of the sensor is
-            unknown; the first host that replies is the sensor.
-        local: the local port that commands are sent from, if the sensor requires one; any port by
-            default.
+        ports: the default ports. For data, they are the ports of this computer that the sensor
+            sends to. For a link that commands are sent on, it is the port of the sensor.
+        stream: whether the datagrams are pieces of a byte stream, because a frame can span several
+            datagrams.
+        assembled: the rule that joins datagrams to messages, if messages can be longer than a
+            datagram. Datagrams that do not follow this rule are used unchanged.
+        broadcast: the port to which commands are broadcast as long as the address of the sensor is
+            unknown. The first host that replies is the sensor.
+        local: the port of this computer from which commands are sent, if the sensor requires one; 0
+            for any port.
     """
 
     ports: tuple[int, ...]
@@ -173,8 +176,8 @@ class Http(Link):
 
     Args:
         port: the port of the server.
-        timeout: maximum seconds for a whole request.
-        largest: the maximum size of a reply's body in bytes; a longer reply is an error.
+        timeout: the maximum time for a request with its reply, seconds.
+        largest: the maximum size of the body of a reply, in bytes. A longer reply is an error.
     """
 
     port: int = 80

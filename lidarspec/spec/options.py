@@ -1,8 +1,8 @@
-"""Options of a sensor: which values each accepts, from annotations of `configure`.
+"""Read the accepted values of a sensor's options from annotations.
 
-The `configure` function of a plugin declares its options as keyword parameters. This module alone
-decides which values are valid, from their annotations: ``Literal["cm", "mm"]``, ``int | None``,
-``str | Path | Learned``.
+The `configure` function of a plugin declares its options as keyword parameters. The annotations of
+the parameters, such as ``Literal["cm", "mm"]``, ``int | None`` or ``str | Path | Learned``,
+determine the accepted values.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from typing import Any, Literal, Optional, Union, get_args, get_origin, get_type
 
 from lidarspec.errors import SpecError, UsageError
 
-#: size of learned content, decompressed, that is accepted from a file.
+#: The maximum size of learned content from a file, decompressed, in bytes.
 MAX_LEARNED_BYTES = 1 << 20
 
 
 class Learned(bytes):
-    """Content reported by a sensor, as the value of an option that usually is a file.
+    """Bytes that a sensor has reported, as the value of an option that is usually a file.
 
-    It is never a path. An option accepts it if its parameter has it in the annotation,
-    ``calibration: str | Path | Learned``.
+    An option accepts this type if its annotation has it, as in ``calibration: str | Path |
+    Learned``.
     """
 
     def __repr__(self) -> str:
@@ -44,7 +44,7 @@ class Learned(bytes):
         """Return the content that `to_dict` wrote.
 
         Raises:
-            UsageError: for other data, or more than a megabyte.
+            UsageError: for other data, or for more than a megabyte of content.
         """
         reader = zlib.decompressobj()
         try:
@@ -58,7 +58,7 @@ class Learned(bytes):
 
     @classmethod
     def content(cls, value: str | PathLike[str] | Learned) -> bytes:
-        """Return learned content itself, or the content of the file at a path.
+        """Return the content of the file at a path, or learned content as it is.
 
         Raises:
             UsageError: for a file that cannot be read.
@@ -72,7 +72,7 @@ class Learned(bytes):
             raise UsageError(f"{value!s}: {getattr(error, 'strerror', None) or error}") from None
 
 
-#: names that an annotation may use even if its module imports them for type checkers only.
+#: The names that an annotation may use even if its module imports them for type checkers only.
 _ANNOTATION_NAMES = {
     "Any": Any,
     "Learned": Learned,
@@ -99,7 +99,8 @@ def _is_instance(kind: type, value: object) -> bool:
     return isinstance(value, kind)
 
 
-#: type in an annotation -> test of a value. A value of any other type is left to the plugin.
+#: For types in an annotation, a function that tests a value. The plugin checks values of all other
+#: types.
 _TESTS: dict[object, Callable[[object], bool]] = {
     PathLike: _is_path,
     Learned: partial(_is_instance, Learned),
@@ -109,7 +110,7 @@ _TESTS: dict[object, Callable[[object], bool]] = {
     str: partial(_is_instance, str),
     NoneType: partial(_is_instance, NoneType),
 }
-#: type in an annotation -> its name in messages.
+#: The names of types in messages.
 _WORDS: dict[object, str] = {
     PathLike: "a path",
     Learned: "data reported by the sensor",
@@ -122,12 +123,13 @@ _WORDS: dict[object, str] = {
 
 @dataclass(frozen=True)
 class OptionType:
-    """The values that an option takes.
+    """The values that an option accepts.
+
+    An option without types and choices accepts any value.
 
     Attributes:
-        types: the types in its annotation; all values are accepted if there is neither a type nor a
-            choice.
-        choices: the values of a `Literal`.
+        types: the types in the annotation.
+        choices: the values of a `Literal` in the annotation.
     """
 
     types: tuple[object, ...] = ()
@@ -201,7 +203,7 @@ def option_types(function: Callable[..., Any] | None) -> dict[str, OptionType]:
 
 
 def _evaluate(option: str, annotation: str, names: Mapping[str, Any]) -> object:
-    """Return the object for an annotation that is written as text."""
+    """Return the type of an annotation that is written as text."""
     holder = SimpleNamespace(__annotations__={option: annotation})
     try:
         return get_type_hints(holder, globalns=dict(names))[option]

@@ -1,8 +1,9 @@
 """Return values of a sensor's `points` function: columns of a batch of packets.
 
-The engine makes a `PointCloud` of them: it flattens the columns, and handles coordinates, masks,
-REP-103 and REP-117. Conventions of the columns: metres, radians, seconds; azimuth counter-clockwise
-from the manual's zero direction, elevation from the horizon; a range of 0 is no return.
+The engine converts them to a `PointCloud`: it flattens the columns, and computes coordinates and
+masks by REP-103 and REP-117. Columns are in metres, radians and seconds. Azimuth is
+counter-clockwise from the manual's zero direction, and elevation is measured from the horizon. A
+range of 0 means no return.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ import numpy as np
 
 from lidarspec.errors import SpecError
 
-#: a value that broadcasts against the packets: a column, a NumPy array or a number.
+#: A column, or a NumPy array or number that broadcasts with columns.
 Array = Any
 
-#: valid name of an additional column; names in `TAKEN` already have a meaning.
+#: The valid names of additional columns, except for the names in `TAKEN`.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 TAKEN = frozenset(
     (
@@ -63,11 +64,11 @@ class Extra:
 
     Args:
         values: a column, an array or a number; nan if a point has no value.
-        unit: for example "m/s"; "" for a pure number. The default for values that are an unchanged
-            field is the field's unit.
-        dtype: a numeric NumPy type. The default is the type of the wire for values that are an
-            unchanged integer field, bool for conditions, and float32 otherwise. In an integer type
-            nan becomes 0.
+        unit: the unit, for example "m/s"; "" for a plain number. The default is the unit of the
+            field, if the values are an unchanged field.
+        dtype: a numeric NumPy type. The default is the type of the field if the values are an
+            unchanged integer field, bool if they are conditions, and float32 otherwise. In an
+            integer type nan becomes 0.
     """
 
     values: Array
@@ -87,7 +88,7 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     """Return the additional columns by name, each as an `Extra`.
 
     Raises:
-        SpecError: for an invalid name, or one that already has a meaning.
+        SpecError: for an invalid name, or the name of a standard column.
     """
     for name in extra:
         if not _NAME.fullmatch(name) or name in TAKEN:
@@ -106,8 +107,8 @@ class Polar:
     """Points given by range and direction.
 
     Args:
-        range: metres; 0 is no return, `inf` is kept, nan is invalid.
-        azimuth: radians, counter-clockwise seen from above; a nan makes the point invalid.
+        range: metres; 0 or inf without a return, nan if the point is invalid.
+        azimuth: radians, counter-clockwise seen from above; if it is nan, the point is invalid.
         elevation: radians above the horizon.
         intensity: the number on the wire; None if the sensor has none.
         time: seconds after the packet's clock.
@@ -148,8 +149,8 @@ class Cartesian:
     """Points given by coordinates.
 
     Args:
-        x, y, z: metres, x forward, y left, z up; all three 0 is no return; a nan or infinite one
-            makes the point invalid.
+        x, y, z: metres, x forward, y left, z up. A point without a return has three zeros. A point
+            with a nan or infinite coordinate is invalid.
         intensity: the number on the wire; None if the sensor has none.
         time: seconds after the packet's clock.
         ring: number of the laser or channel; None if there is none.
@@ -189,16 +190,17 @@ Points = Polar | Cartesian
 class Imu:
     """Measurements of an IMU in the sensor, in SI units and the axes of the points.
 
-    The axes are those of REP-145: x forward, y left, z up.
+    The axes are x forward, y left and z up (REP-145).
 
     Args:
-        angular_velocity: about x, y and z, rad/s, right-handed: positive about z turns to the left.
-        linear_acceleration: along x, y and z, m/s2, including gravity: a level sensor at rest has
-            +9.80665 along z.
+        angular_velocity: three columns, about x, y and z, rad/s, right-handed. A turn to the left
+            is positive about z.
+        linear_acceleration: three columns, along x, y and z, m/s2, including gravity. A level
+            sensor at rest has +9.80665 along z.
         time: seconds after the packet's clock.
 
     Raises:
-        SpecError: unless there are three columns of each.
+        SpecError: for another number of columns.
     """
 
     angular_velocity: tuple[Array, Array, Array]

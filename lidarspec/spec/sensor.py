@@ -1,9 +1,9 @@
 """The facts of a sensor's manual as fields of a `SensorDescription`.
 
-A description is immutable. It checks that its parts fit together when it is made. The engines
-(`frames`, `framing`, `points`, `packets`, `scans`) are functions of a description. Plugins and
-users make a `lidarspec.Sensor`, the subclass with methods that call the engines. Its module,
-`sensor_operations`, is a layer above the engines.
+A description is immutable. When it is made, it checks that its parts fit together. The packages
+`frames`, `framing`, `points`, `packets` and `scans` work from a description. Plugins and users make
+a `lidarspec.Sensor`, which is the subclass with methods that call these packages (see
+`sensor_operations`).
 """
 
 from __future__ import annotations
@@ -49,31 +49,31 @@ from lidarspec.trusted_files import resolve_beside
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: version of the plugin interface; the engine reads this one and the previous one.
+#: The version of the plugin interface. Plugins for this version and the previous one are accepted.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
-#: a valid key of `Sensor.info`.
+#: The valid keys of `Sensor.info`.
 _FACT = re.compile(r"[a-z][a-z0-9_]*")
 #: names of the returns of a firing; "varying" if a setting of the sensor decides.
 RETURN_NAMES = ("first", "last", "strongest", "second strongest", "varying")
-#: directions of the vendor's axes; in REP-103 x points forward, y left and z up.
+#: The possible directions of a vendor's axes.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
-#: options that every sensor has.
+#: The options that every sensor has.
 OPTIONS = ("frame", "answer", "cut", "epoch")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 _Sensor = TypeVar("_Sensor", bound="SensorDescription")
-#: a text that an untrusted file may give as an option, because it cannot be a path.
+#: The texts that an untrusted file may use as an option, because they cannot be paths.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
 
 
 @reject_unknown_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorDescription:
-    """The facts of one sensor. `lidarspec.Sensor` describes each field as an argument.
+    """The facts of one sensor; `lidarspec.Sensor` explains each of them.
 
     Raises:
-        SpecError: for an invalid id or status, or if a part refers to one that does not exist.
+        SpecError: for an invalid fact, or a reference to a part that the sensor does not have.
     """
 
     id: str
@@ -125,10 +125,10 @@ class SensorDescription:
 
     @property
     def data_frame(self) -> str:
-        """The name of the frame type with the points; if there are several, the selected one.
+        """The name of the frame type with the points, or the selected one of several.
 
         Raises:
-            UsageError: for a sensor without points; the message lists its frame types.
+            UsageError: for a sensor without points. The error lists its frame types.
             UnknownFrame: for a sensor that needs a file first and has no frame types yet.
         """
         names = self.data_frames
@@ -152,21 +152,21 @@ class SensorDescription:
 
     @property
     def has_points(self) -> bool:
-        """Whether a frame type has points; True for a sensor that has no frames yet."""
+        """Whether the sensor has points; True for a sensor that has no frame types yet."""
         return bool(self.data_frames) or not self.frames
 
     def require_points(self) -> None:
-        """Raise UsageError for a sensor without points; the message lists its frame types."""
+        """Raise UsageError for a sensor without points. The error lists its frame types."""
         if not self.has_points:
             example = next(iter(self.incoming), "")
             raise UsageError(
-                f"{self.id} has no points: name a frame type, such as frame={example!r}; there are"
+                f"{self.id} has no points: name a frame type, such as frame={example!r}; it has"
                 f" {', '.join(self.incoming) or 'none'}"
             )
 
     @cached_property
     def main_frames(self) -> tuple[str, ...]:
-        """The names of the data frames; of a sensor without points, all incoming frames."""
+        """The names of the data frames, or of all incoming frames if the sensor has no points."""
         return self.data_frames or tuple(self.incoming)
 
     @cached_property
@@ -188,10 +188,10 @@ class SensorDescription:
     def points_of(self, frame: str) -> Callable[[Any], Points]:
         """Return the `points` function of a frame type.
 
-        A data frame without its own function has the function of the sensor.
+        A data frame without a function of its own uses the function of the sensor.
 
         Args:
-            frame: a name, or "name.path" for the parts of a frame.
+            frame: the name of a frame type, or "name.path" for the parts of a frame.
 
         Raises:
             SpecError: if the frame type has no points.
@@ -210,10 +210,11 @@ class SensorDescription:
         """Return the `imu` function of a frame type.
 
         Args:
-            frame: a name, or "name.path" for the parts of a frame.
+            frame: the name of a frame type, or "name.path" for the parts of a frame.
 
         Raises:
-            SpecError: if it has none; the message lists the frame types that have one.
+            SpecError: if the frame type has no such function. The error lists the frame types with
+                one.
         """
         name, _, parts = frame.partition(".")
         function = self.frames[name].imu
@@ -233,7 +234,8 @@ class SensorDescription:
         """Return the path of the parts of a frame that have `points` or `imu`.
 
         Returns:
-            "" if the frame itself has the function, or if the frame does not exist.
+            The path; "" if the frame itself has the function, or if the sensor does not have the
+            frame type.
         """
         if frame not in self.frames:
             return ""
@@ -246,7 +248,7 @@ class SensorDescription:
     def simulation_of(self, frame: str) -> Simulation:
         """Return the simulation facts of a frame type.
 
-        For a data frame, facts that it does not declare are those of the sensor.
+        For a data frame, facts that the frame type does not declare are taken from the sensor.
         """
         declared = self.frames[frame]
         if declared.data:
@@ -291,9 +293,10 @@ class SensorDescription:
 
 
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
-    """Return a sensor with only these frame types, without references to others.
+    """Return a copy of a sensor with only these frame types.
 
-    It has no commands, no state, and no fields with information about the device.
+    The copy has no commands, no state, no `info` fields, and no other references to missing frame
+    types.
     """
     clock = sensor.clock
     if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
@@ -352,7 +355,9 @@ def _check_points(sensor: SensorDescription) -> None:
     for name in ("scan", "range_limits"):
         if getattr(sensor, name) is None:
             raise SpecError(
-                "missing: needed for a sensor with a data frame", path=name, sensor=sensor.id
+                "this argument is required for a sensor with a data frame",
+                path=name,
+                sensor=sensor.id,
             )
 
 
@@ -372,14 +377,15 @@ def _check_facts(sensor: SensorDescription) -> None:
         )
     if not API - 1 <= sensor.api <= API:
         raise SpecError(
-            f"written for plugin interface {sensor.api}; this version supports {API - 1} and {API}",
+            f"the sensor requires version {sensor.api} of the plugin interface; this lidarspec"
+            f" supports {API - 1} and {API}",
             path="api",
             sensor=sensor.id,
         )
     for name, frame in sensor.frames.items():
         if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
             raise SpecError(
-                f"{frame.endless.reason}; only a datagram ends it",
+                f"{frame.endless.reason}; without one, it can only be sent in datagrams",
                 path=f"{name}.{frame.endless.path}".strip("."),
                 sensor=sensor.id,
                 rule=frame.endless.rule,
@@ -416,7 +422,7 @@ def _check_facts(sensor: SensorDescription) -> None:
 
 
 def _comes_in_datagrams(sensor: SensorDescription, frame: Frame) -> bool:
-    """Return whether a frame is never part of a byte stream that the sensor sends."""
+    """Return whether the sensor never sends a frame as part of a byte stream."""
     if frame.direction == "out":
         return True
     if frame.data and "data" in sensor.links:
@@ -477,9 +483,9 @@ def _check_clock(sensor: SensorDescription) -> None:
 def _check_names(
     sensor: SensorDescription, path: str, names: Iterable[str | None], table: Mapping[str, Any]
 ) -> None:
-    """Raise `SpecError` for the first name that is not in a table; None is valid.
+    """Raise `SpecError` for the first name that is not in a table; None is allowed.
 
-    A sensor without frames, which needs a file first, is not checked.
+    A sensor without frame types, which needs a file first, is not checked.
     """
     for name in names:
         if name is not None and name not in table and sensor.frames:
@@ -492,21 +498,22 @@ def _check_names(
 
 @dataclass(frozen=True)
 class Configure:
-    """Callable that makes a sensor with options: ``sensor.configure(...)``.
+    """The method ``sensor.configure(...)``, which returns a sensor with options.
 
-    Every sensor has the options in `OPTIONS`. The sensor's own function declares the others.
+    Every sensor has the options in `OPTIONS`. The `configure` function of the plugin declares
+    further options.
     """
 
     sensor: SensorDescription
     function: Callable[..., SensorDescription] | None
 
     def __call__(self, **options: Any) -> SensorDescription:
-        """Return a new sensor with these options; the old sensor is not changed.
+        """Return a copy of the sensor with these options.
 
         Raises:
             UnknownOption: for an option that the sensor does not have.
             UsageError: for a value that an option does not accept.
-            PluginError: if the sensor's own function fails in another way.
+            PluginError: if the plugin's function raises any other error.
         """
         sensor = self.sensor
         _check_shared(sensor, options)
@@ -536,16 +543,17 @@ class Configure:
         return tuple(name for name, option in self.types.items() if option.is_file)
 
     def takes(self, name: str, value: object) -> bool:
-        """Return whether an option accepts a value; True for an unknown option."""
+        """Return whether an option accepts a value; True if the option is unknown."""
         return self.types.get(name, OptionType()).accepts(value)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Return the options of an untrusted file in `folder`.
+        """Return the options of an untrusted file, with whole paths.
 
-        Valid values are numbers, words, learned content, and paths of files in or below the folder.
+        Valid values are numbers, words, learned content, and paths of files in `folder` or below
+        it.
 
         Raises:
-            UsageError: for a path out of the folder, or another value.
+            UsageError: for a path outside the folder, or any other value.
         """
         checked = dict(options)
         for name, value in options.items():
@@ -562,7 +570,7 @@ class Configure:
         return checked
 
     def _call_function(self, options: Mapping[str, Any]) -> SensorDescription:
-        """Return the result of the sensor's own function, with hooks applied."""
+        """Return the sensor that the plugin's function makes, with hooks applied."""
         sensor = self.sensor
         if self.function is None:
             raise UnknownOption(min(options), OPTIONS, place=sensor.id)
@@ -594,7 +602,7 @@ class Configure:
 
 
 def _refuse_pipe(path: str | PathLike[str]) -> None:
-    """Raise `UsageError` for a pipe or device, which may never end."""
+    """Raise `UsageError` for a pipe or device, because it may never end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise UsageError(
             f"{path!s}: expected a regular file, not a pipe or device; write its content to a"
@@ -608,7 +616,9 @@ def _check_cut(sensor: SensorDescription, degrees: object) -> None:
         isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle)
     )
     if not has_angle:
-        raise UsageError(f"{sensor.id}: cut cannot be set, because scans are not cut at an angle")
+        raise UsageError(
+            f"{sensor.id}: cut cannot be set, because its scans are not cut at an angle"
+        )
     if (
         isinstance(degrees, bool)
         or not isinstance(degrees, Real)
@@ -618,7 +628,7 @@ def _check_cut(sensor: SensorDescription, degrees: object) -> None:
 
 
 def _check_epoch(sensor: SensorDescription, epoch: object) -> None:
-    """Raise `UsageError` if the sensor has no clock, or the clock cannot count this."""
+    """Raise `UsageError` if the clock of the sensor cannot count from this epoch."""
     if sensor.clock is None and sensor.frames:
         raise UsageError(f"{sensor.id}: epoch cannot be set, because the sensor has no clock")
     if epoch not in EPOCHS:

@@ -19,12 +19,12 @@ from lidarspec.errors import SpecError
 
 HOUR_S = 3600
 _DAY_S = 86_400
-#: days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
+#: The days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
 _EPOCH_DAYS = 719_469
-#: times are counted in 64-bit nanoseconds: 292 years.
+#: Times in 64-bit nanoseconds are limited to 292 years.
 MAX_CLOCK_S = 2**63 / 1e9
-#: a field path, several that add up, or a function of the frame's `Fields` (returning a column or
-#: several).
+#: A field path, several paths of fields to add, or a function of `Fields` that returns one column
+#: or several columns to add.
 Source = str | tuple[str, ...] | Callable[[Any], Any]
 #: What a clock can count, by the name in `Clock.epoch`. "utc", "tai" and "gps" count from 1970, so
 #: that they differ by leap seconds only: in 2017 to 2026, TAI is 37 s and GPS time 18 s ahead of
@@ -46,8 +46,9 @@ class OnWrap:
     """Cut when a circular column passes `at`.
 
     Args:
-        name: a field path of an angle ("blocks.azimuth": cut between the rows of that array) or a
-            point column ("azimuth": cut between points).
+        name: the path of an angle field, or the name of a point column. With a field in an array,
+            such as "blocks.azimuth", scans are cut between the elements of the array. With a
+            column, such as "azimuth", they are cut between points.
         at: the angle, in the unit of the field; radians for a point column.
     """
 
@@ -74,9 +75,9 @@ class OnChange:
 
     Args:
         name: a field path.
-        angle: the path of a field with the angle at which a packet begins. It increases evenly as a
-            rotating sensor turns. "" if the frame has no such field. It is used to find a masked
-            sector, in which scans are then cut, and by `configure(cut=)`.
+        angle: the path of a field with the angle at which a packet begins, which increases evenly
+            as the sensor rotates; "" if the frame has no such field. It is used to find a masked
+            sector, and by `configure(cut=)`.
         full: the increase of `angle` in one revolution, in its unit.
     """
 
@@ -90,9 +91,10 @@ class OnJump:
     """Cut before every packet (or row) with a large step of the field `name`.
 
     Args:
-        name: a field path. Steps of an angle are measured the short way around the circle.
-        by: the smallest step that cuts, in either direction; in the unit of the field, more than
-            its largest step within a scan.
+        name: a field path. Steps of an angle are measured in the shorter direction around the
+            circle.
+        by: the smallest step, in either direction, that ends a scan, in the unit of the field. It
+            has to be larger than all steps within a scan.
     """
 
     name: str
@@ -121,7 +123,7 @@ class ClockState:
     """The meaning of one value of a clock's status.
 
     Args:
-        meaning: a few words for users, for example "locked to PTP".
+        meaning: a short description, for example "locked to PTP".
         locked: whether the clock follows its source of time; None if the manual does not say.
         epoch: what the clock counts in this state (a key of `EPOCHS`); None for the epoch of the
             clock.
@@ -167,7 +169,10 @@ class ClockStatus:
         object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
 
     def state_of(self, value: float) -> ClockState:
-        """Return the meaning of a value; a value without one is neither locked nor unlocked."""
+        """Return the state for a value.
+
+        For a value that is not declared, `locked` is None.
+        """
         if value in self.states:
             return self.states[int(value)]
         return ClockState("unknown" if value != value else f"unknown value {value:g}")
@@ -178,27 +183,28 @@ class Clock:
     """The sensor's own clock.
 
     Args:
-        source: the field, the fields that add up (seconds and microseconds), or a function of
-            `Fields` that returns a column, or several that add up, in seconds. Terms are summed as
-            integer nanoseconds. `unix_time` converts the fields of a date.
-        wraps_at: seconds after which it starts again at 0; None if it does not.
-        pace: a function of `Fields` that returns the seconds from a packet to the next, nan if
-            unknown. If there is no counter, it shows losses. With a counter it shows how often a
-            short counter has wrapped in a gap, and whether a number that jumps is corrupt; then it
-            has to be right in every mode. A clock without it counts no loss. It distinguishes
-            related models; if it is left out, the pace of a simulation does.
-        reference: another frame type that completes a clock that starts again: it has the clock's
-            field too. With it a function of its `Fields` that returns seconds since 1970, nan if
-            the frame has no date. The first frame with a date decides: from the start of a file,
-            and for live packets from that frame on.
+        source: the path of a field, the paths of several fields that are added (such as seconds and
+            microseconds), or a function of `Fields` that returns one column or several columns that
+            are added, in seconds. Terms are added as integer nanoseconds. `unix_time` converts the
+            fields of a date.
+        wraps_at: the seconds after which the clock starts again at 0; None if it does not.
+        pace: a function of `Fields` that returns the seconds from a packet to the next one, nan if
+            unknown; None if not declared. Without a counter, lost packets are found by the pace.
+            With a counter, the pace shows how often the counter has wrapped in a gap, and whether a
+            value of the counter is corrupt; it then has to be correct in every mode of the sensor.
+            The pace is also used to distinguish related models.
+        reference: a pair for a clock that starts again: the name of another frame type, which also
+            has the field of the clock, and a function of its `Fields` that returns the date in
+            seconds since 1970, nan if unknown. The first frame with a date is used, in a file for
+            all packets, and for live data for the packets after this frame.
         epoch: what the clock counts, a key of `EPOCHS`: "boot", "utc", "tai", "gps" or "hour"; ""
             if the manual does not say. With `status` it is the epoch of a locked clock. The option
             `epoch` of every sensor replaces it.
-        status: the field that says whether the clock is locked; None if the sensor does not send
+        status: the field that shows whether the clock is locked; None if the sensor does not send
             it.
 
     Raises:
-        SpecError: if `wraps_at` is not positive, or too long to ever be reached, or if the epoch is
+        SpecError: if `wraps_at` is not positive or longer than 292 years, or if the epoch is
             unknown.
     """
 
@@ -244,14 +250,15 @@ def _check_epoch(epoch: str, path: str) -> None:
 
 @dataclass(frozen=True)
 class PacketCounter:
-    """A counter of packets. A jump is a loss.
+    """A counter of packets, whose jumps show lost packets.
 
-    If a clock with a declared pace shows no gap, the jump is not a loss.
+    If a clock with a declared pace shows no gap, a jump is not counted as a loss.
 
     Args:
-        field: path of the counter.
-        first, last: its lowest and highest value. `last` may be a function of `Fields`; by default
-            it is the largest value of the field.
+        field: the path of the counter.
+        first: the lowest value of the counter.
+        last: the highest value of the counter, or a function of `Fields` that returns it; by
+            default the largest value of the field.
         returns: the number of consecutive packets that contain the returns of the same firings, one
             return each; a number or a function of `Fields`. The first packet of such a group has
             the counter `first`, or a multiple of `returns` more.
@@ -268,14 +275,14 @@ def unix_time(
 ) -> Any:
     """Return the seconds from 1970-01-01 to a date of the Gregorian calendar, in UTC.
 
-    The arguments are numbers, arrays or columns. It is used in the `source` of a `Clock`, where a
-    fraction of a second is a separate term, so that nanoseconds stay exact.
+    The arguments are numbers, arrays or columns. The function is used in the `source` of a `Clock`.
+    A fraction of a second is a separate term of the source, so that nanoseconds are exact.
 
     Args:
         year: with its century, for example 2026.
         month: 1 to 12.
         day: 1 to 31.
-        hour, minute, second: the time of day; values beyond the usual range are added.
+        hour, minute, second: the time of day; a value beyond its usual range is added as well.
 
     Returns:
         float64, the broadcast shape; whole seconds are exact.

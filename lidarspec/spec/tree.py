@@ -1,9 +1,10 @@
 """The frame tree: a frame type as a tree of nodes in wire order.
 
-`lidarspec.spec.syntax` makes the tree from an author's struct, once for each frame type. Schemas,
-layouts, examples, wire tables, explanations and exports walk it (`children`, `nodes`) and do not
-use construct. Nodes are immutable. A node has its meaning (`FieldInfo` if it has a value) and its
-storage. Its offset is the sum of the sizes of the nodes before it.
+`lidarspec.spec.syntax` makes the tree from a plugin's struct, once for each frame type. Schemas,
+layouts, examples, wire tables, explanations and exports iterate over it (`children`, `nodes`) and
+do not use construct. Nodes are immutable. A node describes how bytes are stored, and its
+`FieldInfo` describes their value. The offset of a node is the sum of the sizes of the nodes before
+it.
 
     Struct          a sequence of members
     Sealed          a Struct with a checksum
@@ -12,7 +13,7 @@ storage. Its offset is the sum of the sizes of the nodes before it.
     Block           bytes that contain one or more integers as bits (`Part`)
     Repeat          an array: one element, repeated
     Parts           frames within the frame, one after another, each with its own size
-    When            a node or another one, by a condition
+    When one of two nodes, by a condition
     Select          one of several nodes, by a key
     Empty           no bytes
     Check           no bytes; a condition that the frame must meet
@@ -20,19 +21,19 @@ storage. Its offset is the sum of the sizes of the nodes before it.
     Derived         no bytes; a value made from other bytes of the frame
     Opaque          a part that only construct can read
 
-Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and
-operations on both (`Op`). An expression that cannot be converted to a formula is `Untraced`. Then
-construct reads the frames.
+Counts, lengths, conditions and keys are formulas, which consist of numbers, references to fields
+(`Ref`) and operations on both (`Op`). An expression that cannot be converted to a formula is
+`Untraced`. construct then reads the frames.
 
-Parts are in the tree twice. `Kind.element` has paths from the top of the frame, as the author
-described it. `Kind.root` is a frame of its own with paths from the start of the part; layouts and
-tables are made from it.
+The tree has each kind of parts twice. The paths in `Kind.element` start at the top of the frame, as
+in the plugin's struct. `Kind.root` describes the part as a frame of its own, so its paths start at
+the part. Layouts and tables are made from `Kind.root`.
 
-A field that declares the size of a part (`FieldInfo.held`) has a formula made from the sizes of the
-nodes of the part (`size`). The size of padding is a formula too. An array is identified by its axis
-(`Repeat.axis`, `FieldInfo.axes`). One element of an array is an index in the path of a `Ref`.
-A wire form, which recodes the bytes before they are parsed, belongs to the `Frame`, not to its
-tree.
+A field that declares the size of a part (`FieldInfo.held`) has a formula that adds the sizes of the
+nodes of the part (`size`). The size of padding is a formula as well. An array is identified by its
+axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of an array contains
+an index. A wire form, which decodes the bytes before they are parsed, belongs to the `Frame`, not
+to the tree.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
 
-#: the name that is displayed for an unnamed constant.
+#: The name that is displayed for an unnamed constant.
 UNNAMED = "(constant)"
 
 
 def to_exact(number: float | int) -> Fraction:
-    """Return a float as the decimal number that it prints as: 0.001 is 1/1000."""
+    """Return a number as a fraction of its shortest decimal form: 0.001 is 1/1000."""
     if isinstance(number, float):
         return Fraction(repr(float(number)))
     return Fraction(number)
@@ -65,18 +66,18 @@ def to_exact(number: float | int) -> Fraction:
 
 @dataclass(frozen=True, eq=False)
 class Adapter:
-    """Functions between the raw values of a field and the values in a parsed frame.
+    """Functions that convert between the raw values of a field and decoded values.
 
-    They describe construct's ExprAdapter and its texts. Columns have the decoded values too, unless
-    `dtype` is uint8 for bytes.
+    They represent an ExprAdapter or a text of construct. A parsed frame has the decoded values.
+    Columns have them as well, unless `dtype` is uint8.
 
     Attributes:
-        decode: the function of an integer, or of the bytes of the field.
-        encode: the function of a value, and of the size of a field of bytes.
-        dtype: the dtype of a column; uint8 if columns have the bytes of the wire.
-        allowed: the raw values that can be decoded; None if all can, or if only `decode` can test
-            it.
-        is_partial: whether some raw values cannot be decoded, so that these frames are invalid.
+        decode: a function that decodes an integer, or the bytes of the field.
+        encode: a function that encodes a value, given the value and the size of the field in bytes.
+        dtype: the dtype of a column; uint8 if columns have the raw bytes.
+        allowed: the raw values that can be decoded; None if all values can be decoded, or if only
+            `decode` shows which ones.
+        is_partial: whether a frame can be invalid because a raw value cannot be decoded.
         form: how the value is stored, as text to display; "" for a plain number.
     """
 
@@ -93,10 +94,10 @@ class Adapter:
         return self.dtype != np.uint8
 
     def decode_column(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[Any]:
-        """Return the values of a column, of the shape of its fields.
+        """Return the decoded values of a column.
 
         Args:
-            raw: integers, or bytes along the last axis.
+            raw: the raw values, as integers or as bytes along the last axis.
         """
         values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         decoded = np.empty(len(values), self.dtype)
@@ -105,7 +106,7 @@ class Adapter:
         return np.asarray(decoded[where]).reshape(shape)
 
     def can_decode(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[np.bool_]:
-        """Return which raw values can be decoded, as booleans of the shape of the fields."""
+        """Return whether each raw value of a column can be decoded, as booleans."""
         values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         valid = np.zeros(len(values), np.bool_)
         for index, value in enumerate(values):
@@ -120,9 +121,9 @@ class Adapter:
 def _find_distinct(
     raw: NDArray[Any], *, is_bytes: bool
 ) -> tuple[list[Any], NDArray[np.intp], tuple[int, ...]]:
-    """Return the distinct values of a column, their indices, and the column's shape.
+    """Return the distinct values of a column, an index array, and the column's shape.
 
-    Each value of the column has an index into the distinct values.
+    The index array has, for each value of the column, its index among the distinct values.
     """
     if not is_bytes:
         values, where = np.unique(raw, return_inverse=True)
@@ -142,25 +143,26 @@ class FieldInfo:
     """One field of a frame.
 
     Attributes:
-        path: dotted, without indices: "points.distance".
-        axes: paths of the arrays it is in, outermost first; a bytes field adds its own path.
-        dtype: dtype of the raw value in native byte order; None if only construct knows it.
+        path: the path without indices, such as "points.distance".
+        axes: the axes of the arrays that contain the field, outermost first. A field of bytes adds
+            its own path.
+        dtype: the dtype of the raw value in native byte order; None if only construct can read it.
         kind: "int", "float", "bytes" or "other".
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
-        docs: the author's documentation.
-        bits: width in bits; 0 if it is not fixed.
-        const: the value that it must have; None for any.
-        allowed: the raw values that it may have (construct's OneOf, NoneOf and Mapping), in their
-            order; None for any.
-        rebuilt: the formula of its value when a frame is built (construct's Rebuild); None if the
-            caller supplies the value.
-        default: the value in a built frame if the caller supplies none: a raw value or a formula.
+        docs: the documentation of the field in the plugin.
+        bits: the width in bits; 0 if the width is not fixed.
+        const: the value that the field must have; None for any value.
+        allowed: the raw values that the field may have (construct's OneOf, NoneOf and Mapping), in
+            ascending order; None for any value.
+        rebuilt: the formula of the value in a built frame (construct's Rebuild); None if the caller
+            supplies the value.
+        default: the raw value, or its formula, in a built frame if the caller supplies no value.
             For bytes, a pattern of one byte that fills the field.
-        held: True if a parsed frame must have the value of `rebuilt` (`SizeOf`).
-        labels: names of raw values (construct's Enum).
-        optional: True if some headers leave the field out.
-        measured: True if the author declared a unit, or that it is a pure number.
-        adapter: the functions that make other values of the raw ones; None without.
+        held: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
+        labels: the names of raw values (construct's Enum).
+        optional: whether some frames do not have the field.
+        measured: whether the plugin declares a unit, or declares that the value is a plain number.
+        adapter: the functions that decode raw values; None if raw values are not decoded.
     """
 
     path: str
@@ -184,7 +186,7 @@ class FieldInfo:
 
     @functools.cached_property
     def name(self) -> str:
-        """The last part of the path."""
+        """The last name of the path."""
         return self.path.rpartition(".")[2]
 
     @functools.cached_property
@@ -211,14 +213,14 @@ class FieldInfo:
     def raw(self, physical: Any) -> Any:
         """Convert physical values to raw values.
 
-        Values of an integer field are rounded to the nearest raw value, ties to the even value.
+        Values of an integer field are rounded to the nearest raw value, or to the even one of two.
 
         Args:
             physical: a number in the field's unit, or an array of any shape.
 
         Returns:
-            An int, or int64 of the same shape; floats for a float field. They may exceed the
-            field's limits.
+            An int, or an int64 array of the same shape; floats for a float field. The values may
+            exceed the limits of the field.
         """
         if isinstance(physical, Fraction):
             steps: Any = (physical - to_exact(self.offset)) / to_exact(self.scale)
@@ -245,7 +247,7 @@ class FieldInfo:
 
     @property
     def initial(self) -> int:
-        """The raw value used if none is given: 0, or the first allowed value."""
+        """The raw value if no value is given: 0, or the first allowed value."""
         if self.allowed is None or 0 in self.allowed:
             return 0
         return self.allowed[0]
@@ -269,7 +271,7 @@ def find_runs(values: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def format_hex(value: object) -> str:
-    """Return bytes and integers in hexadecimal, other values as Python shows them."""
+    """Return the text of a value: bytes and integers in hexadecimal, others by `repr`."""
     if isinstance(value, bytes):
         return value.hex(" ")
     if isinstance(value, int):
@@ -291,8 +293,8 @@ class Ref:
     """A reference to the raw value of a field before the formula.
 
     Attributes:
-        path: from the top of the frame, dotted. Without indices, it refers to the field in the same
-            element of each array.
+        path: the path from the top of the frame. Without indices, it refers to the field in the
+            current element of each array.
         info: the field.
     """
 
@@ -302,13 +304,13 @@ class Ref:
 
 @dataclass(frozen=True)
 class Op:
-    """An operation on integers, with Python's semantics.
+    """An operation on integers, as in Python.
 
     ``//`` and ``%`` round down. Comparisons return 1 or 0.
 
     Attributes:
-        symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one. A
-            computed value can also have / and floats.
+        symbol: one of + - * // % & | ^ << >> == != < <= > >= with two arguments, or - and not with
+            one argument. The formula of a `Derived` value can also have / and floats.
     """
 
     symbol: str
@@ -319,12 +321,12 @@ class Op:
 class Untraced:
     """An expression that cannot be converted to a formula.
 
-    An example is a Python function with branches. construct reads the frames of a struct that
-    contains it, one at a time.
+    An example is a Python function with branches. If a struct contains such an expression,
+    construct reads its frames one at a time.
 
     Attributes:
-        reason: why it cannot be converted, with the path of its part.
-        text: the expression of the spec, with whole paths of fields; "?" for a function.
+        reason: the reason, preceded by the path of the field with the expression.
+        text: the expression in the plugin, with whole paths of fields; "?" for a function.
     """
 
     reason: str
@@ -332,7 +334,8 @@ class Untraced:
 
 
 Formula = int | Ref | Op | Untraced
-#: From the path of a field to its raw value; to None if the header leaves the field out.
+#: A function that returns the raw value of a field by its path, and None if the frame does not have
+#: the field.
 Read = Callable[[str], "int | None"]
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
@@ -358,9 +361,9 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def calculate(symbol: str, *args: Formula) -> Formula:
-    """Return an operation as a formula.
+    """Return an operation as a formula; the result if all arguments are numbers.
 
-    A sum, difference or product of numbers is computed at once.
+    Only sums, differences and products are computed.
     """
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))
@@ -371,8 +374,8 @@ def evaluate(formula: Formula, read: Read) -> Any:
     """Return the value of a formula.
 
     Args:
-        read: returns the values of fields; None for a field that the header leaves out, as in
-            construct.
+        read: a function that returns the value of a field, or None for a field that the frame does
+            not have.
 
     Raises:
         Exception: any exception of an operation on these values.
@@ -391,11 +394,11 @@ def evaluate(formula: Formula, read: Read) -> Any:
 
 
 def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
-    """Evaluate a formula on arrays. Conditions return boolean arrays.
+    """Return the values of a formula for arrays; booleans for a condition.
 
     Args:
-        columns: path of a field -> array of its values.
-        dtype: a dtype that holds all intermediate values.
+        columns: the values of fields, by path.
+        dtype: a dtype that can represent all intermediate values.
     """
     match formula:
         case Ref():
@@ -413,10 +416,10 @@ def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
     return formula
 
 
-#: operations that return 1 or 0.
+#: The operations that return 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
 
-#: operations that accept boolean arrays without a conversion to integers.
+#: The operations that accept boolean arrays without a conversion to integers.
 _BOOLEAN_OPERATIONS = COMPARISONS | {"&", "|", "^"}
 
 
@@ -431,9 +434,9 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
     """Return a formula as an expression of another language.
 
     Args:
-        named: returns the text of a field.
-        operations: symbol -> text with "{}" for each argument, for the operations that the
-            language writes differently from Python.
+        named: a function that returns the text of a field.
+        operations: the operations that the language writes differently from Python, by symbol, with
+            "{}" for each argument.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -456,11 +459,12 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return the field of one array element, None if the field is not in these arrays.
+    """Return the field of an array element; None if the field is not in these arrays.
 
     Args:
+        info: the field in the array.
         path: the path of the new field.
-        indices: axis -> index; these axes are removed.
+        indices: the index by axis. These axes are removed.
     """
     if not indices.keys() <= set(info.axes):
         return None
@@ -472,7 +476,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return an operator or constant that may give a fraction; None without."""
+    """Return "/" or a float in a formula, which can make it fractional; None without one."""
     for part in parts(formula):
         if isinstance(part, float):
             return part
@@ -494,12 +498,12 @@ def refs(formula: Formula) -> tuple[Ref, ...]:
     return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
 
 
-#: maximum width of the values of a formula that is evaluated in 64-bit integers.
+#: The maximum number of bits of the values of a formula that is evaluated in 64-bit integers.
 MAX_FORMULA_BITS = 62
 
 
 def width(formula: Formula) -> int:
-    """Return the maximum width of the values of a formula in bits, without the sign.
+    """Return the maximum number of bits of the values of a formula, without the sign.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -534,10 +538,10 @@ def width(formula: Formula) -> int:
 
 
 def move_to_part(formula: Formula, axis: str) -> Formula:
-    """Rewrite the paths in a part's formula to start at the top of the outer frame.
+    """Return a formula of a part with paths that start at the top of the outer frame.
 
     Args:
-        axis: the path of the part.
+        axis: the path of the array of parts.
     """
     match formula:
         case Ref(path):
@@ -552,10 +556,10 @@ class Number:
     """An integer or float of whole bytes.
 
     Attributes:
-        info: the field; `info.const` is the value that it must have.
-        size: in bytes.
+        info: the field.
+        size: the size in bytes.
         kind: "uint", "int" or "float".
-        order: byte order.
+        order: the byte order, "little" or "big".
     """
 
     info: FieldInfo
@@ -579,9 +583,9 @@ class Number:
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """Plain bytes with an optional constant content.
+    """Plain bytes, which may be constant.
 
-    `const` is None if any content is allowed. Only a constant may have no name.
+    `const` is None if any bytes are allowed. Only constant bytes may have no name.
     """
 
     name: str
@@ -596,9 +600,10 @@ class Part:
 
     Attributes:
         info: the field.
-        bits: which bits of the block make it up: `bits.segments`, `bits.width`, `bits.signed`.
-        names: the names that lead from the block to it, e.g. () or ("distance",).
-        indices: its index in each array inside the block.
+        bits: the bits of the block that contain it.
+        names: the names that lead from the block to the integer, such as ("distance",); () if the
+            block is a single integer.
+        indices: the index of the integer in each array inside the block.
     """
 
     info: FieldInfo
@@ -611,11 +616,11 @@ class Part:
 class Block:
     """Bytes that contain one or more integers as bits.
 
-    A block of one part without names is a field with an unusual width or byte order.
+    A block with a single part without names is an integer with an unusual width or byte order.
 
     Attributes:
         info: the block as a field.
-        size: in bytes.
+        size: the size in bytes.
         parts: the integers.
     """
 
@@ -630,8 +635,8 @@ class Struct:
     """A sequence of members.
 
     Attributes:
-        path: "" for the frame itself.
-        docs: the author's documentation of the struct.
+        path: the path of the struct; "" for the frame itself.
+        docs: the documentation of the struct in the plugin.
     """
 
     name: str
@@ -641,7 +646,7 @@ class Struct:
 
     @property
     def struct(self) -> Struct:
-        """The struct itself; the counterpart of `Sealed.struct`."""
+        """The struct itself, as for `Sealed.struct`."""
         return self
 
 
@@ -650,12 +655,12 @@ class Sealed:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct, which may have other checksums too.
-        fields: paths of the fields that hold the checksum, low bits first.
-        over: paths of the first and last member that it covers; None for all bytes of the body
-            without the bytes of `fields`.
-        declared: the algorithm; None if a hook has to supply it.
-        absent: values that mean "not filled" and are accepted.
+        body: the struct, or a `Sealed` with another checksum.
+        fields: the paths of the fields with the checksum, low bits first.
+        over: the paths of the first and the last member that the checksum covers; None for all
+            bytes of the body without the bytes of `fields`.
+        declared: the algorithm; None if a hook has to return it.
+        absent: the values that mean that the sensor has computed no checksum.
     """
 
     body: Struct | Sealed
@@ -669,11 +674,11 @@ class Sealed:
         """The algorithm of the checksum.
 
         Raises:
-            SpecError: if there is none.
+            SpecError: if no algorithm is declared.
         """
         if self.declared is None:
             raise SpecError(
-                "a checksum without algorithm, and no lidarspec_checksum hook provides one",
+                "the checksum has no algorithm, and no lidarspec_checksum hook provides one",
                 path=self.fields[0],
             )
         return self.declared
@@ -694,7 +699,8 @@ class Repeat:
     """An array of `count` elements.
 
     Attributes:
-        axis: identifies the array: its path, with "[]" appended for each array directly around it.
+        axis: the name of the array, which is its path, with "[]" appended for each array that
+            directly contains it.
     """
 
     name: str
@@ -709,11 +715,12 @@ class Kind:
     """A kind of parts.
 
     Attributes:
-        name: of the kind; "" if all parts are of one kind.
-        element: the part with paths from the top of the frame.
-        root: the part as a frame of its own. A field of the outer frame is "_." and its path there.
-        following: the size of the next part in bytes, as a formula of fields of `root`; 0 after the
-            last part. None if parts do not declare the size of the next one.
+        name: the name of the kind; "" if all parts are of one kind.
+        element: the part, with paths from the top of the frame.
+        root: the part as a frame of its own. The path of a field of the outer frame starts with
+            "_.".
+        following: the formula of the size of the next part in bytes, by fields of `root`; 0 after
+            the last part. None if parts do not declare the size of the next part.
     """
 
     name: str
@@ -730,10 +737,11 @@ class PartSequence:
         axis: the path of the array of parts.
         kinds: the kinds of parts, in the order in which they are tried.
         count: the number of parts, or None.
-        size: the bytes of the first part, or None. Then each part declares the size of the next.
-        within: the bytes of all parts, or None.
-        outer: fields of the outer frame that formulas of the parts use.
-        total: the bytes of all parts, as a field for the formulas after them.
+        size: the size of the first part in bytes, or None. If it is given, each part declares the
+            size of the next part.
+        within: the total size of all parts in bytes, or None.
+        outer: the fields of the outer frame that formulas of the parts use.
+        total: the total size of all parts as a field, for the formulas after the parts.
     """
 
     name: str
@@ -746,7 +754,10 @@ class PartSequence:
     total: FieldInfo
 
     def following(self, kind: Kind) -> Formula | None:
-        """Return the size of the part after one of this kind, with paths from the frame."""
+        """Return the formula of the size of the part after a part of this kind.
+
+        The paths start at the top of the frame.
+        """
         if kind.following is None:
             return None
         return move_to_part(kind.following, self.axis)
@@ -764,7 +775,7 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """A node for each value of the key, and a default node for all other values.
+    """A node for each value of a key, and a default node for all other values.
 
     The values are integers, unless the key is `Untraced`.
     """
@@ -784,10 +795,10 @@ class Empty:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """A condition that valid frames meet: it is not 0.
+    """A condition that is not 0 in valid frames.
 
     Attributes:
-        axes: the axes of the arrays that it is in.
+        axes: the axes of the arrays that contain the condition.
     """
 
     name: str
@@ -798,14 +809,16 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """A value of a parsed frame that has no bytes of its own. `build` ignores it.
+    """A value of a parsed frame that has no bytes of its own.
+
+    `build` ignores it.
 
     Attributes:
         info: the value as a field.
-        kind: "computed" from other fields (construct's Computed), its own "offset" in the frame
-            (Tell), the "size" or the "bytes" of a part before it (RawCopy), or "peeked", the value
-            of the following bytes (Peek).
-        formula: the formula of a computed value; None if it is `constant`.
+        kind: "computed" for a value computed from other fields (construct's Computed), "offset" for
+            its own offset in the frame (Tell), "size" or "bytes" for the size or the bytes of an
+            earlier part (RawCopy), "peeked" for the value of the following bytes (Peek).
+        formula: the formula of a computed value; None if the value is `constant`.
         constant: a computed value that depends on no field.
         part: the path of the part that is measured or copied.
         node: the node that is peeked.
@@ -826,7 +839,7 @@ class Derived:
 
 @dataclass(frozen=True, eq=False)
 class Never:
-    """An alternative that is an error, so that no valid frame has it."""
+    """An alternative that no valid frame has."""
 
     name: str
 
@@ -839,11 +852,12 @@ class Opaque:
         info: the part as a field.
         kind: the name of its construct class, which may be a class of the plugin.
         reason: why it cannot be converted to another node.
-        inside: the nodes in it, if it is a bit block or a struct. They have no offsets.
-        size: in bytes; None if it depends on the bytes themselves.
-        form: how a field is stored: "text up to" its terminator, otherwise its kind.
-        in_bits: True for a bit block.
-        terminator: the byte that ends a sequence of arbitrary bytes; b"" for other parts.
+        inside: the nodes in the part, if it is a bit block or a struct. They have no offsets.
+        size: the size in bytes; None if it depends on the content.
+        form: how the value is stored, as text to display.
+        in_bits: whether the part is a bit block.
+        terminator: the byte that ends the part, if it has arbitrary bytes up to a terminator; else
+            b"".
     """
 
     name: str
@@ -904,7 +918,7 @@ def nodes(node: Node) -> Iterator[Node]:
 
 
 def formulas(node: Node) -> tuple[Formula, ...]:
-    """Return the formulas of a node itself, without formulas of the nodes below it."""
+    """Return the formulas of a node, without the formulas of the nodes below it."""
     match node:
         case Blob():
             return (node.size,)
@@ -992,10 +1006,10 @@ def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula 
 
 
 def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
-    """Return the size of alternatives.
+    """Return the formula of the size of alternatives.
 
     Args:
-        cases: (condition, size) of each alternative.
+        cases: the condition and the size of each alternative.
     """
     first = cases[0][1] if cases else 0
     if all(each == first for _, each in cases):
@@ -1004,9 +1018,9 @@ def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formul
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
-    """Return the fields of a node itself, without the nodes below it.
+    """Return the fields of a node, without the fields of the nodes below it.
 
-    A block has the fields of its parts. Structs, arrays and choices have none.
+    A block has the fields of its parts. Structs, arrays and choices have no fields.
     """
     match node:
         case Number() | Blob() | Opaque():
@@ -1017,15 +1031,14 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
 
 
 class Scope:
-    """The context of an expression while it is traced.
+    """The context in which an expression is traced, instead of construct's context.
 
-    It replaces the context of construct: each field before the expression is a `Symbol`, which
-    records the operations on it.
+    Each field before the expression is a `Symbol`, which records the operations on it.
 
     Args:
-        parent: the context of the outer struct, "_" in expressions.
+        parent: the context of the outer struct, which is "_" in expressions.
         path: the path of the struct.
-        asked: a list; each field that an expression reads is appended to it.
+        asked: the list to which each field is appended that an expression reads.
     """
 
     def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -1033,11 +1046,11 @@ class Scope:
         self.path = path
         self.asked = asked
         self.names: dict[str, Ref | Scope | Value] = {}
-        #: names that different branches define differently.
+        #: The names that different branches define differently.
         self.ambiguous: set[str] = set()
 
     def add(self, name: str, part: Ref | Scope | Value) -> None:
-        """Add a field, a computed value or a struct that later expressions may read."""
+        """Add a field, a computed value or a struct for later expressions."""
         known = self.names.get(name)
         if known is not None and not (
             isinstance(known, Ref)
@@ -1078,10 +1091,10 @@ class Scope:
 
 
 class RawCopyScope(Scope):
-    """The context of a value that has no struct of its own (construct's RawCopy).
+    """The context of the value of a construct RawCopy.
 
-    It has names for the bytes and the offsets of the value. For other names, expressions of the
-    value see the outer context.
+    It has names for the bytes and the offsets of the value. All other names are looked up in the
+    outer context.
     """
 
     def __init__(self, scope: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -1099,21 +1112,21 @@ class Value:
     """A computed value, in the form that later expressions read.
 
     Attributes:
-        content: a formula or a constant; `Untraced` if no formula gives it.
+        content: a formula or a constant; `Untraced` if the value has no formula.
     """
 
     content: Any
 
     @property
     def refs(self) -> tuple[Ref, ...]:
-        """The fields that it depends on."""
+        """The fields that the value depends on."""
         return refs(self.content)
 
     def read(self) -> Any:
         """Return a symbol, or the constant.
 
         Raises:
-            UntraceableExpressionError: if no formula gives the value.
+            UntraceableExpressionError: if the value has no formula.
         """
         if isinstance(self.content, Untraced):
             raise UntraceableExpressionError(self.content.reason.partition(": ")[2])
@@ -1125,7 +1138,7 @@ class Value:
 class OuterScope(Scope):
     """The context of the outer frame for expressions in a part.
 
-    It has the symbols of that frame, with "_." before their paths.
+    It has the symbols of the outer frame, with "_." before their paths.
     """
 
     def __init__(self, scope: Scope, asked: list[Ref]) -> None:
@@ -1147,7 +1160,7 @@ class UntraceableExpressionError(Exception):
 
 
 class Symbol:
-    """A placeholder for a value that records the operations on it as a formula."""
+    """A placeholder for a value, which records the operations on it as a formula."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -1181,7 +1194,7 @@ class Symbol:
 
 
 def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
-    """Return the result of an operation on symbols and numbers as a symbol."""
+    """Return a symbol for the result of an operation on symbols and numbers."""
     pair: list[Any] = [part.formula if isinstance(part, Symbol) else part for part in (left, right)]
     for one, other in ((0, 1), (1, 0)):
         known = pair[other]
@@ -1194,7 +1207,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
     wrong = next((part for part in pair if not isinstance(part, int | float | Ref | Op)), None)
     if wrong is not None:
-        raise UntraceableExpressionError(f"an expression with {wrong!r}")
+        raise UntraceableExpressionError(f"an expression uses {wrong!r}, which is not a number")
     return Symbol(
         calculate(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
     )
@@ -1240,7 +1253,7 @@ for _name, _symbol in {"pow": "**", "divmod": "divmod", "matmul": "@"}.items():
 
 
 def _find_label_value(ref: Ref, label: str) -> int:
-    """Return the raw value of a label.
+    """Return the raw value of a label of a field.
 
     Raises:
         UntraceableExpressionError: if the field does not have this label.

@@ -1,8 +1,8 @@
-"""Functions for `points`, in addition to NumPy's ufuncs: angles, stream order, tables.
+"""Functions for `points` functions, in addition to NumPy's ufuncs.
 
-Each works on NumPy arrays and on the columns that the engine passes. A column knows the borders of
-packets and the losses; an array counts as one run of values. The engine's other evaluators
-implement the same functions.
+They handle angles, the order of values in the stream, and tables. The functions accept NumPy arrays
+and the columns that the engine passes to `points`. For a column, they respect the borders of
+packets and lost packets. An array counts as one sequence of values.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from lidarspec.errors import SpecError
 
 Array = Any
 
-#: a step between blocks may be longer than the fastest one by this factor: in captures of rotating
+#: A step between blocks may be longer than the fastest one by this factor. In captures of rotating
 #: sensors, steps at a constant speed vary by 5 %.
 STEP_TOLERANCE = 1.25
-#: NumPy functions that work element by element and keep axes; all others get plain arrays.
+#: The NumPy functions that work element by element and keep axes; all others get plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 
 class AlongAxis(NDArrayOperatorsMixin):
-    """Numbers that all packets share, along arrays of the frame.
+    """Numbers for the elements of an array of the frame, which all packets share.
 
     NumPy's ufuncs combine them with each other and with columns.
 
     Attributes:
-        axes: the arrays, by the last part of their paths or the whole path.
-        array: the numbers, with an axis for each array.
+        axes: the names of the arrays, each as a whole path or as the last name of the path.
+        array: the numbers, with an axis for each array of the frame.
     """
 
     def __init__(self, axes: tuple[str, ...], array: NDArray[Any]) -> None:
@@ -43,7 +43,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         return len(self.array)
 
     def __getitem__(self, which: Any) -> Any:
-        """Return an element or part of the plain array."""
+        """Return an element or a part of the numbers."""
         return self.array[which]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -71,7 +71,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         )
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Any:
-        """Return `function` of values that are aligned by the arrays that they are along.
+        """Return `function` of the values, which are first aligned by the names of arrays.
 
         If a column is among the values, the column applies the function.
         """
@@ -96,10 +96,12 @@ class AlongAxis(NDArrayOperatorsMixin):
         return AlongAxis(tuple(axes.values()), array)
 
     def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
-        """Return the numbers with an axis for each name; missing axes have length 1.
+        """Return the numbers with one axis for each name.
+
+        Axes that the numbers do not have get the length 1.
 
         Args:
-            names: last parts of paths; the own axes are among them.
+            names: the last names of paths of arrays, including all arrays in `axes`.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])
@@ -108,17 +110,18 @@ class AlongAxis(NDArrayOperatorsMixin):
 
 
 def along(axis: str | tuple[str, ...], values: Array) -> Any:
-    """Return numbers that all packets share: ``along("pixels", ELEVATIONS)``.
+    """Return numbers for the elements of an array, as in ``along("pixels", ELEVATIONS)``.
 
     Args:
-        axis: the name of an array of the frame, or several, outermost first.
-        values: as many numbers as the array has elements, with an axis for each array.
+        axis: the name of an array of the frame, or the names of several nested arrays, outermost
+            first.
+        values: one number for each element, with an axis for each array.
 
     Returns:
         Numbers that are aligned with columns by the name of the array.
 
     Raises:
-        SpecError: for values with more or fewer axes than names.
+        SpecError: if the number of axes of `values` differs from the number of names.
     """
     axes = (axis,) if isinstance(axis, str) else tuple(axis)
     array = np.asarray(values)
@@ -131,20 +134,23 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
 
 
 def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
-    """Return even steps from start to end, both included, for each packet.
+    """Return evenly spaced angles from start to end, both included, for each packet.
 
     Args:
-        start, end: first and last angle of each packet, shape (n, 1), in the unit of `full`.
-        count: points per packet, a number or a column (n, 1); 1 gives `start`.
-        full: the whole circle in that unit. An end below the start is one turn further.
+        start: the first angle of each packet, (n, 1), in the unit of `full`.
+        end: the last angle of each packet, (n, 1). An end below the start is in the next turn.
+        count: the number of points of each packet, a number or a column (n, 1). If it is 1, the
+            result is `start`.
+        full: a whole turn in the unit of the angles.
 
     Returns:
-        float64, shape (n, count), not wrapped, so that differences are positive. If `count` is a
-        column, its largest value is used, and values beyond the count of a packet have no meaning.
+        float64, shape (n, count), not wrapped, so that the angles of a packet increase. If `count`
+        is a column, its largest value is the length, and values beyond the count of a packet have
+        no meaning.
 
     Raises:
-        SpecError: if every end that differs from its start is whole turns away, so that all points
-            of a packet have one angle.
+        SpecError: if start and end differ by whole turns in all packets, so that all points of a
+            packet would have one angle. `full` is then in the wrong unit.
     """
     turn = end - start
     _refuse_folded(turn, full)
@@ -156,14 +162,15 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 def steps(count: Array) -> Array:
     """Return the index of each sample of a packet: 0, 1, 2 ...
 
-    For times, for example: ``steps(f.count) / RATE``.
+    An example is the time of samples, ``steps(f.count) / RATE``.
 
     Args:
-        count: samples of each packet, a number or a column. It has to be the count of the innermost
-            array.
+        count: the number of samples of each packet, a number or a column. It has to be the length
+            of the innermost array.
 
     Returns:
-        Integers, shape (count,). If `count` is a column, its largest value in the batch is used.
+        Integers, shape (count,). If `count` is a column, its largest value in the batch is the
+        length.
     """
     if hasattr(count, "steps"):
         return count.steps()
@@ -171,10 +178,11 @@ def steps(count: Array) -> Array:
 
 
 def wrap(a: Array, full: float) -> Array:
-    """Return angles within [0, full).
+    """Return angles modulo a whole turn, in [0, full).
 
     Args:
-        full: the whole circle in the unit of `a`.
+        a: the angles.
+        full: a whole turn in the unit of `a`.
 
     Returns:
         float64, the shape of `a`.
@@ -184,37 +192,38 @@ def wrap(a: Array, full: float) -> Array:
 
 
 def following(a: Array, step: int = 1) -> Array:
-    """Return the value `step` places later in stream order, over packet borders.
+    """Return for each value the value `step` places later in the stream.
 
-    Padding is left out.
+    The later value may be in another packet. Padding is not counted.
 
     Returns:
-        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
-        the end.
+        float64, the shape of `a`; nan if packets or bytes were lost between the two values, and at
+        the end of the stream.
     """
     return _shift(a, step)
 
 
 def previous(a: Array, step: int = 1) -> Array:
-    """Return the value `step` places earlier in stream order, over packet borders.
+    """Return for each value the value `step` places earlier in the stream.
 
-    Padding is left out.
+    The earlier value may be in another packet. Padding is not counted.
 
     Returns:
-        float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
-        the beginning.
+        float64, the shape of `a`; nan if packets or bytes were lost between the two values, and at
+        the start of the stream.
     """
     return _shift(a, -step)
 
 
 def last(a: Array, where: Array | None = None) -> Array:
-    """Return the most recent value for which `where` is true, including this value.
+    """Return for each value the last value, up to this one, for which `where` is true.
 
     Args:
-        where: a condition of the shape of `a`; by default that `a` is not nan.
+        a: the values.
+        where: a condition of the shape of `a`; by default whether `a` is not nan.
 
     Returns:
-        float64, the shape of `a`; nan before the first.
+        float64, the shape of `a`; nan before the first such value.
     """
     if hasattr(a, "latest"):
         return a.latest(where)
@@ -234,20 +243,21 @@ def between_blocks(
 ) -> Array:
     """Return the angle that a rotor turns from each block to the next.
 
-    A step that is longer than the rotor can turn is a loss or a masked sector. The last valid step
-    in stream order replaces it.
+    A step that is longer than the rotor can turn comes from a loss or a masked sector. It is
+    replaced by the last valid step in the stream.
 
     Args:
-        azimuth: azimuth of each block, in the unit of `full`.
-        ahead: azimuth of the next block with another azimuth, for example ``following(azimuth)``.
+        azimuth: the azimuth of each block, in the unit of `full`.
+        ahead: the azimuth of the next block with another azimuth, for example
+            ``following(azimuth)``.
         fastest: the angle from block to block at the highest speed of the sensor, in the unit of
             `full`. Encoder readings vary, so steps may be up to 25 % longer.
-        repeat: False returns nan in place of the last valid step.
-        full: the whole circle in the unit of `azimuth`.
+        repeat: False to return nan instead of the last valid step.
+        full: a whole turn in the unit of `azimuth`.
 
     Returns:
-        float64, the shape of `azimuth`. Steps are measured the shorter way round, so they are
-        negative if the readings jitter. nan before the first valid step.
+        float64, the shape of `azimuth`; nan before the first valid step. Steps are measured in the
+        shorter direction, so they are negative if the readings jitter.
     """
     step = ahead - azimuth
     step = step - full * np.rint(step / full)
@@ -260,20 +270,20 @@ def between_blocks(
 def stack(*columns: Array) -> Array:
     """Return columns side by side on a new innermost axis.
 
-    From k columns of shape (n, b), it makes one of shape (n, b, k).
+    k columns of shape (n, b) become one column of shape (n, b, k).
     """
     return _apply(side_by_side, *columns)
 
 
 def side_by_side(*arrays: Any) -> Any:
-    """Return arrays, broadcast, side by side on a new innermost axis."""
+    """Return arrays side by side on a new innermost axis, after broadcasting them."""
     return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
 def running(a: Array) -> Array:
-    """Return the sums of the values so far along the innermost array.
+    """Return the cumulative sum along the innermost array.
 
-    They are needed if the wire has differences.
+    It is needed if a frame contains differences of values.
 
     Returns:
         float64, the shape of `a`.
@@ -284,15 +294,16 @@ def running(a: Array) -> Array:
 
 
 def take(table: Array, index: Array) -> Array:
-    """Return the entries of a table at `index`; nan if an index is not in the table.
+    """Return the entries of a table at `index`; nan if an index is out of range.
 
     Args:
-        table: (m,), a number for each index; or (m, k), a row for each index, along the array of k
-            elements inside the arrays of `index`.
+        table: (m,), a number for each index; or (m, k), a row for each index. A row has a number
+            for each of the k elements of the next inner array.
+        index: the indices.
 
     Returns:
-        float64, the shape of `index`. For a table of rows, the length of the inner array becomes k:
-        an index of shape (n, 16, 1) gives (n, 16, k).
+        float64, the shape of `index`. For a table of rows, the next inner axis has the length k:
+        the result for an index of shape (n, 16, 1) has the shape (n, 16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
@@ -304,15 +315,18 @@ def take(table: Array, index: Array) -> Array:
 
 
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
-    """Return the rows of a table for indices, the shape of `index`.
+    """Return the row numbers for indices, in the shape of `index`.
 
-    An index that the table does not have gives its last row, which is nan.
+    An index that is out of range becomes the number of the last row, which contains nan.
     """
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
 class TableLookup:
-    """Function of an index that returns entries of a table, (m,); nan outside it."""
+    """A function that returns the entries of a table, (m,), at indices.
+
+    The result is nan for an index that is out of range.
+    """
 
     def __init__(self, entries: Any) -> None:
         self.entries = entries
@@ -355,7 +369,7 @@ def _shift(a: Array, step: int) -> Array:
 
 
 def _apply(function: Callable[..., Any], *values: Array) -> Array:
-    """Return `function` of arrays; if one is a column, the column applies the function."""
+    """Return `function` of arrays; if a value is a column, the column applies the function."""
     for value in values:
         if hasattr(value, "apply_function"):
             return value.apply_function(function, *values)

@@ -1,12 +1,12 @@
 """Wire forms: frames without fixed field offsets, as text or with escaped bytes.
 
-A form works on one frame at a time. `find_end` finds the end of a frame, `decode` converts its
-bytes to the bytes of the struct, and `encode` converts these to the bytes to send. All other
-packages use the bytes of the struct, as for binary frames.
+A wire form encodes and decodes one frame at a time. `find_end` finds the end of an encoded frame,
+`decode` converts it to the bytes of the struct, and `encode` converts the bytes of the struct to
+the encoded frame. All other packages use the bytes of the struct, as for binary frames.
 
-In a text, the next field often depends on earlier fields, for example counts. So `decode`
-repeatedly requests the runs of fields that follow the bytes decoded so far, until none are left. A
-run is one text, or consecutive numbers, whose digits NumPy converts at once.
+The fields of a text often depend on earlier fields, for example on counts. `decode` therefore
+repeatedly requests the next run of fields, given the bytes that it has decoded so far. A run is one
+text field, or consecutive numbers, whose digits NumPy converts together.
 """
 
 from __future__ import annotations
@@ -26,22 +26,23 @@ from lidarspec.spec.checksums import Checksum, Xor
 
 Offsets = NDArray[np.intp]
 Values = NDArray[np.uint64]
-#: The bytes of a text; None for each byte that varies.
+#: The bytes of a text; a byte that varies is None.
 Characters = Sequence[int | None]
 
-#: Results of `WireForm.find_end`: the end has not arrived; the bytes do not begin a frame.
+#: `WireForm.find_end` returns these values if the end has not arrived, and if the bytes do not
+#: begin a frame.
 NO_END = 0
 NO_FRAME = -1
-#: Maximum digits of a number in a token.
+#: The maximum number of digits of a number in a token.
 MAX_DIGITS = 16
-#: Maximum characters of a decimal fraction, and its pattern.
+#: The maximum number of characters of a decimal fraction, and its pattern.
 MAX_DECIMAL_CHARACTERS = 40
 _DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)")
-#: Size of a float in bytes -> the number of decimal digits that it always keeps.
+#: The number of decimal digits that a float always keeps, by its size in bytes.
 EXACT_DIGITS = {2: 3, 4: 6, 8: 15}
-#: The largest unsigned value by size in bytes.
+#: The largest unsigned value, by size in bytes.
 LARGEST_OF_BYTES = np.array([256**size - 1 for size in range(9)], np.uint64)
-#: Bits of a character of `SixBits`.
+#: The number of bits in a character of `SixBits`.
 CHARACTER_BITS = 6
 NEWLINE = 0x0A
 PLUS = 0x2B
@@ -50,10 +51,10 @@ MINUS = 0x2D
 
 @dataclass(frozen=True)
 class TextRun:
-    """A field of bytes, which is text on the wire.
+    """A field of bytes, which is a text in the encoded frame.
 
     Attributes:
-        size: in bytes.
+        size: the size of the field in bytes.
     """
 
     size: int
@@ -63,7 +64,7 @@ class TextRun:
 
     @property
     def sizes(self) -> Offsets:
-        """The bytes of each field, (1,)."""
+        """The size of each field of the run in bytes, (1,)."""
         return np.array([self.size], np.intp)
 
 
@@ -72,10 +73,10 @@ class NumberRun:
     """Consecutive numbers of a struct.
 
     Attributes:
-        sizes: the bytes of each number in the struct, (n,).
-        kinds: "u", "i" or "f" for each, as in `numpy.dtype.kind`, (n,).
+        sizes: the size of each number in the struct in bytes, (n,).
+        kinds: "u", "i" or "f" for each number, as in `numpy.dtype.kind`, (n,).
         is_little: whether each number is little-endian, (n,).
-        paths: the path of the field of each number, n.
+        paths: the path of the field of each number, n items.
     """
 
     sizes: Offsets
@@ -94,7 +95,7 @@ class NumberRun:
 
     @cached_property
     def ends(self) -> Offsets:
-        """The offset after each number, from the first byte of the run, (n,)."""
+        """The offset after each number, counted from the first byte of the run, (n,)."""
         return np.cumsum(self.sizes)
 
     @cached_property
@@ -104,29 +105,32 @@ class NumberRun:
 
     @cached_property
     def remaining(self) -> Offsets:
-        """The number of bytes of the same number after each byte of the run, (bytes,)."""
+        """For each byte of the run, the number of bytes of its number after it, (bytes,)."""
         return self.ends[self.owners] - 1 - np.arange(len(self.owners))
 
     @cached_property
     def largest(self) -> Values:
-        """The largest value of each as an unsigned number, with all its bits set, (n,)."""
+        """The largest unsigned value of each number, which has all bits set, (n,)."""
         return LARGEST_OF_BYTES[self.sizes]
 
     @cached_property
     def highest(self) -> Values:
-        """The largest value of each as a signed number; 0 for floats, (n,)."""
+        """The largest value of each number, signed or unsigned; 0 for a float, (n,)."""
         highest = np.where(self.kinds == "i", self.largest >> np.uint64(1), self.largest)
         return np.where(self.kinds == "f", np.uint64(0), highest)
 
     @cached_property
     def lowest(self) -> Values:
-        """The magnitude of the most negative value of each, (n,)."""
+        """The magnitude of the lowest value of each number; 0 if it is not signed, (n,)."""
         lowest = (self.largest >> np.uint64(1)) + np.uint64(1)
         return np.where(self.kinds == "i", lowest, np.uint64(0))
 
     @cached_property
     def _word_offsets(self) -> Offsets:
-        """The offset of each byte of the run in big-endian words of eight bytes."""
+        """The offset of each byte of the run in an array of big-endian words of eight bytes.
+
+        The array has one word for each number.
+        """
         significance = np.where(
             self.is_little[self.owners],
             self.sizes[self.owners] - 1 - self.remaining,
@@ -137,35 +141,37 @@ class NumberRun:
     def to_bytes(self, values: Values) -> bytes:
         """Return the first numbers of the run as bytes of the struct.
 
-        Bits that do not fit are lost.
+        Bits that do not fit into a number are lost.
         """
         size = self.ends.item(len(values) - 1) if len(values) else 0
         words = values.astype(">u8").view(np.uint8)
         return words[self._word_offsets[:size]].tobytes()
 
     def from_bytes(self, data: bytes) -> Values:
-        """Return the bits of all numbers of the run, (n,)."""
+        """Return the bits of all numbers of the run as unsigned integers, (n,)."""
         words = np.zeros(8 * len(self), np.uint8)
         words[self._word_offsets] = np.frombuffer(data, np.uint8)
         return words.view(">u8").astype(np.uint64)
 
 
 Run = TextRun | NumberRun
-#: Returns the runs of fields that follow the first bytes of a struct, as far as these bytes
-#: determine them. It is empty if the struct is complete, or if no frame begins with these bytes.
+#: A function that returns the next runs of fields, given the first bytes of a struct, as far as
+#: these bytes determine them. The result is empty if the struct is complete, or if no frame begins
+#: with these bytes.
 NextRuns = Callable[[bytes], Sequence[Run]]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The first fault of bytes that are not a frame of a form.
+    """The first error in bytes that are not a valid frame of a wire form.
 
     Attributes:
-        offset: in the frame.
-        reason: the fault as text; "" for a field that cannot be decoded.
-        is_checksum: whether a checksum of the form itself is wrong.
+        offset: the offset of the error in the frame.
+        reason: a description of the error; "" for a field that cannot be decoded.
+        is_checksum: whether a checksum of the wire form is wrong.
         path: the path of the field.
-        expected, got: values for the error.
+        expected: the expected value.
+        got: the actual value.
     """
 
     offset: int
@@ -178,13 +184,14 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """The bytes of the struct of a frame, as far as it could be decoded.
+    """The decoded bytes of a frame, up to the first error.
 
     Attributes:
-        struct: the bytes.
-        spans: for successive fields, the offset of each in the frame, and its size in the struct.
-        end: offset of the first byte of the frame after the last field.
-        problem: None if the whole frame was decoded.
+        struct: the bytes of the struct.
+        spans: pairs of arrays for successive runs: the offset of each field in the encoded frame,
+            and its size in the struct.
+        end: the offset in the encoded frame of the first byte after the last field.
+        problem: the first error; None if the whole frame was decoded.
     """
 
     struct: bytes
@@ -194,45 +201,49 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the frame of the field of each byte of the struct, then `end`."""
+        """For each byte of the struct, the offset of its field in the encoded frame, and `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return the offset in the frame of the field that contains a byte of the struct."""
+        """Return the offset in the encoded frame of the field with a byte of the struct.
+
+        Args:
+            place: the offset of the byte in the struct.
+        """
         return self.offsets[min(place, len(self.struct))]
 
 
 class WireForm(Protocol):
-    """The form of the frames of one type on the wire.
+    """The encoding of the frames of one type.
 
     Attributes:
-        is_text: whether fields of bytes are printable characters, so that examples are letters.
+        is_text: whether fields of bytes are printable characters, so that examples have letters.
     """
 
     is_text: ClassVar[bool]
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of frames with structs that begin with these texts.
+        """Return the first bytes of encoded frames, given the first fields of their structs.
 
-        They end before the first byte without a fixed offset; bytes that vary are None.
+        The bytes end before the first byte without a fixed offset. Bytes that vary are None.
         """
 
     def find_end(self, data: bytes) -> int:
-        """Return the size of the frame that begins with the first byte.
+        """Return the size of the encoded frame at the start of some bytes.
 
-        Returns `NO_END` if more bytes are needed to find its end, and `NO_FRAME` if no frame begins
-        with these bytes.
+        Returns `NO_END` if more bytes are needed to find the end of the frame, and `NO_FRAME` if no
+        frame begins with these bytes.
         """
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
-        """Decode one frame, or as much of it as is available; see `decode_runs`."""
+        """Decode one frame, or its first bytes if the rest is missing; see `decode_runs`."""
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
-        """Return the frame for the bytes of a struct, which consists of these runs.
+        """Return the encoded frame for the bytes of a struct that consists of these runs.
 
-        Values that the form cannot express may become any bytes, because the caller decodes the
-        frame again to verify it.
+        Values that cannot be encoded may become any bytes, because the caller verifies the frame by
+        decoding it.
         """
 
     def largest(self, size: int) -> int:
@@ -241,31 +252,33 @@ class WireForm(Protocol):
 
 @runtime_checkable
 class BulkEnds(Protocol):
-    """A wire form that finds the ends of many candidates at once, for speed."""
+    """A wire form that can find the ends of many candidates at once, for speed."""
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the frame size at each offset, `NO_END` or `NO_FRAME`, (n,).
+        """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
 
-        The results equal those of `find_end`, but `NO_FRAME` is allowed for any invalid frame.
+        The result is the same as that of `find_end`, except that it may be `NO_FRAME` for an
+        invalid frame.
 
         Args:
-            offsets: ascending.
+            buffer: the input.
+            offsets: the offsets of the candidates, ascending.
             stops: the offset after the last available byte of each candidate.
         """
 
 
 @runtime_checkable
 class DrawsValues(Protocol):
-    """A wire form that cannot encode some values of a number that are small enough."""
+    """A wire form that cannot encode every value up to `largest`."""
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded, (n,), from random bits, (n,)."""
+        """Return values that can be encoded, (n,), made from random bits, (n,)."""
 
 
 def find_ends(
     form: WireForm, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets
 ) -> Offsets:
-    """Return the frame size at each offset, as `BulkEnds.find_ends` does.
+    """Return the size of the frame at each offset, as `BulkEnds.find_ends` does.
 
     For a form without `find_ends`, `find_end` is called for each candidate.
     """
@@ -281,7 +294,7 @@ class RunReader(Protocol):
 
     @property
     def position(self) -> int:
-        """The offset of the next field in the frame; after the last field, of its end."""
+        """The offset of the next field in the frame; after the last field, the end of the frame."""
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
         """Read the fields of a run, up to the first invalid field.
@@ -295,8 +308,7 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the size of the frame, which ends with an end mark of one byte; None if the end is
-            missing.
+        size: the size of the frame including its end mark of one byte; None if the end is missing.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -317,18 +329,19 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
 
 
 def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
-    """Return the first value that is not below each offset, (n,).
+    """Return for each offset the first place that is not below it, (n,).
 
     Args:
-        places: ascending.
-        none: the result if all values are below the offset.
+        places: the places, ascending.
+        offsets: the offsets, (n,).
+        none: the result for an offset above all places.
     """
     return np.append(places, none)[places.searchsorted(offsets)]
 
 
 @lru_cache(maxsize=64)
 def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit, and which are digits, (256,)."""
+    """Return the value of each character as a digit, and whether it is one, (256,) each."""
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
@@ -340,9 +353,9 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 
 @lru_cache(maxsize=64)
 def _make_digit_weights(base: int) -> Values:
-    """Return the weight of a digit by its distance from the end of its token.
+    """Return the weight of a digit, by its distance from the end of its token.
 
-    It is 0 outside the digits of a number.
+    The first and the last weight are 0, for characters that are not digits of a number.
     """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
@@ -351,11 +364,11 @@ def _make_digit_weights(base: int) -> Values:
 class HexCheck:
     """A checksum in hexadecimal digits after a mark, such as ``*5B`` of NMEA 0183.
 
-    It covers the bytes between the first byte of the frame and the mark.
+    The checksum covers the bytes after the first byte of the frame, up to the mark.
 
     Args:
-        algorithm: the checksum algorithm; its width gives the number of digits.
-        mark: one byte.
+        algorithm: the checksum algorithm; its width determines the number of digits.
+        mark: the byte before the digits.
 
     Raises:
         SpecError: if the mark is not one byte.
@@ -370,7 +383,7 @@ class HexCheck:
 
     @property
     def size(self) -> int:
-        """The number of bytes of mark and digits."""
+        """The size of mark and digits in bytes."""
         return 1 + -(-self.algorithm.width // 4)
 
     def write(self, content: bytes) -> bytes:
@@ -382,32 +395,33 @@ class HexCheck:
 class Tokens:
     """Text in tokens, each followed by a separator or the end.
 
-    A number is a token of digits. It may have leading zeros, lower-case digits, or a sign, which
-    makes it decimal in any base; signed fields without a sign have the digits of their bits. A
-    float has the digits of its bits in base 16. In base 10 it is a decimal fraction, and nan if the
-    token is empty. A field of bytes is a token of exactly as many characters, which may contain the
-    separator.
+    An integer is a token of digits in the given base, which may have leading zeros and lower-case
+    digits. An integer with a sign is always decimal. A negative integer may also be sent without a
+    sign, as the digits of its two's complement. In base 16, a float has the digits of its bits. In
+    base 10, a float is a decimal fraction, or nan if the token is empty. A field of bytes is a
+    token with exactly as many characters, which may include the separator.
 
     Args:
-        start: the byte that a frame begins with.
+        start: the first byte of a frame.
         sep: the byte between tokens.
-        end: the bytes that the frame ends with.
+        end: the last bytes of a frame.
         base: the base of the digits, 10 or 16.
-        width: the minimum number of digits to write; when reading, any number is accepted.
-        check: the checksum before the end; None if there is none.
-        formats: path of a number -> its minimum digits, as manuals show them: "hhmmss.ss" is six
-            digits, and two after the point.
-        joined: the number of fields of bytes that form the first token.
-        padded: whether a token of bytes may be shorter than its field, which is then filled with
+        width: the minimum number of digits of an encoded integer. Decoding accepts any number of
+            digits.
+        check: the checksum before the end; None without a checksum.
+        formats: the minimum digits of encoded floats by path, in the form of manuals: "hhmmss.ss"
+            means six digits before the point and two after it.
+        joined: the number of fields of bytes that form the first token together.
+        padded: whether a token may be shorter than its field of bytes, which is then padded with
             zero bytes.
         optional: the number of fields of bytes at the end whose tokens may be missing; requires
             `padded`.
-        rest: whether the field of bytes after the first token is the whole rest of the frame,
+        rest: whether the field of bytes after the first token contains the whole rest of the frame,
             including separators; requires `padded`.
 
     Raises:
-        SpecError: for a start or separator that is not one byte, or that the end begins with, and
-            for other bases.
+        SpecError: if the base is not 10 or 16, if start or separator are not one byte, or if the
+            end begins with one of them.
     """
 
     is_text: ClassVar[bool] = True
@@ -476,9 +490,10 @@ class Tokens:
         return replace(decoded, problem=problem)
 
     def _find_stop(self, data: bytes) -> tuple[int | None, Problem | None]:
-        """Return the offset after the last token, and the fault of the checksum.
+        """Return the offset after the last token, and an error in the checksum.
 
-        The offset is None if the end is missing, the fault is None if the checksum is correct.
+        The offset is None if the end of the frame is missing. The error is None if the checksum is
+        correct.
         """
         if not data.endswith(self.end):
             return None, None
@@ -487,7 +502,7 @@ class Tokens:
             return stop, None
         begin = stop - self.check.size
         if data[begin : begin + 1] != self.check.mark or begin < 1:
-            reason = f"there is no {self.check.mark.decode()} and checksum before the end"
+            reason = f"{self.check.mark.decode()} and a checksum are missing before the end"
             return stop, Problem(stop, reason, is_checksum=True)
         got = data[begin:stop]
         expected = self.check.write(data[1:begin])
@@ -535,7 +550,7 @@ class Tokens:
         return int(256**size - 1)
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded: fractions with few digits."""
+        """Return values that can be encoded, which are fractions with few digits."""
         if self.base == 16:
             return values
         drawn = values.copy()
@@ -562,8 +577,8 @@ def _bits_of_float(value: float, size: int) -> int:
 def _write_decimal(value: np.floating[Any], form: str) -> bytes:
     """Return a float as a decimal fraction.
 
-    It has all digits of the float, and at least the digits of a format. It is empty for nan, a
-    missing value.
+    The text has all digits of the float, and at least the digits in `form`. It is empty for nan,
+    which means a missing value.
     """
     if not np.isfinite(value):
         return b""
@@ -581,7 +596,7 @@ class _TokenReader:
 
     Args:
         data: the frame, up to the end of the last token.
-        stop: the offset of that end; None if it is missing.
+        stop: the offset of the end of the last token; None if it is missing.
     """
 
     def __init__(self, form: Tokens, data: bytes, stop: int | None) -> None:
@@ -596,7 +611,7 @@ class _TokenReader:
         is_mark = characters == form.sep[0]
         is_mark[:1] = False
         is_mark[-1] = stop is not None
-        #: Offset of the separator or the end after each token.
+        #: The offset of the separator or the end after each token.
         self._marks = is_mark.nonzero()[0]
         self._begins = np.append(1, self._marks + 1)[: len(self._marks)]
         self._magnitudes = np.zeros(len(self._marks), np.uint64)
@@ -608,7 +623,7 @@ class _TokenReader:
                 self._convert_signed(characters[self._begins])
 
     def _convert_numbers(self, characters: NDArray[np.uint8]) -> None:
-        """Convert all tokens that are digits without a sign."""
+        """Convert all tokens that consist of digits without a sign."""
         values, is_digit = _make_digit_values(self._form.base)
         lengths = self._marks - self._begins
         body = characters[1 : self._marks[-1] + 1]
@@ -648,7 +663,7 @@ class _TokenReader:
         return self._data[begin:end], np.array([begin])
 
     def _read_joined(self, run: TextRun) -> tuple[bytes, Offsets]:
-        """Read a field that is followed by the next field without a separator."""
+        """Read a field that has no separator after it."""
         begin = self.position
         text = self._data[begin : begin + run.size]
         if len(text) < run.size or self._form.sep in text:
@@ -657,7 +672,7 @@ class _TokenReader:
         return text, np.array([begin])
 
     def _read_padded(self, run: TextRun) -> tuple[bytes, Offsets]:
-        """Read a token that may be shorter than its field, or missing at the end."""
+        """Read a token that may be shorter than its field, or may be missing."""
         begin = self.position
         token = int(self._marks.searchsorted(begin))
         if token == len(self._marks):
@@ -700,7 +715,7 @@ class _TokenReader:
     def _read_decimal(self, token: int, size: int) -> int | None:
         """Return a decimal fraction as the bits of a float.
 
-        An empty token is nan. Returns None for an invalid token.
+        Returns the bits of nan for an empty token, and None for an invalid token.
         """
         text = self._data[self._begins[token] : self._marks[token]]
         if not text:
@@ -715,15 +730,15 @@ class _TokenReader:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Steps with a variable number of echoes, which are joined by a mark.
+    """A variable number of echoes for each step, which are joined by a mark.
 
-    In the struct, each step has places for `most` echoes, and a missing echo is 0. The first echo
-    of a step is always sent. Others are not sent if they and all later echoes of the step are 0.
+    In the struct, each step has `most` echoes, and a missing echo is 0. When a step is encoded,
+    echoes of 0 at its end are left out, except for the first echo.
 
     Args:
-        size: the characters of an echo.
+        size: the number of characters of an echo.
         most: the maximum number of echoes of a step.
-        mark: a character that is not a digit.
+        mark: the character between the echoes of a step, which must not be a digit.
     """
 
     size: int
@@ -732,7 +747,7 @@ class Echoes:
 
     @cached_property
     def _step(self) -> re.Pattern[bytes]:
-        """A pattern for one step: a mark joins two echoes if another character follows it."""
+        """The pattern of one step. A mark joins two echoes only if another character follows."""
         mark = re.escape(self.mark)
         echo = b"[^%b].{%d}" % (mark, self.size - 1)
         return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
@@ -743,14 +758,16 @@ class Echoes:
         """Insert the echoes that were not sent.
 
         Args:
+            characters: the characters of the steps.
             offsets: the offsets of the characters in the frame, (n,).
             end: the offset after the last character.
-            zero: the digit of a missing echo.
+            zero: the digit that missing echoes consist of.
             is_whole: whether these are all characters of the frame.
 
         Returns:
-            The characters, and the offset of each. A missing echo has the offset of the next
-            character. A mark that joins no echoes is kept, and later fails to be read as a number.
+            The characters with all echoes, and the offset of each. A missing echo has the offset of
+            the next character. A mark that joins no echoes is kept, so that it is reported as an
+            invalid number.
         """
         stride = self.size + len(self.mark)
         step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
@@ -780,7 +797,7 @@ class Echoes:
         return [step[0] for step in self._step.finditer(steps[0])] if steps else []
 
     def _begins_echo(self, characters: bytes, *, is_whole: bool) -> bool:
-        """Return whether characters begin with a mark that joins an echo."""
+        """Return whether characters begin with a mark and an echo."""
         if not characters.startswith(self.mark):
             return False
         following = characters[len(self.mark) : len(self.mark) + 1]
@@ -789,10 +806,10 @@ class Echoes:
         return not is_whole
 
     def join(self, characters: bytes, zero: bytes) -> bytes:
-        """Return the steps as they are sent.
+        """Return the characters of steps without the echoes that are not sent.
 
         Raises:
-            SpecError: if the characters are not steps.
+            SpecError: if the characters are not whole steps.
         """
         room = self.most * self.size
         if len(characters) % room:
@@ -818,17 +835,17 @@ class Echoes:
 class SixBits:
     """Numbers in characters of six bits each, the highest bits first.
 
-    It is used as ``Lines(...) | SixBits()``. A number has as many characters as its field has
-    bytes: `Int16ub` is two characters, `Int24ub` three, `Int32ub` four. An `Int8ub` is one
-    character, which can also be a decimal digit.
+    It is used as ``Lines(...) | SixBits()``. The number of characters is the size of the field in
+    bytes: an `Int16ub` has two characters, an `Int24ub` three, and an `Int32ub` four. An `Int8ub`
+    is one character, which may also be a decimal digit.
 
     Args:
         first: the character for 0.
-        echoes: how the steps with echoes after the head are sent; None if all numbers are sent.
+        echoes: how steps with echoes after the head are sent; None if all numbers are sent.
 
     Raises:
-        SpecError: for a mark of echoes that is a digit or not one character, and for echoes without
-            a character.
+        SpecError: for invalid `echoes`: a mark that is a digit or not one character, or a size or
+            number below 1.
     """
 
     first: bytes = b"0"
@@ -848,7 +865,7 @@ class SixBits:
             )
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
-        """Return the characters of a struct; higher bits of large numbers are lost."""
+        """Return the characters of a struct; the highest bits of large numbers are lost."""
         parts = list[bytes]()
         offset = 0
         for run in runs:
@@ -920,7 +937,7 @@ class _SixBitReader:
 class Scip:
     """The check character of SCIP: six bits of the sum of a line's characters.
 
-    Its value 0 is the character "0".
+    The character "0" stands for 0.
 
     Source: SCIP 2.0, C-42-03320B, 5.
     """
@@ -932,17 +949,18 @@ class Scip:
 
 @dataclass(frozen=True)
 class Lines:
-    """Text in lines of one length after a head; a frame ends with an empty line.
+    """A head and further lines of one length, followed by an empty line.
 
-    ``Lines(...) | SixBits()`` declares how numbers are written.
+    ``Lines(...) | SixBits()`` declares how numbers are encoded.
 
     Args:
-        width: the characters of each line except the last, without its check character.
-        head: the numbers of characters of the first lines, which have their own lengths.
-        bare: the number of first lines without a check character.
+        width: the number of characters of each line after the head, without its check character.
+            The last line may be shorter.
+        head: the number of characters of each line of the head.
+        bare: the number of lines at the start that have no check character.
         check: a function from a line to its check character, for example `Scip`; None if lines have
-            none.
-        numbers: how numbers are written; None for unchanged bytes.
+            no check characters.
+        numbers: how numbers are encoded; None for unchanged bytes.
 
     Raises:
         SpecError: for lines without a character, and for echoes without a head before them.
@@ -987,7 +1005,7 @@ class Lines:
         return NO_END
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the sizes of frames, and `NO_FRAME` if a line has another length."""
+        """Return the sizes of frames; `NO_FRAME` if a line has a wrong length."""
         newlines = np.flatnonzero(buffer == NEWLINE)
         steps = np.diff(newlines, prepend=0)
         ends = find_next_offsets(newlines[:-1][steps[1:] == 1], offsets, len(buffer))
@@ -1051,10 +1069,10 @@ class Lines:
         return replace(decoded, problem=problem)
 
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
-        """Return the characters of all lines without checks, and their offsets.
+        """Return the characters of all lines without check characters, and their offsets.
 
-        The characters end before a line of another length. The third value is the fault of the
-        lines; None if they are valid.
+        The characters end before the first line with a wrong length. The third value is the first
+        error in the lines; None if they are valid.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:
@@ -1116,16 +1134,17 @@ class Lines:
 class Escaped:
     """Frames between two flags, with escaped bytes (as in HDLC).
 
-    A flag or an escape in the content is sent as an escape and the byte with some bits inverted.
-    Each frame has its own two flags. When reading, any byte may be escaped. When building, only
-    flags and escapes are.
+    A flag or an escape byte in the content is sent as an escape byte, followed by the byte with
+    some bits inverted. Each frame has its own two flags. Decoding accepts an escape before any
+    byte. Encoding escapes only flags and escape bytes.
 
     Args:
-        flag, escape: bytes.
-        xor: the bits to invert in an escaped byte.
+        flag: the byte before and after a frame.
+        escape: the escape byte.
+        xor: the bits that are inverted in an escaped byte.
 
     Raises:
-        SpecError: unless flag and escape are different bytes, which no escaped byte equals.
+        SpecError: if flag and escape byte are equal, or if an escaped byte can be one of them.
     """
 
     is_text: ClassVar[bool] = False

@@ -1,15 +1,14 @@
 """Prepare construct structs for the engine, and translate them to the frame tree.
 
-Only this package knows construct's classes.
+No other package of the engine uses construct's classes. `prepare` returns a copy of a plugin's
+struct for the engine, `check_struct` raises an error if the struct is not supported, and
+`frame_tree` returns the tree of the struct. Modules in reading order:
 
-In: an author's struct. Out: a copy of it for the engine (`prepare`), an error if it is unsupported
-(`check_struct`), its nodes (`frame_tree`). Modules in reading order:
-
-* `replacements`: classes that replace construct's, each with its reason, and additional ones.
-* `adapters`: adapters and texts as functions of raw values.
-* `raw_checksums`: translates construct's Checksum of a RawCopy to a seal.
-* `structs`: prepares a struct; properties of a construct, and random values for it.
-* `refusals`: checks for unsupported structs.
+* `replacements`: classes that replace classes of construct, and additional classes.
+* `adapters`: converts adapters and texts to functions of raw values.
+* `raw_checksums`: replaces construct's Checksum of a RawCopy by a struct with a checksum.
+* `structs`: prepares a struct, returns properties of a construct, and draws random values.
+* `refusals`: raises errors for unsupported structs.
 * `meaning`: translates a struct to nodes.
 """
 

@@ -1,8 +1,9 @@
 """Convert adapters of construct to functions between raw and decoded values.
 
-An adapter is called with values of its field, without a context. If it needs a context, or fails
-for some numbers, only construct can apply it. All values of a byte are tried, and several hundred
-values of a wider field. An adapter that does not restore the raw value is refused.
+The engine calls an adapter with values of its field, without a context. If the adapter needs a
+context, or fails for some numbers, only construct can apply it. To find this out, the adapter is
+tried with all values of a byte, or with several hundred values of a wider field. An adapter is not
+supported if encoding a decoded value does not give the raw value again.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from construct import BytesInteger, Construct, FormatField, Subconstruct
 from lidarspec.spec import tree
 from lidarspec.spec.syntax.structs import bit_width, children, fixed_size, number_kind
 
-#: number of random values to try for a field that is wider than a byte.
+#: The number of random values to try for a field that is wider than a byte.
 TRIAL_COUNT = 200
 
-#: maximum width of an integer in a column, in bits.
+#: The maximum width of an integer in a column, in bits.
 MAX_INT_BITS = 64
 
-#: adapters with a known meaning, which are handled elsewhere.
+#: Adapters with a known meaning, which `meaning` converts.
 _KNOWN = (construct.Enum, construct.Validator, construct.StringEncoded)
 
 
@@ -35,11 +36,11 @@ class Trial:
     """The results of an adapter for trial values.
 
     Attributes:
-        valid: the raw values that it accepts.
+        valid: the raw values that can be decoded.
         values: the decoded values.
-        failed: whether it fails for some raw values.
-        lost: a raw value that it does not restore, and the raw value it returns instead; None if it
-            restores all.
+        failed: whether some raw values cannot be decoded.
+        lost: a raw value that decoding and encoding does not restore, and the raw value that
+            results instead; None if all values are restored.
     """
 
     valid: tuple[Any, ...]
@@ -49,9 +50,9 @@ class Trial:
 
 
 def int_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions of an adapter of an integer.
+    """Return an adapter of an integer as functions.
 
-    Returns None for another construct, or if only construct can apply the adapter.
+    Returns None if the construct is no such adapter, or if only construct can apply it.
     """
     if not is_int_adapter(con):
         return None
@@ -84,7 +85,7 @@ def without_int_adapters(con: Construct) -> Construct:
 def is_int_adapter(con: Construct) -> bool:
     """Return whether a construct is a general adapter of an integer.
 
-    Adapters with a known meaning (`_KNOWN`) are not general.
+    Adapters in `_KNOWN`, whose meaning is known, are not general.
     """
     if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
         return False
@@ -163,7 +164,7 @@ def _encode_int(con: Any, value: Any, size: int) -> Any:
 
 
 def _int_bits(con: Construct) -> int:
-    """Return the width of an integer in bits; 0 for a wider one and for another construct."""
+    """Return the width of an integer of at most 64 bits; 0 for any other construct."""
     if number_kind(con) not in ("i", "u") or not isinstance(con.length, int):
         return 0
     bits = bit_width(con)
@@ -171,7 +172,7 @@ def _int_bits(con: Construct) -> int:
 
 
 def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
-    """Return the functions of a text, from its encoding and its padding."""
+    """Return the functions that decode and encode a text."""
     inner = con.subcon
     while isinstance(inner, Subconstruct) and not isinstance(inner, construct.NullStripped):
         inner = inner.subcon
@@ -196,7 +197,7 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
 
 
 def part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions of a part of fixed size.
+    """Return the functions that decode and encode a part of fixed size.
 
     Returns None if only construct can read the part.
     """
@@ -230,7 +231,7 @@ def _describe_form(con: Construct) -> str:
     return type(con).__name__
 
 
-#: constructs that depend on no other bytes.
+#: Constructs that depend only on their own bytes.
 _INDEPENDENT_KINDS = (
     FormatField,
     BytesInteger,
@@ -249,7 +250,7 @@ _INDEPENDENT_KINDS = (
 
 
 def _find_independent_size(con: Construct) -> int:
-    """Return the fixed size of a part that depends on no other bytes, else 0."""
+    """Return the fixed size of a part; 0 if it depends on bytes outside of it."""
     pending = [con]
     while pending:
         part = pending.pop()

@@ -2,8 +2,8 @@
 
 * Expressions (counts, conditions, keys) are traced: they are called with symbols in place of
   fields, and the operations on the symbols are recorded as a formula.
-* The bit positions of a bit block are found by parsing test patterns with construct, so this
-  project has no bit order rules of its own.
+* The bit positions of a bit block are found by parsing test patterns with construct, so this module
+  has no rules about the order of bits.
 * A construct that no node can represent becomes `tree.Opaque`, with the reason. Only construct can
   parse it, one frame at a time.
 """
@@ -74,8 +74,8 @@ def frame_tree(con: Construct) -> tree.Node:
 def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
     """Return the node that `build` makes, and the builder.
 
-    If rebuilt values depend on later fields, the node is built a second time by a builder that
-    knows the fields and sizes of the first pass.
+    If values of built frames depend on later fields, the node is made a second time, by a builder
+    with the fields and sizes of the first pass.
     """
     builder = _Builder()
     root = build(builder)
@@ -86,9 +86,9 @@ def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Bu
 
 
 def _trace(expression: Any, scope: tree.Scope) -> Any:
-    """Return the value of an expression in which symbols replace the fields.
+    """Return the value of an expression for symbols in place of the fields.
 
-    Expressions of construct are walked here instead of called, because calling ``~`` evaluates
+    Expressions of construct are evaluated here and not called, because calling ``~`` evaluates
     ``not value``, and a symbol has no truth value.
     """
     if isinstance(expression, BinExpr):
@@ -133,9 +133,10 @@ def _expand_path(path: str, way: re.Match[str]) -> str:
 
 
 def to_seen(info: tree.FieldInfo, raw: int) -> Any:
-    """Return a raw value as expressions of a struct read it.
+    """Return a raw value in the form that expressions of a struct read.
 
-    It has its name if construct's Enum has a name for it.
+    If the Enum of the field has a name for the value, expressions can compare the value with the
+    name.
     """
     if raw in info.labels:
         return construct.EnumIntegerString.new(raw, info.labels[raw])
@@ -143,7 +144,7 @@ def to_seen(info: tree.FieldInfo, raw: int) -> Any:
 
 
 def to_unnamed(raw: int) -> Any:
-    """Return a raw value without a name in its Enum, as construct does."""
+    """Return a raw value without a name in its Enum, in the form of construct."""
     return construct.EnumInteger(raw)
 
 
@@ -152,20 +153,21 @@ class _Context:
     """The context of a construct.
 
     Attributes:
-        info: what its wrappers and parents declare about the field.
-        scope: the fields that its expressions can refer to.
-        name: its name in the parent struct; "" if it has none.
-        in_bits: whether it is inside a bit block.
+        info: the description of the field by the constructs around it.
+        scope: the fields that expressions can refer to.
+        name: the name of the construct in its struct; "" without a name.
+        in_bits: whether the construct is inside a bit block.
     """
 
     info: tree.FieldInfo
     scope: tree.Scope | None
     name: str = ""
     in_bits: bool = False
-    #: number of bytes up to the end of the enclosing part, if its length is declared elsewhere.
+    #: The number of bytes up to the end of the enclosing part, if another field declares its
+    #: length.
     room: tree.Formula | None = None
-    #: returns the offset in the frame, or None if no formula gives it. It is None in parts, because
-    #: their offset in the frame is not known.
+    #: A function that returns the formula of the offset in the frame, or None if there is no
+    #: formula. The offset of parts is never known.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
     def inside(self, **changes: Any) -> _Context:
@@ -177,12 +179,13 @@ class _Builder:
     """Makes the nodes of a struct.
 
     Args:
-        before: the builder of the first pass, if this is the second one (`_build_twice`).
+        before: the builder of the first pass, if this is the second pass (`_build_twice`).
 
     Attributes:
         scopes: the complete scope of each struct, by its path.
-        sizes: the formulas of all SizeOf fields, in the order of these fields; None until known.
-        rebuilding: whether a second pass is required, because values depend on other fields.
+        sizes: the formulas of all SizeOf fields, in the order of the fields; None if not known yet.
+        rebuilding: whether a second pass is required, because values of built frames depend on
+            other fields.
     """
 
     def __init__(self, before: _Builder | None = None) -> None:
@@ -192,8 +195,8 @@ class _Builder:
         self.sizes: list[tree.Formula | None] = []
         self.rebuilding = False
         self._asked: list[tree.Ref] = []
-        #: the SizeOf fields that measure a part of each struct under construction, as (index in
-        #: `sizes`, field).
+        #: For each struct that is not complete yet, the SizeOf fields that measure a part of it, as
+        #: (index in `sizes`, field).
         self._measured: dict[tree.Scope, list[tuple[int, SizeField]]] = {}
 
     def node(self, con: Construct, place: _Context) -> tree.Node:
@@ -255,7 +258,8 @@ class _Builder:
     def _make_derived(self, con: Construct, place: _Context) -> tree.Node | None:
         """Return the node of a value without bytes of its own.
 
-        Returns None for another construct, or if only construct can compute the value.
+        Returns None if the construct has bytes of its own, or if only construct can compute the
+        value.
         """
         if isinstance(con, construct.Computed):
             return self._make_computed(con, place)
@@ -296,7 +300,7 @@ class _Builder:
         )
 
     def _raw(self, con: RawPart, place: _Context) -> tree.Struct:
-        """Return a RawCopy as a struct of the value, its bytes and its offsets."""
+        """Return a RawCopy as a struct with the value, its bytes and its offsets."""
         info = place.info
         scope = tree.RawCopyScope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
@@ -329,7 +333,7 @@ class _Builder:
         return tree.Struct(place.name, info.path, (before, value, *behind), info.docs)
 
     def _add_value(self, place: _Context, content: Any) -> None:
-        """Add a computed value for later expressions to the scope."""
+        """Add a computed value to the scope, for later expressions."""
         if place.scope is not None:
             place.scope.add(place.name, tree.Value(content))
 
@@ -377,13 +381,13 @@ class _Builder:
             con = con.subcon
 
     def _adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
-        """Return the adapter of an integer, unless its wrappers define its values."""
+        """Return the adapter of an integer; None if the field has a constant, labels or a scale."""
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
         return int_adapter(con)
 
     def _default(self, value: Any, place: _Context) -> Any:
-        """Return the value of a construct Default, or a formula if it is a function."""
+        """Return the value of construct's Default, as a formula if it is a function."""
         if callable(value):
             return self._formula(value, place)
         return value
@@ -402,7 +406,7 @@ class _Builder:
         Returns `tree.Untraced` with the reason if it cannot be converted.
 
         Args:
-            known: the scope of the expression, if it is not the scope of `place`.
+            known: the scope of the expression; by default the scope of `place`.
             is_key: whether named values may be compared by their names.
             may_be_fraction: whether the result may be a fraction.
         """
@@ -557,9 +561,10 @@ class _Builder:
     def _fill_with_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return an array of the elements of one size that fill a part.
+        """Return the node for the elements that fill a part.
 
-        If their number depends on the elements, it is a node that only construct can read.
+        The node is an array if all elements have the same fixed size. Otherwise only construct can
+        read it.
         """
         axis = axis_path(place.info)
         element = self.node(
@@ -641,8 +646,8 @@ class _Builder:
     def _check(self, con: construct.Check, place: _Context) -> tree.Node:
         """Return the node of a condition.
 
-        If it uses fields of another array or frame, or may exceed 64 bits, only construct can
-        read it.
+        If the condition uses fields of another array or frame, or may exceed 64 bits, only
+        construct can check it.
         """
         condition = self._formula(con.func, place)
         info = place.info
@@ -742,9 +747,9 @@ class _Builder:
         return node
 
     def _encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
-        """Return bytes with functions that decode them, or None.
+        """Return a node of bytes with functions that decode them.
 
-        It is None if only construct can read them.
+        Returns None if only construct can read the bytes.
         """
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
@@ -766,7 +771,7 @@ class _Builder:
     def _text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
         """Return the size of a text in bytes.
 
-        Returns None if it ends with a terminator or the datagram.
+        Returns None if the text extends to a terminator or to the end of the datagram.
         """
         inner = con.subcon
         if inner is construct.GreedyBytes:
@@ -782,7 +787,7 @@ class _Builder:
         return None
 
     def _block(self, con: Construct, place: _Context) -> tree.Node:
-        """Return a bit block. The bits of each field are found by probing construct."""
+        """Return the node of a bit block; the bits of each field are found by probing."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
             size = int(con.sizeof())
@@ -830,7 +835,8 @@ def _seen_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
 def _is_whole(formula: tree.Formula) -> bool:
     """Return whether an operation is defined for all values of its fields.
 
-    Division, modulo and shifts are defined only if the right operand is a positive constant.
+    Division, modulo and shifts are defined for all values only if the right operand is a positive
+    constant.
     """
     if not isinstance(formula, tree.Op) or formula.symbol not in ("/", "//", "%", "<<", ">>"):
         return True
@@ -853,7 +859,7 @@ def _find_offset_after(
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
     """Return whether a computed value can read exactly one value of a field.
 
-    The field exists whenever the computed value does, and has one value in each of its elements.
+    The field has to exist whenever the computed value exists, and must not be in a further array.
     """
     return (
         not ref.path.startswith("_.")
@@ -869,9 +875,9 @@ def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
 
 
 def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
-    """Return a peeked value.
+    """Return the node of a peeked value.
 
-    If the frame may end before the peeked bytes do, it is a node that only construct can read.
+    If the peeked bytes may extend beyond the frame, only construct can read the value.
     """
     assert derived.node is not None
     needed = tree.size(derived.node)
@@ -889,7 +895,7 @@ def _accepts_any_bytes(node: tree.Node) -> bool:
 
 
 def _find_min_size(node: tree.Node) -> int:
-    """Return the minimum size of a node in bytes, 0 if it is not known."""
+    """Return the minimum size of a node in bytes; 0 if it is not known."""
     match node:
         case tree.When():
             return min(_find_min_size(node.then), _find_min_size(node.otherwise))
@@ -911,7 +917,8 @@ def _sum_member_sizes(
     """Return the size of consecutive members of a struct.
 
     Args:
-        first, last: the names of the first and the last member; "" for the last member.
+        first: the name of the first member.
+        last: the name of the last member; "" for `first` alone.
     """
     names = [member.name for member in members]
     return tree.total(
@@ -920,10 +927,10 @@ def _sum_member_sizes(
 
 
 def _find_below(node: tree.Node, names: Iterable[str]) -> tree.Node:
-    """Return the node that names lead to in a struct.
+    """Return the node at a path in a struct.
 
     Raises:
-        SpecError: if it does not exist.
+        SpecError: if the path does not exist.
     """
     for name in names:
         body = node.struct if isinstance(node, tree.Sealed) else node
@@ -945,7 +952,7 @@ _TRANSFORMED_REASON = (
     " 0x55), or use a WireForm"
 )
 
-#: class that only construct can read -> the message with a replacement.
+#: The classes that only construct can read, with a message that suggests a replacement.
 _OPAQUE_REASONS = {
     "ProcessXor": _TRANSFORMED_REASON.format("ProcessXor"),
     "ProcessRotateLeft": _TRANSFORMED_REASON.format("ProcessRotateLeft"),
@@ -989,10 +996,10 @@ _OPAQUE_REASONS = {
     "RepeatUntil": ("RepeatUntil has no fixed offset: use Array with a count, or Parts"),
 }
 
-#: constructs that read all available bytes unchanged.
+#: Constructs that read all available bytes unchanged.
 _GREEDY_BYTES = (type(construct.GreedyBytes),)
 
-#: kinds of numbers, by the kind of their dtype.
+#: The kinds of numbers, by the kind of their dtype.
 _NUMBER_KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
 
 
@@ -1005,7 +1012,7 @@ def _make_number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Numbe
 def axis_path(info: tree.FieldInfo) -> str:
     """Return the name of the axis of an array at this path.
 
-    The axis of an array directly inside an array gets brackets.
+    If an array is directly inside an array, "[]" is appended to the path.
     """
     path = info.path
     while path in info.axes:
@@ -1065,7 +1072,7 @@ def _is_text(con: Construct) -> bool:
 
 
 def _describe_form(con: Construct) -> str:
-    """Return the form on the wire of a field without a size of its own."""
+    """Return how a field of variable size is stored, as text to display."""
     below = con
     while isinstance(below, Subconstruct):
         if isinstance(below, construct.NullTerminated):
@@ -1089,7 +1096,7 @@ def _find_terminator(con: Construct) -> bytes:
 def _find_constant(con: Const) -> Any:
     """Return the raw value of a constant.
 
-    If it is given as a name of construct's Enum, the number of the name is returned.
+    If the constant is a name of construct's Enum, this is the number of the name.
 
     Raises:
         SpecError: if the Enum does not have the name.
@@ -1117,7 +1124,7 @@ def _is_variable_integer(con: BytesInteger) -> bool:
 def _probe_block(con: Construct, size: int) -> list[BitField] | None:
     """Return the bit fields of a block.
 
-    Returns None if its fields depend on values, or if its values are not plain integers.
+    Returns None if the fields of the block depend on values, or if values are not plain integers.
     """
     if _has_fixed_fields(con):
         return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
@@ -1142,7 +1149,7 @@ def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
     """Return the offsets of the bytes of a block that contain bits of a field.
 
     Args:
-        names: the names that lead to the field.
+        names: the names that lead from the block to the field.
 
     Raises:
         KeyError: if the block does not have the field.

@@ -1,8 +1,9 @@
-"""Recognise construct's Checksum of a RawCopy as a seal of the struct that has both.
+"""Replace construct's Checksum of a RawCopy by a struct with a checksum.
 
-``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` equals a `Checksummed`
-with the function as its algorithm. The covered part is found by calling the expression of the
-Checksum with an object that records the names it reads.
+A struct with ``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` is
+converted to a `Checksummed` with the function as its algorithm. The covered part is found by
+calling the expression of the Checksum with an object that records the names that the expression
+reads.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from construct import Construct, Struct
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.syntax.replacements import BoundedPart, SealedStruct
 
-#: maximum width of a checksum for many frames at once, in bits.
+#: The maximum width of a checksum that is computed for many frames at once, in bits.
 MAX_CHECKSUM_BITS = 64
 
 
 @dataclass(frozen=True)
 class FunctionChecksum(Checksum):
-    """The function of construct's Checksum, called for each frame.
+    """A checksum algorithm that calls the function of construct's Checksum.
 
     Attributes:
-        function: returns the checksum, a number or bytes.
-        takes_part: whether its argument is the whole value of construct's RawCopy, not only the
-            bytes.
+        function: the function, which returns the checksum as a number or bytes.
+        takes_part: whether the argument of the function is the whole value of a RawCopy, and not
+            only its bytes.
     """
 
     function: Callable[[Any], int | bytes]
@@ -50,7 +51,7 @@ class FunctionChecksum(Checksum):
 
 @dataclass(frozen=True)
 class _Names:
-    """Records the names that an expression reads from the struct that contains it."""
+    """An object that records the names of the members that an expression reads."""
 
     names: tuple[str, ...] = ()
 
@@ -64,11 +65,10 @@ class _Names:
 
 
 def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
-    """Return the members of a struct without its checksums of a RawCopy.
+    """Replace the checksums of a RawCopy among the members of a struct by plain fields.
 
     Returns:
-        The members, with plain fields in place of these checksums, and for each of them the
-        arguments of a `SealedStruct`.
+        The new members, and for each replaced checksum the arguments of a `SealedStruct`.
     """
     found = list[Construct]()
     seals = list[dict[str, Any]]()
@@ -89,7 +89,11 @@ def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[d
 
 
 def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
-    """Return a struct with seals around it."""
+    """Return a struct inside a `SealedStruct` for each checksum.
+
+    Args:
+        seals: the arguments of each `SealedStruct`.
+    """
     for arguments in seals:
         struct = SealedStruct.plugin_class(struct, **arguments)
     return struct
@@ -98,11 +102,11 @@ def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
 def _find_covered_part(
     checksum: Construct, members: Sequence[Construct]
 ) -> tuple[tuple[str, ...], bool] | None:
-    """Return the names of the RawCopy that a checksum covers.
+    """Find the RawCopy that a checksum covers.
 
     Returns:
-        The names, and whether the function of the checksum takes the whole value of the RawCopy.
-        None for another checksum.
+        The names that lead to the RawCopy, and whether the function of the checksum takes its whole
+        value. None if the checksum does not cover a RawCopy.
     """
     if not isinstance(checksum, construct.Checksum):
         return None

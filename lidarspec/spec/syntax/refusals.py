@@ -1,7 +1,7 @@
-"""Refuse structs that cannot describe a frame.
+"""Raise errors for structs that cannot describe a frame.
 
-These are structs with clashing names, and constructs that lose bits, run code or have no end. The
-error has the path and the reason.
+Examples are structs with two members of one name, and constructs that lose bits, run code or have
+no end. The error has the path and the reason.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from lidarspec.spec.syntax.structs import (
     unwrap,
 )
 
-#: field names that are reserved for `points` and the engine.
+#: The field names that are reserved for `points` and the engine.
 RESERVED = frozenset({"state", "on"})
 SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_"))
 
-#: refused construct -> the rule that `lidarspec check` explains, and the reason.
+#: The constructs that are not supported, with the rule of `lidarspec check` and the reason.
 _REFUSED: dict[type, tuple[str, str]] = {
     type(construct.Pickled): ("LS110", "Pickled executes code from the wire: use other fields"),
     construct.FlagsEnum: (
@@ -43,18 +43,18 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Union: (
         "LS109",
         (
-            "Union reads bytes in several ways and ignores edits of all but one on rebuild:"
-            " declare one"
+            "Union parses the same bytes in several ways and builds only one of them: declare"
+            " one of them"
         ),
     ),
     construct.Padded: (
         "LS106",
-        ("padding loses its bytes on a round trip: declare a field, such as 'reserved' / Bytes(n)"),
+        ("a rebuilt frame loses the bytes of padding: declare a field, 'reserved' / Bytes(n)"),
     ),
     construct.Aligned: (
         "LS106",
         (
-            "Aligned loses its padding on a round trip, unless it is a named member of a Struct:"
+            "a rebuilt frame loses the padding of Aligned, unless it is a named member of a Struct:"
             " Struct('part' / Aligned(4, ...))"
         ),
     ),
@@ -79,7 +79,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
     ),
 }
 
-#: constructs that limit a greedy part.
+#: The constructs that limit a greedy part.
 _BOUNDED_KINDS = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
 
 
@@ -90,8 +90,8 @@ def check_struct(con: Construct) -> SpecError | None:
         An error if the frames have no end in a byte stream; None if they have an end.
 
     Raises:
-        SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses
-            bits or never ends. It has the path and the reason.
+        SpecError: for a shadowed, reserved, duplicate or missing name, or for a construct that
+            loses bits or has no end. The error has the path and the reason.
     """
     endless = _check_ends(con, "", bounded=False)
     constructs = list(_iter_constructs(con, "", in_bits=False))
@@ -106,7 +106,7 @@ def check_struct(con: Construct) -> SpecError | None:
             child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons
         ):
             raise SpecError(
-                "no field of a part may be called 'frame', which is the outer frame",
+                "no field of a part may be called 'frame', because f.frame is the outer frame",
                 path=f"{path}.frame",
                 rule="LS102",
             )
@@ -115,11 +115,13 @@ def check_struct(con: Construct) -> SpecError | None:
 
 
 def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
-    """Refuse a construct of a class that loses bits, runs code or reads other bytes."""
+    """Raise SpecError for a class that loses bits, runs code or reads bytes elsewhere."""
     lost = try_values(part).lost if is_int_adapter(part) else None
     if lost is not None and not isinstance(part, construct.FlagsEnum):
         raw, back = lost
-        reason = f"{author_class(part)} makes {back!r:.80} of {raw} when a frame is built again"
+        reason = (
+            f"{author_class(part)} changes {raw} to {back!r:.80} when a parsed frame is built again"
+        )
         raise SpecError(reason, path=path, rule="LS106")
     for kind, (rule, reason) in _REFUSED.items():
         is_exact = kind is construct.FlagsEnum and is_int_adapter(part) and lost is None
@@ -136,15 +138,16 @@ def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
 def _check_ends(
     con: Construct, path: str, *, bounded: bool, is_last: bool = True
 ) -> SpecError | None:
-    """Refuse greedy parts without an end, and bounded parts that lose bytes.
+    """Raise SpecError for greedy parts without an end, and bounded parts that lose bytes.
 
-    A greedy part is valid at the end of the frame, or of a part that has an end.
+    A greedy part reads all available bytes. It is valid as the last part of the frame, or of a part
+    that has an end.
 
     Returns:
-        An error if the last part of the frame is greedy, so that it has no end in a stream.
+        An error if the last part of the frame is greedy, so that the frame has no end in a stream.
 
     Raises:
-        SpecError: for another greedy part without an end, or for a part that loses bytes.
+        SpecError: for any other greedy part without an end, or for a part that loses bytes.
     """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}".strip(".")
@@ -194,10 +197,10 @@ def _check_ends(
 
 
 def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
-    """Return whether a part reads all its bytes and builds the same bytes again.
+    """Return whether a part reads all its bytes, so that the same bytes can be built.
 
     Args:
-        padded: whether zeros are added after a part that is too short.
+        padded: whether a part that is too short is padded with zeros.
     """
     if isinstance(con, construct.NullStripped):
         return padded and con.pad == b"\0" and con.subcon is construct.GreedyBytes
@@ -209,7 +212,7 @@ def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
 
 
 def _check_focus(con: construct.FocusedSeq, path: str) -> None:
-    """Refuse a FocusedSeq that drops the value of a field."""
+    """Raise SpecError for a FocusedSeq that loses the value of a field."""
     for member in con.subcons:
         if member.name != con.parsebuildfrom and not member.flagbuildnone:
             reason = (
@@ -264,9 +267,9 @@ def _check_measures(
     measure: tuple[float, float, str],
     measures_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
-    """Refuse a field that has different scales or units in different branches.
+    """Raise SpecError for a field with different scales or units in different branches.
 
-    It is one column, which has one scale and one unit.
+    The field becomes one column, which has one scale and one unit.
     """
     if isinstance(con, construct.Renamed):
         if path:

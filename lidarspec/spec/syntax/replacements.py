@@ -1,12 +1,12 @@
-"""The classes of a prepared struct: replacements of construct's, and additional classes.
+"""The classes of a prepared struct: replacements of construct's classes, and new ones.
 
-`prepare` replaces a class of construct if it loses bytes, does not report the offset of a fault, or
-cannot parse without verification. Frames with a layout are read without these classes. They are
-used for frames without a layout, which construct parses and builds one at a time, and for the
+`prepare` replaces a class of construct if the class loses bytes, does not report the offset of an
+error, or cannot parse without verification. Most frames have a layout and are read without these
+classes. construct uses them to parse and build frames without a layout, one at a time, and the
 examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is missing.
 
 The additional classes are units, checksums, sizes, fillers and chains of parts, which construct
-does not have. `lidarspec.spec.fields` gives the names and arguments for plugins.
+does not have. Plugins use them through `lidarspec.spec.fields`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lidarspec.spec.checksums import Checksum
 
 _MISSING = object()
 
-#: the exception of construct for bytes or values that do not fit a struct.
+#: The exceptions of construct for bytes or values that do not match a struct.
 Fault = construct.ConstructError
 
 
@@ -72,10 +72,10 @@ def is_verifying(context: Any) -> bool:
 
 
 def check_bound(number: int, limit: int, what: str, path: str) -> int:
-    """Return a count or length if it is possible in a frame.
+    """Return a count or length after checking that a frame can have it.
 
     Raises:
-        construct.RangeError: if it is negative or larger than `limit`.
+        construct.RangeError: if the number is negative or larger than `limit`.
     """
     if not 0 <= number <= limit:
         raise construct.RangeError(f"invalid {what} {number}", path=path)
@@ -83,7 +83,7 @@ def check_bound(number: int, limit: int, what: str, path: str) -> int:
 
 
 def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
-    """Return the member of a nested mapping with this dotted name."""
+    """Return the member at a dotted path of a nested mapping."""
     for part in dotted.split("."):
         if default is not _MISSING and (not isinstance(obj, Mapping) or part not in obj):
             return default
@@ -94,9 +94,9 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 class MarkedStruct(Struct):  # type: ignore[misc]
     """A Struct with the (start, end) of each member under ``_marks`` when parsed.
 
-    construct's own does not keep them. `Checksummed` needs them to find its bytes, `SizeOf` and
-    `PaddingField` to measure, and `explain` to list the fields of a frame without a layout. A
-    missing value is reported with the path of its field.
+    construct's Struct does not keep these offsets. `Checksummed` needs them to find its bytes,
+    `SizeOf` and `PaddingField` to measure parts, and `explain` to list the fields of a frame
+    without a layout. An error about a missing value has the path of its field.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -140,8 +140,8 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
         """Return the context of the members' expressions.
 
-        `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field
-        that declares a length.
+        The entry `_marks` has (start, end) of each member by name. `_sizings` has (SizeField, path,
+        offset, value) for each field that declares a size.
         """
         inner = Container(
             _=context,
@@ -163,13 +163,13 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 class IndexedArray(Array):  # type: ignore[misc]
     """An Array that limits its elements, and reports the index of an invalid element.
 
-    construct's own reports no index, and an invalid count of elements without bytes keeps it busy
-    for minutes. All arrays of a frame together have at most `limit` elements without bytes, because
-    the numbers of nested arrays multiply.
+    construct's Array reports no index, and takes minutes for an invalid count of elements without
+    bytes. All arrays of a frame together may have at most `limit` elements without bytes, because
+    the numbers of elements of nested arrays multiply.
 
     Attributes:
-        limit: the maximum size of a frame, in bytes; inside a bit block in bits.
-        in_bits: whether it is inside a bit block.
+        limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
+        in_bits: whether the array is inside a bit block.
     """
 
     limit: int
@@ -202,7 +202,8 @@ class IndexedArray(Array):  # type: ignore[misc]
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
     """A GreedyRange that uses all bytes of the part that bounds it.
 
-    construct's own drops an element that fails and all bytes after it, and reports no error.
+    construct's GreedyRange ends without an error at an element that fails, and loses all bytes
+    after it.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -214,7 +215,9 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
             place = f"{path}[{len(elements)}]"
             elements.append(self.subcon._parsereport(stream, context, place))
             if stream.tell() == start:
-                raise construct.RangeError("an element without bytes repeats forever", path=place)
+                raise construct.RangeError(
+                    "an element without bytes would repeat forever", path=place
+                )
         return elements
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -226,7 +229,7 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
 def _build_elements(
     con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any, path: str
 ) -> Any:
-    """Build the elements of an array, with the index in an error's path."""
+    """Build the elements of an array; the path of an error includes the index."""
     built = construct.ListContainer()
     for index, element in enumerate(elements):
         context._index = index
@@ -238,7 +241,7 @@ class CheckedConst(Const):  # type: ignore[misc]
     """A Const that can be parsed without verification, and reports a wrong value.
 
     ``parse(verify=False)`` and `explain` parse frames with wrong constants, and a `WireError` has
-    the offset, the expected and the actual value. construct's own supports neither.
+    the offset, the expected and the actual value. construct's Const supports neither.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -254,7 +257,7 @@ class CheckedConst(Const):  # type: ignore[misc]
 class LimitedNumber(Subconstruct):  # type: ignore[misc]
     """A number that accepts only some raw values.
 
-    It represents OneOf, NoneOf and Mapping of construct.
+    It replaces OneOf, NoneOf and Mapping of construct.
     """
 
     def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
@@ -289,8 +292,9 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
 class CountedBytes(Bytes):  # type: ignore[misc]
     """Bytes that distinguish an invalid length from an incomplete frame.
 
-    For a length that is impossible in a frame, construct's own reports the end of the stream. The
-    candidate would wait for more bytes, and block the output until the maximum size has arrived.
+    For a length that is too large for a frame, construct's Bytes reports the end of the stream. The
+    candidate would then wait for more bytes, and block the output until as many bytes as the
+    longest frame have arrived.
     """
 
     limit: int
@@ -303,7 +307,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
 
 
 class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
-    """A NullTerminated that searches for its terminator, not byte by byte."""
+    """A NullTerminated with a fast search for its terminator."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         if len(self.term) != 1 or not self.require or not isinstance(stream, io.BytesIO):
@@ -322,7 +326,7 @@ class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
 class ExactFloat(FormatField):  # type: ignore[misc]
     """A float field that keeps the bits of a NaN.
 
-    construct's own builds a signalling NaN as a quiet one.
+    construct's FormatField builds a signalling NaN as a quiet NaN.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -340,10 +344,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions the name of a number, also while building.
+    """An Enum that gives expressions the name of a number when a frame is built, too.
 
-    With construct's own, a Switch on a name finds its case while parsing, but not while building
-    from the number, and builds other bytes.
+    With construct's Enum, a Switch on a name finds its case when a frame is parsed, but not when it
+    is built from the number, so that other bytes are built.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -355,8 +359,8 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 class RawPart(Construct):  # type: ignore[misc]
     """A part with its bytes and offsets, as construct's RawCopy.
 
-    It is built from its `value`. construct's own is built from `data`, so that changes of the value
-    of a parsed frame are lost.
+    It is built from its `value`. construct's RawCopy is built from `data`, so that changes of the
+    value of a parsed frame are lost.
     """
 
     def __init__(self, subcon: Construct) -> None:
@@ -411,7 +415,7 @@ class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
 
 
 class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
-    """A NamedTuple of a struct without private entries, which construct's rejects."""
+    """A NamedTuple that ignores private entries of its struct, unlike construct's."""
 
     def _decode(self, obj: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, dict):
@@ -420,7 +424,7 @@ class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
 
 
 class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
-    """A Compressed for which bytes that cannot be decompressed are an invalid value."""
+    """A Compressed that reports bytes that cannot be decompressed as an invalid value."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
@@ -434,7 +438,7 @@ class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
 
 
 class Reserved(CountedBytes):
-    """Bytes without a meaning, which construct's Padding drops.
+    """Reserved bytes, in place of construct's Padding, which loses them.
 
     If no value is given, they are built from a pattern.
     """
@@ -462,11 +466,11 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     """A struct with a checksum.
 
     Attributes:
-        fields: names of the fields that hold it, low bits first.
-        algorithm: the algorithm of the checksum; None if a hook has to supply it.
-        over: names of the consecutive fields that it covers; None for all bytes without a bit of
-            `fields`.
-        absent: values that mean "not filled".
+        fields: the names of the fields with the checksum, low bits first.
+        algorithm: the algorithm; None if a hook has to return it.
+        over: the names of the consecutive fields that the checksum covers; None for all bytes
+            without a bit of `fields`.
+        absent: the values that mean that the sensor has computed no checksum.
     """
 
     fields: tuple[str, ...]
@@ -474,20 +478,22 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     over: tuple[str, ...] | None
     absent: frozenset[int]
 
-    #: the class for plugins, `Checksummed`; it replaces construct's Checksum of a RawCopy.
+    #: The class for plugins, `Checksummed`, which is also used for construct's Checksum of a
+    #: RawCopy.
     plugin_class: Callable[..., SealedStruct]
 
 
 class SizeField(Subconstruct):  # type: ignore[misc]
     """A number that declares the size of a part.
 
-    It is built from the size of the part, and a parsed frame is invalid if they differ.
+    `build` sets it to the size of the part. A parsed frame with another number is invalid.
 
     Attributes:
-        of: the names that lead to the part from the struct that contains this field. It is empty
-            for the struct itself; "_" leads to the outer struct.
-        plus: is added to the size.
-        since: a member before the part at which the size begins; "" for only the part.
+        of: the names that lead from the struct with this field to the part. The name "_" leads to
+            the outer struct; no names mean the struct itself.
+        plus: a number that is added to the size.
+        since: the name of an earlier member from which on bytes are counted; "" to count only the
+            part.
     """
 
     def __init__(
@@ -501,7 +507,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
     @property
     def out(self) -> int:
-        """The number of struct levels from this field out to the struct with the part."""
+        """The number of struct levels between this field and the struct with the part."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
@@ -533,9 +539,9 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _enter(self, context: Any, entry: tuple[str, int, Any]) -> None:
-        """Register the value with the struct that contains the part.
+        """Add the value to the sizes that the struct with the part has to check.
 
-        A bit block that is probed on its own has no such struct.
+        If a bit block is probed, there is no such struct.
         """
         for _ in range(self.out):
             context = context.get("_", {})
@@ -545,7 +551,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 class CountField(Subconstruct):  # type: ignore[misc]
     """The number of elements of a later array, `of`.
 
-    It is built from the length of the array; a given value is ignored.
+    `build` sets it to the length of the array and ignores a given value.
     """
 
     def __init__(self, subcon: Construct, of: str) -> None:
@@ -561,9 +567,9 @@ class CountField(Subconstruct):  # type: ignore[misc]
 
 
 class BoundedPart(Subconstruct):  # type: ignore[misc]
-    """A part of `length` bytes when parsed.
+    """A part that is parsed from `length` bytes.
 
-    When it is built, it has the size of its values.
+    A built part has the size of its values.
     """
 
     def __init__(self, length: Any, subcon: Construct) -> None:
@@ -582,14 +588,14 @@ class BoundedPart(Subconstruct):  # type: ignore[misc]
 
 
 class PaddingField(CountedBytes):
-    """The bytes that fill a range of members up to a length or a multiple.
+    """The bytes that pad consecutive members to a length, or to a multiple of a length.
 
     If no value is given, they are built from a pattern.
 
     Args:
-        of: the names of the first and the last member.
-        to: the length in bytes; None for a multiple.
-        modulus: the number to fill up to a multiple of; None for a length.
+        of: the names of the first and the last padded member.
+        to: the length in bytes, or None.
+        modulus: the length in bytes to whose multiple the members are padded, or None.
     """
 
     def __init__(
@@ -617,7 +623,8 @@ class ParsedParts(construct.ListContainer):  # type: ignore[misc]
     """Parts that were parsed or built.
 
     Attributes:
-        spans: (kind, offset of the first byte, offset after the last byte) of each part.
+        spans: for each part, its kind, the offset of its first byte and the offset after its last
+            byte.
     """
 
     def __init__(self) -> None:
@@ -626,7 +633,7 @@ class ParsedParts(construct.ListContainer):  # type: ignore[misc]
 
     @property
     def size(self) -> int:
-        """The bytes of all parts."""
+        """The total size of all parts in bytes."""
         return sum(end - start for _, start, end in self.spans)
 
     def __getitem__(self, key: Any) -> Any:
@@ -636,14 +643,14 @@ class ParsedParts(construct.ListContainer):  # type: ignore[misc]
 
 
 class Partition(Construct):  # type: ignore[misc]
-    """Consecutive structs, each with its own size.
+    """Consecutive structs of different sizes.
 
     Attributes:
-        cases: the kinds of parts, by name.
+        cases: the struct of each kind of parts, by name.
         count: the number of parts, or None.
-        size: the bytes of the first part of a chain, or None.
-        within: the bytes of all parts, or None.
-        following: the bytes of the next part, from fields of a part.
+        size: the size of the first part in bytes, or None.
+        within: the total size of all parts in bytes, or None.
+        following: an expression of the fields of a part for the size of the next part, or None.
         limit: the maximum size of a frame, in bytes.
     """
 

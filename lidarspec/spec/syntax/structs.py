@@ -1,7 +1,7 @@
-"""Prepare a struct of a plugin, query properties of constructs, and draw random values.
+"""Prepare a struct of a plugin, return properties of constructs, draw random values.
 
-`prepare` copies a struct with some of construct's classes replaced; `replacements` gives the
-reasons. The lengths, counts and padding that construct hides become members.
+`prepare` copies a struct and replaces some of construct's classes, for the reasons in
+`replacements`. Lengths, counts and padding that construct hides become members of the struct.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ from lidarspec.spec.syntax.replacements import (
 if TYPE_CHECKING:
     import random  # imported here because finding a sensor does not need it
 
-    #: field path -> function that draws its value
+    #: The functions that draw the values of certain fields, by path.
     Drawn = Mapping[str, Callable[[random.Random], Any]]
 
-#: construct's classes -> their replacements.
+#: The replacements of construct's classes.
 _REPLACEMENTS: dict[type, type] = {
     Struct: MarkedStruct,
     Array: IndexedArray,
@@ -76,7 +76,7 @@ _REPLACEMENTS: dict[type, type] = {
     construct.Compressed: CheckedCompressed,
 }
 
-#: wrappers that only change how a value is printed or when it is read.
+#: Wrappers that only change how a value is printed or when it is read.
 _TRANSPARENT = (
     construct.Hex,
     construct.HexDump,
@@ -85,10 +85,10 @@ _TRANSPARENT = (
     construct.Rebuffered,
 )
 
-#: the LazyBound constructs in preparation, to detect recursion.
+#: The LazyBound constructs that are being prepared, to detect recursion.
 _BINDING: list[Construct] = []
 
-#: attributes of constructs that hold other constructs. "cases" holds them by key.
+#: The attributes of constructs that contain other constructs. "cases" contains them by key.
 _INNER = ("subcon", "thensubcon", "elsesubcon", "default", "checksumfield")
 
 
@@ -96,7 +96,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     """Return a copy of a struct in which construct's classes are replaced.
 
     Args:
-        limit: the maximum size of a frame, in bytes; inside a bit block in bits.
+        limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
         in_bits: whether the construct is inside a bit block.
     """
     if isinstance(con, FormatField):
@@ -189,7 +189,10 @@ def _strip_name(con: Construct) -> Construct:
 
 
 def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
-    """Return the construct of a LazyBound; the LazyBound itself in its own content."""
+    """Return the construct of a LazyBound.
+
+    Inside the content of the LazyBound itself, return the LazyBound unchanged.
+    """
     if con in _BINDING:
         return con
     _BINDING.append(con)
@@ -200,7 +203,7 @@ def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
 
 
 def _name_padding(members: list[Construct]) -> list[Construct]:
-    """Return the members of a struct, with names for unnamed paddings and checks."""
+    """Return the members of a struct after naming unnamed paddings and checks."""
     taken = {member.name for member in members}
     named = list[Construct]()
     for member in members:
@@ -224,8 +227,8 @@ def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | Non
     """Return a padded part with its padding as a field.
 
     Returns:
-        The bytes or bits of a padding, or a struct with its padding as the last member. None for
-        another padded part.
+        A field for the bytes or bits of a padding, or a struct with the padding as its last member.
+        None if neither is possible.
     """
     if con.subcon is construct.Pass and in_bits:
         return construct.Default(BitsInteger(con.length), 0)
@@ -240,10 +243,10 @@ def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | Non
 
 
 def _expand_macro(con: Construct) -> list[Construct]:
-    """Return the members for a member that construct prefixes, pads or aligns.
+    """Return the members that replace a prefixed, padded or aligned member.
 
-    They are the member itself, and fields for the length, count or padding that construct hides.
-    Another member is returned unchanged.
+    They are the member itself, and a field for the length, count or padding that construct hides.
+    All other members are returned unchanged.
     """
     inner = _strip_name(con)
     if not con.name:
@@ -288,12 +291,12 @@ def _is_prefixed_array(con: Construct) -> bool:
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
-    """Return a field that construct hides, named and documented after its member."""
+    """Return a hidden field with a name and documentation derived from its member."""
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
 
 
 def _expand_content(con: Construct, content: Construct) -> list[Construct]:
-    """Return the members for the content of a member, with the member's name."""
+    """Return the members that replace the content of a member."""
     return _expand_macro(construct.Renamed(content, newname=con.name, newdocs=con.docs))
 
 
@@ -336,7 +339,7 @@ def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct]
 
 
 class _ComparisonRecorder:
-    """Placeholder for the value of a validator that records comparisons with it."""
+    """A placeholder for the value of a validator, which records comparisons with it."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -351,7 +354,7 @@ class _ComparisonRecorder:
 def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     """Return the raw values that a validator accepts; None if they are unknown.
 
-    They are found among the values that it compares with. If it makes no comparisons with integers,
+    The values that the validator compares with are tried. If it makes no comparisons with integers,
     all values of up to 16 bits are tried.
     """
     field = unwrap(con)
@@ -384,10 +387,10 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     return None
 
 
-#: constructs that read all available bytes.
+#: Constructs that read all available bytes.
 GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
 
-#: constructs that read all available bytes and convert them to other bytes.
+#: Constructs that read all available bytes and convert them to other bytes.
 RECODING = (construct.Tunnel, construct.ProcessXor, construct.ProcessRotateLeft)
 
 
@@ -397,7 +400,7 @@ def is_greedy(
     """Return whether a part reads all bytes that are available.
 
     Args:
-        kinds: the greedy constructs. A part is greedy if it ends in one of them.
+        kinds: the greedy constructs. A part that ends in one of them is greedy as well.
     """
     if isinstance(con, kinds):
         return True
@@ -421,7 +424,7 @@ def unwrap(con: Construct, *, bits: bool = True) -> Construct:
     """Return the construct inside names, units and checksums.
 
     Args:
-        bits: True also removes bit transformations.
+        bits: whether to remove transformations of bits as well.
     """
     while isinstance(con, Subconstruct) and not isinstance(con, Array | Const):
         if isinstance(con, construct.Transformed | construct.Restreamed) and not bits:
@@ -458,7 +461,7 @@ def bit_width(con: Construct) -> int:
 def number_kind(con: Construct) -> str:
     """Return "f" for a float, "i" for a signed and "u" for an unsigned integer.
 
-    Returns "" for another construct.
+    Returns "" if the construct is not a number.
     """
     if isinstance(con, BytesInteger | BitsInteger):
         return "i" if con.signed else "u"
@@ -496,15 +499,15 @@ def remove_private(parsed: Any) -> Any:
 def field_path(path: str | None) -> str:
     """Return a path of construct as a field path.
 
-    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". Steps named "None", which
-    construct adds for docs on a part without a name, are removed.
+    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". construct adds a step named
+    "None" for a part that has documentation but no name; these steps are removed.
     """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
 
 
 def author_class(con: Construct) -> str:
-    """Return the name of the class in the plugin, which `prepare` may have replaced."""
+    """Return the name of the class that the plugin used, before `prepare` replaced it."""
     classes = type(con).__mro__
     own = [kind for kind in classes if not kind.__module__.startswith("lidarspec.spec.syntax")]
     return own[0].__name__
@@ -529,7 +532,10 @@ def seals(con: Construct) -> Iterator[SealedStruct]:
 def leaves(
     parsed: Any, keys: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Yield the values of a parsed object with their paths, without private entries."""
+    """Yield the values of a parsed object with the keys that lead to them.
+
+    Private entries are left out.
+    """
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             if not name.startswith("_"):
@@ -542,15 +548,15 @@ def leaves(
 
 
 def is_expression(value: object) -> bool:
-    """Return whether a value is an expression or a construct instead of a number."""
+    """Return whether a value is an expression or a construct, and not a number."""
     return isinstance(value, ExprMixin | Construct)
 
 
-#: upper limits of the small numbers that are drawn half of the time, because a large number is
-#: hardly ever a valid count or key.
+#: Half of the drawn numbers are below one of these limits, because a large number is hardly ever a
+#: valid count or key.
 SMALL_LIMITS = (1, 6, 40)
 
-#: maximum number of attempts to draw a valid part.
+#: The maximum number of attempts to draw a valid part.
 MAX_DRAWS = 100
 
 
@@ -564,10 +570,10 @@ def random_value(
     Examples of all other frames are random bytes in a layout.
 
     Args:
-        source: if it has the methods `draw_number` and `draw_elements`, they draw integers,
-            floats and arrays.
-        drawn: field path -> function that draws its value.
-        scope: the context for its expressions.
+        source: the source of random numbers. If it has the methods `draw_number` and
+            `draw_elements`, they draw integers, floats and arrays.
+        drawn: the functions that draw the values of certain fields, by path.
+        scope: the context for expressions.
     """
     if path in drawn:
         return drawn[path](source)
@@ -639,7 +645,7 @@ def random_value(
 def _draw_until(
     con: construct.RepeatUntil, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> list[Any]:
-    """Return random elements up to the first that ends the array."""
+    """Return random elements, up to the first element that ends the array."""
     found: list[Any] = construct.ListContainer()
     for _ in range(MAX_DRAWS):
         element = random_value(con.subcon, source, drawn, scope, path)
@@ -650,9 +656,10 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of elements in an element that is itself an array.
+    """Return the number of elements in an element of an array.
 
-    It is 1 for other elements, and if the number is not known yet.
+    If the element is itself an array, this is its length. Otherwise, or if the length is not known
+    yet, it is 1.
     """
     with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
@@ -681,8 +688,8 @@ def _draw_parts(
 def _draw_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
     """Return a random part.
 
-    A part with an invalid count is drawn again. Otherwise frames with many counts would never have
-    a part.
+    A part with an invalid count is drawn again, because otherwise frames with many counts would
+    hardly ever have a part.
     """
     for _ in range(MAX_DRAWS):
         with contextlib.suppress(Fault):
