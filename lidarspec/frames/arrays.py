@@ -1,6 +1,6 @@
-"""Arrays that cost almost nothing, and settings of the memory allocator.
+"""Functions that make simple arrays fast, and settings of the memory allocator.
 
-The arrays hold one repeated value, consecutive numbers, or selected rows of another array.
+The arrays have one repeated value, consecutive numbers, or selected rows of another array.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: the length of the shared array that `count_up` returns slices of.
+#: The length of the shared array that `count_up` returns slices of.
 MAX_SHARED_COUNT = 1 << 17
-#: bytes of the block that `keep_freed_memory` allocates. glibc then keeps up to twice this size of
-#: free memory at the end of the heap.
+#: The size in bytes of the block that `keep_freed_memory` allocates. glibc then keeps up to twice
+#: this size of free memory at the end of the heap.
 LARGE_BLOCK_BYTES = 1 << 24
 
 
 def repeat(value: int, *shape: int) -> NDArray[np.int64]:
     """Return a read-only array of this shape with one value everywhere.
 
-    It equals the result of `np.broadcast_to`, at a tenth of the cost.
+    The result is the same as that of `np.broadcast_to`, in a tenth of the time.
     """
     memory = value.to_bytes(8, sys.byteorder, signed=True)
     return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
@@ -34,7 +34,7 @@ def select_values(
 ) -> NDArray[np.int64]:
     """Return the values that a mask, indices or a slice select, (k,).
 
-    A zero-stride array, as from `repeat`, stays one.
+    The result for a zero-stride array, such as from `repeat`, is a zero-stride array.
     """
     value = broadcast_value(values)
     if value is None or isinstance(which, slice):
@@ -45,7 +45,7 @@ def select_values(
 def count_up(count: int) -> NDArray[np.int64]:
     """Return the numbers from 0 to `count` - 1, (count,), read-only.
 
-    Small results share the same memory.
+    Small arrays share the same memory.
     """
     if count <= MAX_SHARED_COUNT:
         return _shared_numbers()[:count]
@@ -53,7 +53,7 @@ def count_up(count: int) -> NDArray[np.int64]:
 
 
 def is_counted(numbers: NDArray[np.int64]) -> bool:
-    """Return whether an array is from `count_up`, and so is known to ascend."""
+    """Return whether an array is from `count_up`, so that its values ascend."""
     return numbers.base is _shared_numbers() and numbers.strides[0] > 0
 
 
@@ -65,19 +65,19 @@ def _shared_numbers() -> NDArray[np.int64]:
 
 
 def broadcast_value(values: NDArray[np.int64]) -> int | None:
-    """Return the value of a zero-stride array, as from `repeat`; None for others."""
+    """Return the value of a zero-stride array, such as from `repeat`; None for others."""
     if values.strides == (0,) and len(values):
         return values.item(0)
     return None
 
 
 def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
-    """Return each distinct value, ascending, with the indices of its occurrences.
-
-    The indices are ascending, (k,).
+    """Return each distinct value with the indices of its occurrences, (k,), ascending.
 
     Args:
-        few: up to this number of distinct values, one search for each is faster than sorting.
+        values: the values.
+        few: with at most this number of distinct values, a search for each value is used, which is
+            then faster than sorting.
     """
     values_found = list[int]()
     left = values
@@ -111,13 +111,13 @@ def take_rows(
 def keep_freed_memory() -> None:
     """Make the allocator keep freed blocks of up to 32 MiB.
 
-    It is called at the first work on a large batch.
+    It is called before the first large batch is decoded.
 
-    The columns of a batch are blocks of several hundred kilobytes that live for milliseconds. glibc
-    requests such blocks from the system and returns them, and the page faults of each new block
-    cost several times as much as computing the columns. glibc keeps blocks that are smaller than
-    the largest block that was ever freed. So this function allocates one large block and frees it.
-    The block is never written, and takes no memory.
+    The columns of a batch are blocks of several hundred kilobytes, which are freed after
+    milliseconds. glibc by default requests each such block from the system, and its page faults
+    take several times as long as computing the columns. glibc keeps blocks that are smaller than
+    the largest block that was ever freed. This function therefore allocates one large block and
+    frees it. The block is never written, so it takes no memory.
 
     Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
     M_TRIM_THRESHOLD to twice its value.
@@ -126,5 +126,5 @@ def keep_freed_memory() -> None:
 
 
 def add_axes(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Return values of packets with `depth` axes of length 1 after the first."""
+    """Append axes of length 1 until the array has `depth` axes after the first."""
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))

@@ -35,15 +35,15 @@ def build(
     *,
     units: bool = False,
 ) -> bytes:
-    """Return the bytes of one frame. Constants, counts and the checksum are computed.
+    """Return the bytes of one frame; constants, counts and checksums are computed.
 
     Args:
         value: a mapping of all fields, for example a result of `parse`, or None.
-        values: single fields by name; they replace entries of `value`.
-        units: True takes physical values and rounds them to the resolution of the fields.
+        values: single fields by name, which replace entries of `value`.
+        units: True if the values are physical; they are rounded to the resolution of the fields.
 
     Raises:
-        UsageError: for a missing or unknown field, or a value that its field cannot hold.
+        UsageError: for a missing or unknown field, or a value that its field cannot represent.
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -79,9 +79,9 @@ def build(
 
 
 class _ValueChecker:
-    """The caller's values, checked against the fields of the frame.
+    """Checks the names and ranges of the caller's values, and converts them to raw values.
 
-    Names and ranges are checked, and also units if the values are physical.
+    If the values are physical, their units are checked as well.
     """
 
     def __init__(self, table: Schema, paths: frozenset[str], place: str, *, units: bool) -> None:

@@ -38,14 +38,15 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     """Return the bytes of a command; b"" for a command that only sets control lines.
 
     Args:
-        arguments: by name, in the units of their fields. A value that is known only when the
-            command is sent is given by the path of its field, a value of a template by its name.
+        arguments: the arguments by name, in the units of their fields. They may also have values
+            that are known only when the command is sent, by the path of their field, and values of
+            a template by name.
 
     Raises:
         UnknownCommand: if the sensor has no such command.
         UnknownField: for an argument that the command does not have.
         MissingField: for an argument that is missing.
-        OutOfRange: for a value beyond the limits of the argument.
+        OutOfRange: for a value that exceeds the limits of the argument.
     """
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
@@ -84,7 +85,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
 
 
 def _fill_template(template: Template, arguments: Mapping[str, Any], place: str) -> bytes:
-    """Return the text of a template; a value that is not given is 0.
+    """Return the text of a template; missing values are 0.
 
     Raises:
         UsageError: for a value that a template does not accept.
@@ -100,8 +101,11 @@ def _fill_template(template: Template, arguments: Mapping[str, Any], place: str)
 class ArgumentSlot:
     """The field of a command frame that an argument is written to.
 
-    `room` is the number of bytes, or of numbers in an array. It is None if it varies.
-    `in_template` is whether the argument is a part of a text.
+    Attributes:
+        info: the field.
+        room: the size of the field in bytes, or the number of elements of an array; None if it
+            varies.
+        in_template: whether the argument is a part of a text.
     """
 
     info: FieldInfo
@@ -114,7 +118,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     """Return the field of its frame that a command argument is written to.
 
     Raises:
-        SpecError: if the field cannot hold this kind of argument.
+        SpecError: if the field is not suitable for this kind of argument.
     """
     declared = sensor.commands[name].arguments[argument]
     place = f"commands.{name}.args.{argument}"
@@ -143,7 +147,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
 def _template_slot(
     sensor: SensorDescription, template: Template, declared: Argument, argument: str, place: str
 ) -> ArgumentSlot:
-    """Return the place of an argument in a template."""
+    """Return the slot of an argument that is a part of a template."""
     if argument not in template.names or not isinstance(declared.kind, Range | Text):
         raise SpecError(
             f"{template.text!r} requires {{{argument}}}, with a range or Text(size)",
@@ -232,7 +236,7 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
 
 
 def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
-    """Return bytes as the raw value of a field.
+    """Convert bytes to the raw value of a field.
 
     The field is plain bytes, an array of numbers, or one number in network byte order.
     """
@@ -246,9 +250,9 @@ def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
 def _resolve_filled(
     sensor: SensorDescription, name: str, path: str, value: Count | Address | Port, given: Any
 ) -> Any:
-    """Return a value that is known only when a command is sent.
+    """Return the raw value of a field that is filled in when a command is sent.
 
-    If the caller gives none, it is the first value of a `Count`, else zero bytes.
+    If the caller gives no value, the result is the first number of a `Count`, or zero bytes.
     """
     if isinstance(value, Count):
         if given is None:

@@ -1,6 +1,7 @@
 """Check which structs can be compiled.
 
-A part is found here if no header determines its offset. construct then parses the whole frame.
+A struct cannot be compiled if it has a part whose offset does not follow from header fields.
+construct then parses the frames.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """A part of a struct has no computable offset; attributes `path` and `reason`."""
+    """A part of a struct, at `path`, has no computable offset, for this `reason`."""
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path
@@ -21,7 +22,7 @@ class NotCompilableError(Exception):
 def check_compilable(root: tree.Node) -> None:
     """Raise `NotCompilableError` if a tree has a part without a computable offset.
 
-    It is also raised for values that no column can hold.
+    It is also raised for values that no column can represent.
     """
     _check(root, "", in_array=False)
     _check_columns(root)
@@ -67,7 +68,7 @@ def _check_traced(formula: object) -> None:
 
 
 def _check_part(kind: tree.Kind, path: str) -> None:
-    """Check a kind of parts like a frame type."""
+    """Raise `NotCompilableError` if a kind of parts cannot be compiled."""
     try:
         for ref in () if kind.following is None else tree.refs(kind.following):
             check_control(ref.info)
@@ -77,7 +78,7 @@ def _check_part(kind: tree.Kind, path: str) -> None:
 
 
 def _check_columns(root: tree.Node) -> None:
-    """Raise `NotCompilableError` if no column can hold the values of a field."""
+    """Raise `NotCompilableError` if no column can represent the values of a field."""
     for info in make_schema(root).fields.values():
         if info.dtype is None:
             wide = f"its {info.bits} bits do not fit in a column"

@@ -1,7 +1,8 @@
 """Find the first fault in the bytes of one frame.
 
-Faults are in the order of the wire. A wrong constant or value counts at its own offset, a wrong
-length or checksum at the end of its struct. Missing or additional bytes come last.
+Faults are ordered by their offset in the frame. A wrong constant or value has its own offset. A
+wrong length or checksum has the offset of the end of its struct. Missing or additional bytes come
+last.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from lidarspec.frames.layout_tree import (
 from lidarspec.frames.wire_fields import ExaminedFrame, WireField
 from lidarspec.spec.tree import format_hex, format_values
 
-#: Kinds of faults.
+#: The kinds of faults.
 CONSTANT = "constant"
 VALUE = "value"
 LENGTH = "length"
@@ -42,10 +43,13 @@ class Fault:
         kind: one of the constants of this module.
         path: the path of the field, with indices.
         offset: the first byte of the field in the frame.
-        expected, got: texts or numbers.
-        end: the offset up to which the frame is correct; faults are ordered by it.
-        needed: the bytes of a field that is cut off; 0 for others.
-        is_bounded: whether the end of the parts cuts it off, not the end of the frame.
+        expected: the expected value, as a text or number.
+        got: the actual value, as a text or number.
+        end: the offset up to which the frame has to be read to find the fault. Faults are ordered
+            by it.
+        needed: the size of a field that is cut off, in bytes; 0 for all other faults.
+        is_bounded: whether the field is cut off by the end of the parts, not by the end of the
+            frame.
     """
 
     kind: str
@@ -58,10 +62,10 @@ class Fault:
     is_bounded: bool = False
 
     def reason(self, offset: int) -> str:
-        """Return the fault as a sentence.
+        """Return a description of the fault.
 
         Args:
-            offset: the offset to print, which differs from `self.offset` in a wire form.
+            offset: the offset to print, which differs from `self.offset` if the frame is encoded.
         """
         if self.kind == CUT_OFF:
             return self._describe_shortage()
@@ -108,7 +112,7 @@ def find_fault(examined: ExaminedFrame) -> Fault | None:
 
 
 def find_shortage(examined: ExaminedFrame) -> Fault | None:
-    """Return why the values of a frame cannot be read; None if they can.
+    """Return the fault because of which a frame has no values; None if it has values.
 
     Raises:
         Exception: any error of an expression of the struct.
@@ -155,7 +159,7 @@ def _find_value_fault(each: WireField) -> Fault | None:
 
 
 def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
-    """Yield wrong lengths and false conditions of a complete frame and of its parts."""
+    """Yield the wrong lengths and the false conditions of a complete frame and its parts."""
     layout = examined.layout
     if layout is None or layout.size > len(examined.data):
         return
@@ -171,7 +175,7 @@ def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
 
 
 def _describe_misfit(part: ExaminedFrame) -> Fault:
-    """Return why a part does not fit into the bytes for parts."""
+    """Return the fault of a part that does not fit into the bytes for parts."""
     shortage = find_shortage(part)
     if shortage is not None:
         return shortage
@@ -182,7 +186,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
 def _iter_length_faults(
     examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
 ) -> Iterator[Fault]:
-    """Yield the faults of fields that declare a wrong length of a part."""
+    """Yield the faults of fields that declare a wrong size of a part."""
     if not layout.held:
         return
     right = row.copy()
@@ -221,7 +225,7 @@ def _iter_condition_faults(
 
 
 def _find_false_condition(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
-    """Return the path of a false condition, with the indices of the first element."""
+    """Return the path of a false condition, with the indices of the first such element."""
     raw = {info.path: layout.leaves[info.path].load(row) for info in condition.fields}
     holds = condition.values(raw)
     if holds.ndim == 1:
@@ -239,9 +243,9 @@ def _insert_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> s
 
 
 def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
-    """Return why a frame has no end.
+    """Return the fault of a frame without an end.
 
-    Either its bytes end early, or its header leads to no layout.
+    Either the bytes end too early, or the header leads to no layout.
 
     Raises:
         Exception: any error of an expression of the struct.
@@ -258,7 +262,7 @@ def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault
 
 
 def _find_open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
-    """Return the last part without an end; None if all parts are complete."""
+    """Return the part whose end is missing; None if all parts are complete."""
     if isinstance(examined.known, HeaderWalk):
         for axis, region in examined.known.open_regions.items():
             if axis not in examined.known.regions and region.start <= len(examined.data):
@@ -279,7 +283,7 @@ def _describe_shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fa
 
 
 def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
-    """Return why a header leads to no layout."""
+    """Return the fault of a header that leads to no layout."""
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):

@@ -1,9 +1,9 @@
 """Encode one frame from the values of its fields, by its layout.
 
-The values are completed first: each count field is set from its array or parts. Then the values of
-the header fields select the layout, each value is stored at its offset, and lengths, constants and
-checksums are written last. A part of a frame (`PartSequence`) is encoded like a frame, and copied
-into the outer frame.
+First, each count field is set to the length of its array or parts. The values of the header fields
+then select the layout, and each value is stored at its offset. Lengths, constants and checksums are
+written last. A part of a frame (`PartSequence`) is encoded as a frame of its own, and copied into
+the outer frame.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ def encode(layouts: LayoutLookup, given: Container, place: str) -> bytes:
     """Return the bytes of a frame.
 
     Args:
-        layouts: of the frame type.
-        given: raw values by name, nested as in the struct; completed in place.
-        place: sensor and frame, for messages.
+        layouts: the layouts of the frame type.
+        given: the raw values by name, nested as in the struct. Missing values are added to it.
+        place: the names of sensor and frame, for messages.
 
     Raises:
-        UsageError: for a missing value, or one that its field cannot hold.
+        UsageError: for a missing value, or a value that its field cannot represent.
     """
     return _Encoder(layouts, given, place).encode()
 
 
 class _Encoder:
-    """Encoder of one frame, or of one part of it."""
+    """Encodes one frame, or one part of a frame."""
 
     def __init__(
         self,
@@ -80,18 +80,18 @@ class _Encoder:
         self._layouts = layouts
         self._given = given
         self._place = place
-        #: path of the part in the frame around it, for messages; "" for a frame.
+        #: The path of the part in the outer frame, for messages; "" for a frame.
         self._prefix = prefix
-        #: values of fields of the frame around a part, by their path there.
+        #: For a part, the values of fields of the outer frame, by their path in it.
         self._around = around or {}
         self._schema = make_schema(layouts.root)
-        #: paths of the fields that hold checksums, which need not be given.
+        #: The paths of the fields with checksums, which need not be given.
         self._checksums = set[str]()
-        #: bytes of the parts at a path, by the path of their size.
+        #: The total size of parts in bytes, by the path of this size in formulas.
         self._totals: dict[str, int] = {}
-        #: raw values of each field, element by element.
+        #: The raw values of each field, element by element.
         self._columns: dict[str, list[Any]] = {}
-        #: index of the element that is being collected, by the axis of its array.
+        #: The index of the element that is being collected, by the axis of its array.
         self._indices: dict[str, int] = {}
 
     def encode(self) -> bytes:
@@ -120,7 +120,7 @@ class _Encoder:
         return row.tobytes()
 
     def _layout(self) -> Layout:
-        """Return the layout that the values of the header fields lead to."""
+        """Return the layout that the values of the header fields select."""
         try:
             return self._layouts.layout_for(self._read_header)
         except TooLongError as fault:
@@ -130,7 +130,7 @@ class _Encoder:
             ) from None
 
     def _read_header(self, leaf: Leaf | PartsSize) -> int:
-        """Return the value of a field that decides the layout."""
+        """Return the value of a field that the layout depends on."""
         path = leaf.info.path
         if path in self._totals:
             return self._totals[path]
@@ -140,7 +140,7 @@ class _Encoder:
         return int(value)
 
     def read(self, path: str) -> Any:
-        """Return the value of a field, as formulas read it (`lidarspec.spec.tree.Read`)."""
+        """Return the value of a field for a formula (see `lidarspec.spec.tree.Read`)."""
         if path.startswith("_."):
             return self._around[path[2:]]
         value: Any = self._given
@@ -166,7 +166,7 @@ class _Encoder:
         return to_raw(info, value)
 
     def _find_implied(self, info: FieldInfo) -> Any:
-        """Return the value of a field that is not given; None if it is required."""
+        """Return the value of a field if none is given; None if the field is required."""
         if info.const is not None:
             return info.const
         if info.rebuilt is not None and not info.held:
@@ -213,7 +213,8 @@ class _Encoder:
 
         Args:
             value: the given value; None if it is missing.
-            path, shown: the path of the node, without and with indices.
+            path: the path of the node without indices.
+            shown: the path of the node with indices.
         """
         match node:
             case Sealed():
@@ -295,7 +296,7 @@ class _Encoder:
         """Add one value to the column of its field.
 
         Args:
-            size: the size of a byte string, in bytes.
+            size: the size of a field of bytes, in bytes.
         """
         column = self._columns.setdefault(path, [])
         if info.held and info.rebuilt is not None:
@@ -327,7 +328,7 @@ class _Encoder:
         except Exception as error:  # the author's function may raise anything
             reason = f"{type(error).__name__}: {error}".partition("\n")[0]
             raise UsageError(
-                f"{self._place}: {shown}: {value!r:.60} is refused: {reason}"
+                f"{self._place}: {shown}: {value!r:.60} cannot be encoded: {reason}"
             ) from None
 
     def _bytes(self, shown: str, value: Any, size: int) -> bytes:
@@ -358,7 +359,7 @@ class _Encoder:
         return raw
 
     def _store(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
-        """Write the values of a field into the row."""
+        """Write the values of a field into the bytes of the frame."""
         if not column:
             return
         if leaf.info.kind == "bytes":
@@ -380,13 +381,13 @@ class _Encoder:
             raise OutOfRange(leaf.info.path, number, -largest, largest, place=self._place)
 
     def _store_payloads(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
-        """Write each NaN that has to keep its bits."""
+        """Write the original bits of each NaN that was parsed from a frame."""
         for value, offset in zip(column, leaf.offsets(), strict=True):
             if isinstance(value, WireNaN) and len(value.raw) == leaf.size:
                 row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
 
     def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
-        """Return whether the given checksum means "not filled"."""
+        """Return whether the given checksum means that none was computed (`Seal.absent`)."""
         if not seal.absent or any(
             get_member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
         ):
@@ -419,7 +420,7 @@ class _Encoder:
         return f"{self._prefix}.{path}".strip(".")
 
     def _missing_count_error(self, path: str) -> UsageError:
-        """Return the error for a missing field that decides the layout."""
+        """Return the error for a missing field that the layout depends on."""
         for axis, counting in self._schema.counting_fields.items():
             array = get_member(self._given, axis, None)
             if array is not None and counting == path:
@@ -438,7 +439,8 @@ class _Encoder:
 def to_raw(info: FieldInfo, value: Any) -> Any:
     """Return the raw value of a field.
 
-    The name of an Enum becomes its number, and a single byte of an integer field its value.
+    The name of an Enum is converted to its number, and a single byte for an integer field to its
+    value.
     """
     if info.adapter is not None and info.kind == "int" and value is not None:
         return info.adapter.encode(value, 0)
@@ -450,9 +452,9 @@ def to_raw(info: FieldInfo, value: Any) -> Any:
 
 
 def fill_counts(given: Container, table: Schema) -> None:
-    """Set the header fields that give the lengths of arrays.
+    """Set the header fields that contain the lengths of arrays.
 
-    A given field keeps its value, unless it is always computed from the array.
+    A given value is kept, unless the field is always computed from the array.
     """
     counted = set[str]()
     for axis, count in table.arrays.items():
@@ -480,9 +482,9 @@ def fill_in(
     fields: Mapping[str, FieldInfo],
     axis: str,
 ) -> None:
-    """Set the field that a formula depends on, so that the formula has a value.
+    """Set the field that a formula depends on, so that the formula has a given value.
 
-    A field that is already given keeps its value.
+    A field that already has a value is not changed.
 
     Args:
         value: the value of the formula.
@@ -502,7 +504,7 @@ def fill_in(
 def _find_holder(values: Any, path: str) -> tuple[Any, str]:
     """Return the mapping that contains a field, and the name of the field in it.
 
-    Missing mappings are added.
+    Missing mappings are added to `values`.
     """
     *parents, last = path.split(".")
     for parent in parents:
@@ -519,7 +521,10 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Set a count field to the value that gives this length, and return the value."""
+    """Return the value of a count field for which a formula is a given length.
+
+    The field is set to values in turn to find it.
+    """
     if info.kind == "int":
         top = int(info.limits[1])
     else:
@@ -544,10 +549,10 @@ def _find_count(
 
 
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
-    """Return the kind of a part that is given by its values.
+    """Return the kind of a part, given its values.
 
-    It is the first kind that has all given fields and no contradicting constant. If no kind has, it
-    is the first kind.
+    This is the first kind that has all given fields and no contradicting constant, or else the
+    first of all kinds.
     """
     for kind in node.kinds:
         fields = make_schema(kind.root)
@@ -575,7 +580,7 @@ def list_paths(root: Node) -> frozenset[str]:
 
 
 def read_given(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
-    """Return a given value of a frame, for formulas (`lidarspec.spec.tree.Read`).
+    """Return a given value of a frame for a formula (see `lidarspec.spec.tree.Read`).
 
     Raises:
         LookupError: if the value is missing.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-#: names of fields, and indices: a number, or "*" for every element.
+#: A path as a list of names and indices. An index is a number, or "*" for every element.
 Steps = list[int | str]
 
 
@@ -30,14 +30,15 @@ def put_value(
     length: Callable[[str], int] = lambda array: 0,
     place: str = "",
 ) -> Any:
-    """Return a struct or array in which the field at a path has this value.
+    """Set the field at a path of a struct or array, and return the struct or array.
 
-    Dicts of `target` are changed in place, and lists are copied.
+    Dicts in `target` are changed in place, and lists are copied.
 
     Args:
-        target: the struct or array; None makes a new one.
-        length: returns the number of elements of the array at a path, 0 if it is not known. The
-            index "*" sets the field in all elements.
+        target: the struct or array; None to make a new one.
+        path: the path. The index "*" sets the field in all elements.
+        value: the value.
+        length: a function that returns the number of elements of the array at a path, 0 if unknown.
     """
     if not path:
         return value

@@ -1,11 +1,11 @@
 """Tables: frames of one type as columns of raw values, in stream order.
 
-There are two tables with the same interface. `CompiledTable` loads fields from bytes by their
-layout. `ParsedTable` collects them from Containers that construct parsed. Arrays of variable length
-are padded with zeros to the longest; `counts` returns the lengths.
+There are two kinds of tables with the same interface. `CompiledTable` loads fields from bytes by
+their layout. `ParsedTable` collects fields from Containers that construct has parsed. Arrays of
+variable length are padded with zeros to the longest one; `counts` returns their lengths.
 
-Parts (frames within a frame) form a table of their own, without padding. `parts` also returns the
-frame that contains each part.
+Parts (frames within a frame) are in a table of their own, without padding. `parts` also returns the
+row of the frame that contains each part.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class Table(Protocol):
 
     def __len__(self) -> int: ...
     def raw(self, path: str) -> NDArray[Any]:
-        """Return raw values, shape (n, *lengths of its axes), in native byte order.
+        """Return the raw values of a field, (n, *lengths of its axes), in native byte order.
 
-        Values of a missing field or element are 0.
+        The value of a missing field or element is 0.
         """
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        """Return which frames have the field, (n,), or None if all have it.
+        """Return whether each frame has the field, (n,); None if all frames have it.
 
-        If only some elements of a frame have the field, the result has an entry for each element.
+        If only some elements of a frame have the field, the result has one value for each element.
         """
 
     def counts(self, axis: str) -> NDArray[np.intp]:
@@ -63,7 +63,7 @@ class Table(Protocol):
         """Return a table of the frames at these indices, in this order."""
 
     def parts(self, axis: str, kind: str = "") -> tuple[Table, NDArray[np.intp]]:
-        """Return the parts of one kind, in stream order, and the frame of each, (k,)."""
+        """Return the parts of one kind, in stream order, and the row of each part's frame, (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +71,9 @@ class LayoutRows:
     """Frames of one layout.
 
     Attributes:
-        layout: their layout.
-        where: their indices in the table, (k,).
-        rows: their bytes, one frame per row, (k, layout.size).
+        layout: the layout of the frames.
+        where: the indices of the frames in the table, (k,).
+        rows: the bytes of the frames, one frame per row, (k, layout.size).
     """
 
     layout: Layout
@@ -87,7 +87,7 @@ class LayoutRows:
 
     @cached_property
     def stream_order(self) -> NDArray[np.intp] | slice:
-        """An index that puts the frames into stream order, if the table has no others."""
+        """The indices that sort the frames into stream order."""
         if self.is_in_order:
             return slice(None)
         return np.argsort(self.where)
@@ -129,7 +129,7 @@ class CompiledTable:
     def _load(self, leaf: Leaf | Derivation, path: str, group: LayoutRows) -> NDArray[Any]:
         """Return the values of a field in the frames of a group.
 
-        An index in the path selects one element, and removes the axis of the array.
+        A path with an index selects one element, and the result has no axis for this array.
         """
         values = group.layout.load(path, group.rows)
         if "[" in path:
@@ -209,9 +209,12 @@ class CompiledTable:
         return CompiledTable(self.schema, groups)
 
     def walks(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
-        """Return the groups that have these parts, each with a buffer and the parts in it.
+        """Find the parts in the frames of each group that has them.
 
         The result is cached, because the clock, the points and each kind of parts use it.
+
+        Returns:
+            For each group, the group, the buffer that contains its frames, and the parts in it.
         """
         if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
@@ -276,7 +279,11 @@ class CompiledTable:
 class _PartRows:
     """Parts of one layout that were found in one round.
 
-    `offsets` are their offsets in the buffer, (k,). `frames` are the indices of their frames, (k,).
+    Attributes:
+        layout: the layout of the parts.
+        buffer: the bytes that contain them.
+        offsets: the offsets of the parts in the buffer, (k,).
+        frames: the indices of the frames that contain the parts, (k,).
     """
 
     buffer: NDArray[np.uint8]
@@ -288,7 +295,7 @@ class _PartRows:
 def _group_by_layout(
     pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]
 ) -> list[LayoutRows]:
-    """Return the parts grouped by layout.
+    """Group parts by layout.
 
     Args:
         ranks: for each piece, the indices of its parts in the table of parts.
@@ -305,7 +312,7 @@ def _group_by_layout(
 
 
 def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
-    """Return parts of one layout in one buffer as a group, in stream order."""
+    """Return parts that have one layout and one buffer as a group, in stream order."""
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])
     first, _ = parts[0]
@@ -334,7 +341,7 @@ def _merge_groups(groups: list[LayoutRows]) -> LayoutRows:
 
 
 def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
-    """Stack arrays of rows, without a copy if they follow one another in memory."""
+    """Stack arrays of rows; nothing is copied if they follow one another in memory."""
     base = parts[0].base
     width = parts[0].shape[1]
     addresses = [_address(part) for part in parts]
@@ -442,12 +449,12 @@ class ParsedTable:
     def _take_element(
         self, column: NDArray[Any], path: str, indices: Mapping[str, int]
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return one element of a field's arrays, and which frames have it, (n,).
+        """Return one element of a field's arrays, and whether each frame has it, (n,).
 
         Args:
             column: the values of the whole field, (n, *lengths).
             path: the path of the field, without indices.
-            indices: the index in each axis to remove. A negative index counts from the end.
+            indices: the index in each axis that is removed. A negative index counts from the end.
         """
         inside = np.ones(len(self), np.bool_)
         axes = self.schema.columns[path].axes
@@ -537,13 +544,13 @@ class ParsedTable:
 
 
 def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
-    """Return the value at a path; None if a branch omits it.
+    """Return the value at a path of a parsed frame; None if the frame lacks it.
 
     A value in arrays is returned as nested lists.
 
     Args:
         names: the names that lead to the value.
-        axes: the number of arrays that the value is in.
+        axes: the number of arrays that contain the value.
     """
     if isinstance(parsed, list):
         return _collect_elements(parsed, names, axes)
@@ -568,9 +575,9 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether the value exists.
+    """Return whether a value exists.
 
-    For nested lists in which some elements are missing, it is nested lists of booleans.
+    If some elements of nested lists are missing, the result is nested lists of booleans.
     """
     if not isinstance(value, list):
         return value is not None
@@ -583,7 +590,7 @@ def _find_present(value: Any) -> Any:
 def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
     """Copy a value or nested lists to an index of a padded array.
 
-    If a list is shorter than the array, the padding after it is not changed.
+    If a list is shorter than the array, the remaining elements of the array are not changed.
     """
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
@@ -603,7 +610,7 @@ def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
 
     Args:
         names: the names that lead to the array.
-        brackets: the number of "[]" after the names: how many arrays are directly around it.
+        brackets: the number of arrays that directly contain this array ("[]" in its axis).
     """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1
@@ -647,9 +654,9 @@ def _are_numbers(found: list[Any]) -> bool:
 
 
 def _outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
-    """Return the lengths of the arrays around a field.
+    """Return the lengths of the arrays that contain a field.
 
-    A bytes field with an adapter is one value, and its axis of bytes is left out.
+    A field of bytes with an adapter is one value, so its axis of bytes is left out.
     """
     if leaf.info.adapter is not None and leaf.info.kind == "bytes":
         return leaf.shape[:-1]
@@ -657,7 +664,7 @@ def _outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
 
 
 def _make_object_column(values: list[Any]) -> NDArray[Any]:
-    """Return a column of any values, (n,)."""
+    """Return an object array of any values, (n,)."""
     column = np.empty(len(values), object)
     column[:] = values
     return column

@@ -1,10 +1,10 @@
-"""Layouts: the positions of all fields of a frame, and the functions that load and store by them.
+"""Layouts: the positions of all fields of a frame, for loading and storing values.
 
-A `Layout` describes the frames of one header variant: offsets, strides, bits, constants and
+A `Layout` describes the frames of one header variant by offsets, strides, bits, constants and
 checksums. `lidarspec.frames.layout_tree` makes it from the frame tree. A `Leaf` is the position of
 one field. A `Seal` is a checksum with the bytes that it covers.
 
-Most functions work on many frames at once, given as rows of bytes. Constants are compared in words
+Most functions handle many frames at once, given as rows of bytes. Constants are compared in words
 of up to eight bytes.
 """
 
@@ -46,7 +46,7 @@ def view_elements(
 ) -> NDArray[Any]:
     """Return a view of the elements at an offset of each row, (n, *shape).
 
-    Each row is contiguous by itself.
+    Each row has to be contiguous.
     """
     if rows.flags.c_contiguous:
         return np.ndarray((len(rows), *shape), dtype, rows, offset, (rows.shape[1], *strides))
@@ -57,7 +57,7 @@ def view_elements(
 
 
 def view_span(rows: Bytes2D) -> NDArray[np.uint8]:
-    """Return a view of all bytes from the first row to the last, (k,).
+    """Return a view of the memory from the first row to the last, (k,).
 
     Bytes between the rows are included.
     """
@@ -71,13 +71,13 @@ def view_span(rows: Bytes2D) -> NDArray[np.uint8]:
 def gather_rows(
     buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
 ) -> NDArray[np.uint8]:
-    """Return `size` bytes from each of these offsets, (n, size).
+    """Return `size` bytes from each of these offsets on, (n, size).
 
-    Nothing is copied if the rows are back to back.
+    Nothing is copied if each row follows the previous one in the buffer.
 
     Args:
-        gathered: True returns a C-contiguous array. False also avoids the copy if the offsets are
-            evenly spaced; then only each row by itself is contiguous.
+        gathered: whether the result has to be C-contiguous. If not, nothing is copied for evenly
+            spaced offsets either.
     """
     count = len(offsets)
     if not count or not size:
@@ -107,13 +107,13 @@ class Leaf:
     Attributes:
         info: the field.
         offset: the offset of its first element, in bytes from the start of the frame.
-        shape: the number of elements along each of its arrays.
-        strides: bytes from one element to the next along each array. An array inside a bit block
-            has no stride.
-        wire: its dtype with byte order if NumPy can read it directly, else None.
-        elements: if `wire` is None, the bits of each element of the innermost array. It has one
-            entry if that array is not inside the bit block.
-        size: bytes of one element, or of the bit block that the field is in.
+        shape: the number of elements along each array that contains the field.
+        strides: the distance from one element to the next along each array, in bytes. An array
+            inside a bit block has no stride.
+        wire: the dtype with byte order if NumPy can read the field directly, else None.
+        elements: if `wire` is None, the bits of each element of the array inside the bit block, or
+            of the field if the bit block has no array.
+        size: the size of one element, or of the bit block that contains the field, in bytes.
     """
 
     info: FieldInfo
@@ -125,10 +125,10 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return the raw values of frames given as rows of bytes.
+        """Return the raw values in frames given as rows of bytes.
 
         Returns:
-            shape (n, *shape), in native byte order.
+            An array (n, *shape) in native byte order.
         """
         if self.wire is not None:
             return self._view(rows, self.wire, 0).astype(self._native)
@@ -161,7 +161,7 @@ class Leaf:
                 buffer.
 
         Returns:
-            The indices of the candidates that have the field (None: all), and the values.
+            The indices of the candidates that have the field (None if all have it), and the values.
         """
         there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
         which = None if there.all() else np.flatnonzero(there)
@@ -174,7 +174,10 @@ class Leaf:
         return which, self._from_start.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return its value in the first bytes of a frame; None if they end before it."""
+        """Return the value of the field, given the first bytes of a frame.
+
+        Returns None if the bytes end before the end of the field.
+        """
         if self.offset + self.size <= len(frame):
             return self.scalar(frame)
         return None
@@ -196,7 +199,7 @@ class Leaf:
         """Return the offset of each element, row by row.
 
         Args:
-            depth: the number of arrays to iterate over; by default all outside a bit block.
+            depth: the number of arrays to iterate over; by default all arrays outside a bit block.
         """
         offsets = [self.offset]
         for length, stride in list(zip(self.shape, self.strides, strict=False))[:depth]:
@@ -206,8 +209,8 @@ class Leaf:
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
         """Return physical values of n frames as raw values, (n, ...).
 
-        Values with fewer axes than the field get trailing axes of length 1. Bytes are padded with
-        zeros.
+        Axes of length 1 are appended to values with fewer axes than the field. Bytes are padded
+        with zeros.
         """
         if self.info.kind == "bytes":
             size = self.shape[-1]
@@ -233,7 +236,7 @@ class Leaf:
 
     @property
     def _packed(self) -> bool:
-        """Whether the innermost array is inside the bit block, and so has no stride."""
+        """Whether the innermost array is inside the bit block, so that it has no stride."""
         return len(self.shape) > len(self.strides)
 
     def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
@@ -263,7 +266,7 @@ class Leaf:
         return total.astype(self.info.dtype, copy=False)
 
     def _within(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
-        """Return values of bits within one byte."""
+        """Return the values of bits within one byte."""
         total = self._view(rows, np.dtype("u1"), part.byte).astype(wide)
         if part.mask != 0xFF:
             total &= wide.type(part.mask)
@@ -271,10 +274,10 @@ class Leaf:
         return total
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Return values of contiguous bits; None if they cannot be read as one word.
+        """Return the values of contiguous bits, each read as one word.
 
-        Each word ends with the last byte of the value. The result is None if the bits are not
-        contiguous, if they do not fit into a word, or if the word would begin before the frame.
+        Each word ends with the last byte of the value. Returns None if the bits are not contiguous,
+        if they do not fit into a word, or if the word would begin before the frame.
         """
         if element.run is None:
             return None
@@ -292,9 +295,9 @@ class Leaf:
 
     @property
     def byte_span(self) -> tuple[int, int]:
-        """The offsets of its first byte and of the byte after its last.
+        """The offset of the first byte of the field, and the offset after its last byte.
 
-        In arrays, they belong to the first element.
+        If the field is in arrays, these are the offsets of its first element.
         """
         if not self.elements:
             return self.offset, self.offset + self.size
@@ -304,10 +307,10 @@ class Leaf:
         return min(byte_offsets), max(byte_offsets) + 1
 
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
-        """Return one element of its arrays; None if it does not exist.
+        """Return one element of the arrays of the field; None if it does not exist.
 
-        A negative index counts from the last element. An array with an index keeps its axis, with
-        length 1, if it contains an array without an index.
+        A negative index counts from the end. If an array with an index contains an array without
+        one, its axis is kept with length 1.
         """
         info = get_element(self.info, path, indices)
         if info is None:
@@ -347,15 +350,15 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class Derivation:
-    """A value without bytes of its own in frames of one layout.
+    """A value without bytes of its own, in frames of one layout.
 
     Attributes:
         info: the value as a field.
-        shape: the number of elements along each of its arrays.
-        strides: the difference from one element to the next along each array, starting at `start`.
+        shape: the number of elements along each array that contains the value.
+        strides: the difference between the values of consecutive elements along each array.
         formula: a formula of fields of the frame; None if the value is computed from `start`.
         start: the value of the first element.
-        picked: the index of the element to return in each array; None for all elements.
+        picked: the index of the selected element in each array; None for all elements.
     """
 
     info: FieldInfo
@@ -392,7 +395,7 @@ class Derivation:
         return values
 
     def element(self, path: str, indices: Mapping[str, int]) -> Derivation | None:
-        """Return one element of its arrays; None if it does not exist."""
+        """Return one element of the arrays of the value; None if it does not exist."""
         info = get_element(self.info, path, indices)
         picked = tuple(indices.get(axis) for axis in self.info.axes)
         exists = all(
@@ -404,8 +407,8 @@ class Derivation:
         return replace(self, info=info, picked=picked)
 
 
-#: Computes the checksums of one seal for many frames, (n,). Returns None if the algorithm of the
-#: seal has to compute them.
+#: A function that computes the checksums of one seal for many frames, (n,). It returns None if the
+#: algorithm of the seal has to compute them.
 Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
 
 
@@ -413,19 +416,22 @@ Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
 class Seal:
     """A checksum of the frame.
 
-    `leaves` are the fields that hold it, low bits first. `spans` are the byte ranges that it
-    covers. `absent` are stored values that mean "not filled".
+    Attributes:
+        algorithm: the algorithm.
+        leaves: the fields with the checksum, low bits first.
+        spans: the byte ranges that it covers.
+        absent: the stored values that mean that the sensor has computed no checksum.
     """
 
     leaves: tuple[Leaf, ...]
     spans: tuple[tuple[int, int], ...]
     algorithm: Checksum
     absent: tuple[int, ...]
-    #: the offset after the last byte of the sealed struct.
+    #: The offset after the last byte of the struct with the checksum.
     end: int = 0
 
     def covers(self, other: Seal) -> bool:
-        """Return whether it covers a field that holds the checksum of another seal."""
+        """Return whether this checksum covers a field with the checksum of another seal."""
         return any(
             start < leaf.byte_span[1] and leaf.byte_span[0] < end
             for start, end in self.spans
@@ -447,7 +453,7 @@ class Seal:
         return total
 
     def _byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """Return the left shift of each byte of a bytes field, in bits, (k,)."""
+        """Return the number of bits by which each byte of a field is shifted, (k,)."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
@@ -457,8 +463,8 @@ class Seal:
         """Compute the checksums of the frames, (n,).
 
         Args:
-            sums: a function that computes the checksums. If it is None or returns None, the
-                algorithm of the seal computes them.
+            sums: a faster function that computes the checksums. If it is None or returns None, the
+                algorithm of the seal is used.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -479,7 +485,7 @@ class Seal:
     def sound(self, frame: bytes) -> bool:
         """Return whether the checksum of one frame is correct.
 
-        A value that means "not filled" counts as correct.
+        A stored value in `absent` counts as correct.
         """
         stored = shift = 0
         for leaf in self.leaves:
@@ -503,12 +509,12 @@ class Seal:
         return single(self.algorithm)
 
     def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
-        """Return which frames have a correct checksum, (n,).
+        """Return whether the checksum of each frame is correct, (n,).
 
-        A value that means "not filled" counts as correct.
+        A stored value in `absent` counts as correct.
 
         Args:
-            sums: a function that computes the checksums, as for `compute`.
+            sums: a faster function that computes the checksums, see `compute`.
         """
         stored = self.load_stored(rows)
         if self.absent:
@@ -529,13 +535,13 @@ class Seal:
 class Condition:
     """A condition that frames have to meet.
 
-    Without `formula`, the field must have one of its allowed values. With `formula`, the result
+    Without a `formula`, the field must have one of its allowed values. With a `formula`, its value
     must not be 0.
     """
 
     fields: tuple[FieldInfo, ...]
     formula: Formula | None
-    #: the path of the check, or of the field.
+    #: The path of the check, or of the field.
     path: str = ""
 
     @classmethod
@@ -553,7 +559,7 @@ class Condition:
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
         """Return whether the condition is true, element by element.
 
-        It is false if one of its fields is missing in `raw`.
+        The condition is false if one of its fields is missing in `raw`.
         """
         if len(raw) < len(self.fields):
             return np.zeros(1, np.bool_)
@@ -573,7 +579,7 @@ class Condition:
 
     @cached_property
     def _dtype(self) -> Any:
-        """The smallest integer type that holds all intermediate values of the formula."""
+        """The smallest integer type that can represent all intermediate values of the formula."""
         most = max(width(part) for part in parts(self.formula or 0))
         if most < 15:
             return np.int16
@@ -583,7 +589,7 @@ class Condition:
 
 
 class FrameTest(Protocol):
-    """A test of fields that valid frames pass."""
+    """A test of fields that all valid frames pass."""
 
     @property
     def fields(self) -> tuple[FieldInfo, ...]:
@@ -593,12 +599,13 @@ class FrameTest(Protocol):
         """Return whether the test is true, element by element.
 
         Args:
-            raw: the raw values of its fields, by path, without fields that a layout does not have.
+            raw: the raw values of the fields, by path. Fields that a layout does not have are
+                missing.
         """
 
 
 def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
-    """Return which frames, given as rows of bytes, pass a test, (n,).
+    """Return whether each frame, given as a row of bytes, passes a test, (n,).
 
     A frame passes if the test is true for all its elements.
     """
@@ -618,10 +625,10 @@ class LayoutRefusal:
 
     Attributes:
         error: the error of a plugin expression that failed.
-        by_constant: True if a constant is wrong. If it is False and `error` is None, the frame is
+        by_constant: whether a constant is wrong. If it is False and `error` is None, the frame is
             too long.
-        constants: if the frame is too long, its constants before that point. A candidate in which
-            one of them is wrong is refused because of this constant instead.
+        constants: if the frame is too long, the constants before the part that is too long. If one
+            of them is wrong in a candidate, this is the reason for the candidate.
     """
 
     error: PluginError | None = None
@@ -634,21 +641,21 @@ class Layout:
     """The layout of the frames of one header variant.
 
     Attributes:
-        size: in bytes.
+        size: the size of the frames in bytes.
         leaves: the position of each field, by path.
-        constants: offset -> (mask, value).
-        seals: its checksums, inner ones first.
+        constants: the constant bits, as (mask, value) by offset.
+        seals: the checksums, inner ones first.
         places: the byte range of each named part outside arrays.
         branches: the branch that each `When` and `Select` takes.
-        following: fields with values that follow from the header, and these values. They are
-            written when a frame is built, and not checked when it is parsed.
+        following: pairs of a field and its value, if the value follows from the header. The values
+            are written when a frame is built, and not checked when it is parsed.
         lengths: the length of each array, by its axis; 0 for an array inside an empty array.
         regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
-        held: the values of the fields that declare the sizes of parts, in the form of `constants`.
-        conditions: conditions that the values of its fields have to meet.
-        derived: the `Derivation` of each value without bytes of its own, by path. For a value that
-            repeats the bytes of another field, it is the `Leaf` of these bytes.
-        notes: cache for results derived from the layout.
+        held: the bits of the fields that declare the sizes of parts, in the form of `constants`.
+        conditions: the conditions that the values of fields have to meet.
+        derived: the `Derivation` of each value without bytes of its own, by path; the `Leaf` of
+            another field if the value is a copy of this field.
+        notes: a cache for results that other modules derive from the layout.
     """
 
     size: int
@@ -667,7 +674,7 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits that all frames of this layout have: offset -> (mask, value).
+        """The bits that all frames of this layout have, as (mask, value) by offset.
 
         They are the bits of `constants` and of `held`.
         """
@@ -690,7 +697,7 @@ class Layout:
     def column(self, path: str) -> Leaf | Derivation | None:
         """Return the position of a field, or the `Derivation` of a derived value.
 
-        Returns None if the layout does not have it.
+        Returns None if the layout does not have the field.
         """
         return self.leaves.get(path) or self.derived.get(path)
 
@@ -705,7 +712,7 @@ class Layout:
     def sound(self, frame: bytes) -> bool:
         """Return whether one frame is valid.
 
-        Its size, constants, checksums and conditions are checked.
+        This checks its size, constants, checksums and conditions.
         """
         return (
             len(frame) == self.size
@@ -718,14 +725,14 @@ class Layout:
         )
 
     def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Return which frames, given as rows of bytes, meet all conditions, (n,)."""
+        """Return whether each frame, given as a row of bytes, meets all conditions, (n,)."""
         met = np.ones(len(rows), np.bool_)
         for condition in self.conditions:
             met &= self.meets_condition(condition, rows)
         return met
 
     def meets_condition(self, condition: Condition, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Return which frames, given as rows of bytes, meet one of the conditions, (n,)."""
+        """Return whether each frame, given as a row of bytes, meets a condition, (n,)."""
         return find_passing(condition, self.leaves, rows)
 
     def seal(self, rows: Bytes2D) -> None:
@@ -742,24 +749,29 @@ class Layout:
 
 
 def set_bits(rows: Bytes2D, bits_by_offset: Mapping[int, tuple[int, int]]) -> None:
-    """Write bits into frames given as rows of bytes: offset -> (mask, value)."""
+    """Write bits into frames given as rows of bytes.
+
+    Args:
+        bits_by_offset: the bits, as (mask, value) by offset.
+    """
     if bits_by_offset:
         offsets = list(bits_by_offset)
         bits = np.array(list(bits_by_offset.values()), np.uint8)
         rows[:, offsets] = rows[:, offsets] & ~bits[:, 0] | bits[:, 1]
 
 
-#: constant bytes: (offset, mask, value) of each.
+#: Constant bytes, each as (offset, mask, value).
 Marks = tuple[tuple[int, int, int], ...]
 
-#: constant bytes that are compared at once: offset, dtype, mask (None: all bits), value.
+#: Constant bytes that are compared together, as (offset, dtype, mask, value). The mask is None for
+#: all bits.
 Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Return constants sorted by offset, whole bytes before single bits.
+    """Return constant bytes sorted by offset, whole bytes before single bits.
 
-    Whole bytes rule out more candidates.
+    Whole bytes come first because they exclude more candidates.
     """
     constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
     return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
@@ -767,7 +779,7 @@ def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
 
 @lru_cache(maxsize=2048)
 def merge_constants(constants: Marks) -> tuple[Word, ...]:
-    """Return constants merged into words of 1, 2, 4 or 8 bytes.
+    """Merge constant bytes into words of 1, 2, 4 or 8 bytes.
 
     The first and the last byte of each word have constant bits.
     """
@@ -799,13 +811,13 @@ def are_contradictory(some: Marks, others: Marks) -> bool:
 
 
 def match_word(values: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Return whether values read at the offset of a word match it, element by element."""
+    """Return whether each of the values that were read at the offset of a word matches it."""
     _, _, mask, value = word
     return np.asarray((values if mask is None else values & mask) == value)
 
 
 def match_constants(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
-    """Return which rows have all constants, (n,); None if all rows have them."""
+    """Return whether each row has all constants, (n,); None if all rows have them."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         offset, dtype, _, _ = word

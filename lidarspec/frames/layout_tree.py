@@ -1,13 +1,13 @@
 """Compute the layouts of a frame type: the offset of each field, for each variant of the header.
 
-A count, condition or key in a struct makes the layout depend on header fields, here called
-*selectors*. `find_layout` walks the tree of the struct with a cursor, for given values of the
-selectors. If it needs another selector, it raises `UnknownSelectorError`.
+If a struct has a count, condition or key, the layout depends on header fields, which are called
+*selectors* here. `find_layout` moves a cursor through the tree of the struct, for given values of
+the selectors. If it needs another selector, it raises `UnknownSelectorError`.
 
 `HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
-is a value of it, and each leaf is a `Layout`, or a `LayoutRefusal` with the reason why there is
-none. `HeaderTree.classify` sorts many candidates through the tree at once, so the struct is walked
-only once for each distinct header.
+is a value of the selector, and each leaf is a `Layout`, or a `LayoutRefusal` with the reason why
+there is no layout. `HeaderTree.classify` passes many candidates through the tree at once, so that
+`find_layout` runs only once for each distinct header.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class TooLongError(Exception):
     The frame would be longer than the maximum of the frame type, or have no bytes.
 
     Attributes:
-        path: path of the part that is too long.
-        number: the invalid count or length; None if only the sum of all parts is too long.
+        path: the path of the part that is too long.
+        number: the invalid count or length; None if the sum of all parts is too long.
     """
 
     def __init__(self, path: str, number: int | None = None) -> None:
@@ -64,7 +64,7 @@ class TooLongError(Exception):
 
 
 class UnknownPartError(Exception):
-    """No kind of parts has the constants of a part."""
+    """The constants of a part match no kind of parts."""
 
 
 class CutOffError(Exception):
@@ -79,12 +79,12 @@ def find_layout(
     Args:
         values: the raw values of the fields that the layout depends on, by path.
         limit: the maximum size of a frame, in bytes.
-        given: for parts, raw values of fields of the outer frame, by their path there.
+        given: for parts, the raw values of fields of the outer frame, by their path in it.
 
     Raises:
         UnknownSelectorError: if the layout depends on another field.
         TooLongError: if the frame would be longer than `limit`, or have no bytes.
-        UnknownPartError: if no kind of parts has the constants of a part.
+        UnknownPartError: if the constants of a part match no kind of parts.
         NotCompilableError: if only construct can parse the struct.
         Exception: any error of a formula with these values.
     """
@@ -92,11 +92,11 @@ def find_layout(
 
 
 def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
-    """Return the layout that a walk leads to.
+    """Complete a walk through the tree, and return the layout.
 
     Raises:
-        Exception: as `find_layout`, or any error of `walk.request`. The walk then keeps the results
-            until there.
+        Exception: the same as `find_layout`, or any error of `walk.request`. The walk then has the
+            results up to the error.
     """
     walk.visit(root, "")
     if not walk.cursor:
@@ -108,7 +108,7 @@ def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """Return the constants at offsets that depend on no header field.
 
     Returns:
-        offset -> (mask, value).
+        The constant bits, as (mask, value) by offset.
     """
     walk = HeaderWalk({}, limit)
     # If an expression of the struct fails, the constants before it are still known.
@@ -131,9 +131,10 @@ class HeaderWalk:
     values: Mapping[str, int]
     limit: int
     given: Mapping[str, int] = field(default_factory=dict)
-    #: returns the value of a field that is not in `values`; may replace `values`.
+    #: A function that returns the value of a field that is not in `values`. It may replace
+    #: `values`.
     request: ValueRequest = _raise_unknown
-    #: number of bytes of the frame if no more follow; None if more may follow.
+    #: The size of the frame in bytes if no more bytes follow; None if more may follow.
     room: int | None = None
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
@@ -143,17 +144,17 @@ class HeaderWalk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
-    #: regions of unknown size.
+    #: The regions of unknown size.
     open_regions: dict[str, Region] = field(default_factory=dict)
-    #: conditions that values have to meet, each once.
+    #: The conditions that values have to meet, each once.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
-    #: values without bytes of their own, by path.
+    #: The values without bytes of their own, by path.
     derived: dict[str, Leaf | Derivation] = field(default_factory=dict)
-    #: the offset of each part; in arrays, that of the first element.
+    #: The offset of each part; in arrays, the offset of the first element.
     starts: dict[str, int] = field(default_factory=dict)
-    #: number of elements of size 0 in all arrays.
+    #: The number of elements without bytes in all arrays.
     empty: int = 0
-    #: fields before the cursor, for formulas; None for a field that the header omits.
+    #: The fields before the cursor, for formulas; None for a field that the frame does not have.
     parts: dict[str, Leaf | PartsSize | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
@@ -214,10 +215,13 @@ class HeaderWalk:
     def visit(
         self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
     ) -> None:
-        """Add a part and move the cursor behind it.
+        """Add a part and move the cursor to its end.
 
         Args:
-            shape, strides: of the arrays that the part is in.
+            node: the part.
+            path: the path of the part.
+            shape: the lengths of the arrays that contain the part.
+            strides: the strides of these arrays.
         """
         start = self.starts[path] = self.cursor
         match node:
@@ -311,7 +315,7 @@ class HeaderWalk:
     def _peek(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add fields that are read at the cursor without moving it.
+        """Add fields at the cursor without moving it.
 
         Their bytes belong to the nodes after them.
         """
@@ -327,7 +331,8 @@ class HeaderWalk:
     def _parts(self, node: tree.PartSequence, path: str) -> None:
         """Add a sequence of parts.
 
-        The header gives their size, or it is requested like the value of a field.
+        If no header field contains their total size, the size is requested in the same way as the
+        value of a selector.
         """
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
         rule = PartRule(
@@ -364,7 +369,7 @@ class HeaderWalk:
     ) -> None:
         """Add the fields of the element type of an empty array.
 
-        Bytes and constants are not added, and conditions on these fields apply to no element.
+        Their bytes and constants are not added, and conditions on these fields apply to no element.
         """
         start = self.cursor
         constants = dict(self.constants)
@@ -467,7 +472,7 @@ class HeaderWalk:
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
     def _held_bits(self) -> dict[int, tuple[int, int]]:
-        """Return the bits of fields that hold lengths of parts, as constants.
+        """Return the bits of fields that contain the sizes of parts.
 
         They are constant within one layout.
         """
@@ -489,10 +494,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield rebuilt fields with the values that follow from known values.
-
-        Known are constants, and the fields that the layout depends on.
-        """
+        """Yield fields with values that follow from constants and selectors, and the values."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -516,7 +518,7 @@ class HeaderWalk:
 
 
 def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> None:
-    """Set the stride of an array in all leaves that are in it."""
+    """Set the stride of an array in all leaves that the array contains."""
     for path, leaf in leaves.items():
         is_constant = isinstance(leaf, Derivation) and not leaf.strides[depth:]
         if axis in leaf.info.axes and not is_constant:
@@ -527,7 +529,7 @@ def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> Non
 def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
     """Yield checksums, each before the checksums that cover its field.
 
-    If neither covers the field of the other, the inner one is first.
+    If neither of two checksums covers the field of the other, the inner one is first.
     """
     left = list(seals)
     while left:
@@ -540,27 +542,27 @@ def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
         yield first
 
 
-#: maximum number of cached headers: random input must not fill the memory with layouts.
+#: The maximum number of cached headers, so that random input does not fill the memory.
 MAX_CACHED_HEADERS = 4096
 
-#: up to this number of distinct values, one search for each is faster than sorting.
+#: Up to this number of distinct values, a search for each value is faster than sorting.
 MAX_SEARCHED_VALUES = 4
 
 
 @dataclass(eq=False)
 class HeaderNode:
-    """A node of a `HeaderTree`: the next field that decides the layout, or the result.
+    """A node of a `HeaderTree`, which has a selector or a result.
 
     Attributes:
-        values: raw values of the deciding fields above this node, by path.
+        values: the raw values of the selectors above this node, by path.
         above: the parent node; None for the root.
-        leaf: the deciding field of this node; None if not known yet, or if the node has a result.
-        before: all fields found before `leaf`, by path.
-        constants: the constants found before `leaf`, or before the end of a truncated frame.
-            Constants that all frames begin with are left out.
-        least: known minimum size in bytes of a frame with these values; 0 if not known.
+        leaf: the selector of this node; None if it is not known yet, or if the node has a result.
+        before: all fields before `leaf`, by path.
+        constants: the constants before `leaf`, or before the end of a truncated frame. Constants
+            that all frames begin with are left out.
+        least: the known minimum size of a frame with these values, in bytes; 0 if not known.
         value_classes: the values of `leaf` that lead to different layouts.
-        children: child nodes by value of `leaf`.
+        children: the child nodes by value of `leaf`.
         result: the layout or the refusal; None if not known yet.
     """
 
@@ -588,26 +590,27 @@ class HeaderNode:
         return self.children[value]
 
 
-#: reads the field of a node in candidates. Returns the indices of the candidates that have the
-#: field (None: all), and the values.
+#: A function that reads the field of a node in candidates. It returns the indices of the candidates
+#: that have the field (None if all have it), and the values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
 Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
 class _ValueClasses:
-    """Maps all values of a selector with the same result to one representative.
+    """Maps all values of a selector that lead to the same result to one representative.
 
-    Noise in place of a header can contain any of billions of lengths or keys. Values that lead to
-    the same result are therefore mapped to one value, and share one branch of the tree.
+    Random bytes in place of a header can contain billions of different lengths or keys. Values with
+    the same result share one branch of the tree, so that the tree stays small.
 
     If `keys` is not empty, all values that are not in it are mapped to `other`. Otherwise, values
-    are clipped to `low` and `high`.
+    are limited to the interval from `low` to `high`.
 
     Attributes:
-        limits: lowest and highest value of the field.
-        rises: from this value on, a larger value never makes the frame shorter. So if a value makes
-            the frame too long, all larger values do. None if no such value is known.
+        limits: the lowest and the highest value of the field.
+        rises: from this value on, a larger value never makes the frame shorter. If such a value
+            makes the frame too long, all larger values do so as well. None if no such value is
+            known.
     """
 
     limits: tuple[int, int]
@@ -621,7 +624,7 @@ class _ValueClasses:
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
         """Return the classes of the values of a field in the formulas of a frame.
 
-        If they cannot be derived from the formulas, each value is a class of its own.
+        If the classes cannot be derived from the formulas, each value is a class of its own.
         """
         (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [
@@ -713,8 +716,8 @@ def _depends_on(formula: tree.Formula, info: tree.FieldInfo) -> bool:
 def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
     """Return whether a formula of a node counts bytes, elements or parts.
 
-    All numbers larger than the maximum frame size then have the same result: each part has at least
-    one byte (`HeaderWalk._parts`), and an array with more elements than that is refused too.
+    If so, all numbers larger than the maximum frame size have the same result, because each part
+    has at least one byte (`HeaderWalk._parts`), and an array with more elements is refused.
     """
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
@@ -723,7 +726,7 @@ def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
 
 
 def _is_increasing(formula: tree.Formula) -> bool:
-    """Return whether a formula has one field and never decreases when it increases."""
+    """Return whether a formula depends on one field and never decreases when it increases."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
@@ -733,18 +736,18 @@ def _is_increasing(formula: tree.Formula) -> bool:
 
 
 def _evaluate_with(formula: tree.Formula, value: int) -> int:
-    """Return the value of a formula of one field for this value of the field."""
+    """Return the value of a formula of one field for a value of this field."""
     return int(tree.evaluate(formula, lambda _: value))
 
 
 class _CandidateSet:
-    """Candidates in a buffer, as given to `HeaderTree.classify`.
+    """The candidates in a buffer that are passed to `HeaderTree.classify`.
 
     Frames have at most `limit` bytes.
 
     Attributes:
-        refuted: indices of candidates that are incomplete or too long, and in which a constant
-            before that point is wrong.
+        refuted: indices of candidates that are incomplete or too long, and in which an earlier
+            constant is wrong.
     """
 
     def __init__(
@@ -776,7 +779,7 @@ class _CandidateSet:
     def read(
         self, node: HeaderNode, which: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read the field of a node, as `Reader`, and check the incomplete candidates."""
+        """Read the field of a node like a `Reader`, and check the incomplete candidates."""
         assert node.leaf is not None
         there, values = node.leaf.read(
             self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]
@@ -793,7 +796,7 @@ class _CandidateSet:
     def wrong(
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Return which candidates have a wrong constant in their available bytes, (n,)."""
+        """Return whether each candidate has a wrong constant in its available bytes, (n,)."""
         if len(which) == 1:  # the usual case for random headers, which differ
             data = self.longest(which)
             return np.array([_is_refuted(constants, data)])
@@ -817,7 +820,7 @@ def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryvi
 class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
-    The layouts of parts also depend on the values of fields of the outer frame.
+    The layouts of parts also depend on fields of the outer frame, whose values are `given`.
 
     Attributes:
         root: the frame type or kind of parts.
@@ -842,13 +845,16 @@ class HeaderTree:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> list[Group]:
-        """Return the candidates at `offsets` by layout: (layout or refusal, indices).
+        """Group the candidates at `offsets` by layout.
 
         Candidates with an incomplete header are left out.
 
         Args:
-            stops: the offset after the last byte of each candidate, which is then complete. By
-                default, candidates reach to the end of the buffer, and more bytes may follow.
+            stops: the offset after the last byte of each candidate, if all candidates are complete.
+                By default, candidates extend to the end of the buffer, and more bytes may follow.
+
+        Returns:
+            Pairs of a layout or refusal and the indices of its candidates.
         """
         places = _CandidateSet(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
@@ -868,10 +874,10 @@ class HeaderTree:
         """Group candidates by layout, as `classify` does.
 
         Args:
-            number: number of candidates.
-            read: reads the field of a node for some candidates.
-            places: the candidates in their buffer, if single headers can be read as well. If None,
-                only `read` is used.
+            number: the number of candidates.
+            read: a function that reads the field of a node for some candidates.
+            places: the candidates in their buffer, for reading single headers. If None, only `read`
+                is used.
         """
         self._forget_many()
         groups: list[Group] = []
@@ -914,9 +920,9 @@ class HeaderTree:
         return tuple(leaves.values()), find_prefix(self.root, self.limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """Return the common layout of rows of bytes; None if they have none.
+        """Return the common layout of rows of bytes; None if their layouts differ.
 
-        All rows must have the same class of value in each field that selects the layout.
+        All rows must have the same class of value in each selector.
         """
         node = self._root
         while node.result is None:
@@ -944,11 +950,12 @@ class HeaderTree:
     ) -> HeaderNode:
         """Return the node that the available bytes of a header lead to.
 
-        The node has a result, or the deciding field is incomplete.
+        The node has a result, or a selector that is not completely available.
 
         Args:
+            frame: the available bytes.
             since: the node for fewer bytes of the same header, to continue from.
-            is_all: True if the frame has no more bytes.
+            is_all: whether the frame has no more bytes.
         """
         if since is None:
             self._forget_many()
@@ -968,10 +975,10 @@ class HeaderTree:
         """Return the layout for these values of header fields.
 
         Args:
-            read: returns the value of a field that decides the layout.
+            read: a function that returns the value of a selector.
 
         Raises:
-            Exception: as `find_layout`, or any error of `read`.
+            Exception: the same as `find_layout`, or any error of `read`.
         """
         self._forget_many()
         node = self._root
@@ -987,7 +994,7 @@ class HeaderTree:
     def _end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
     ) -> HeaderNode:
-        """Return the last node of a header from a node on, as `_explore` does."""
+        """Return the last node for a header, starting from a node, as `_explore` does."""
         while node.leaf is not None:
             value = node.leaf.read_first(data)
             if value is None:
@@ -1000,16 +1007,14 @@ class HeaderTree:
     def _explore(
         self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False
     ) -> HeaderNode:
-        """Determine the next fields that select the layout, in one walk.
-
-        The walk goes as far as the header of the frame allows.
+        """Add the nodes for a header to the tree, as far as its bytes are available.
 
         Args:
-            is_all: True if the frame has no more bytes.
+            is_all: whether the frame has no more bytes.
 
         Returns:
-            The last node. It has a result, or a field that the available bytes do not contain, or
-            neither if the frame is longer than the available bytes.
+            The last node. It has a result, or a selector that the available bytes do not contain,
+            or neither if the frame is longer than the available bytes.
         """
 
         def read_selector(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
@@ -1058,9 +1063,9 @@ class HeaderTree:
         return node
 
     def _new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants found by a walk, without the common prefix.
+        """Return the constants found by a walk, without those that all frames begin with.
 
-        Candidates are known to have the constants that all frames begin with.
+        Candidates were already checked for the latter.
         """
         return {
             offset: bits
@@ -1080,7 +1085,7 @@ class HeaderTree:
 def find_kinds(
     node: tree.PartSequence, given: tuple[tuple[str, int], ...], limit: int
 ) -> tuple[PartKind, ...]:
-    """Return the possible kinds of parts for these values of outer fields."""
+    """Return the possible kinds of parts, given the values of fields of the outer frame."""
     values = dict(given)
     return tuple(
         PartKind(kind, HeaderTree(kind.root, limit, values), find_prefix(kind.root, limit))
@@ -1090,7 +1095,7 @@ def find_kinds(
 
 @functools.lru_cache(maxsize=2048)
 def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
-    """Return the layouts of a frame type, or the reason why it cannot be compiled."""
+    """Return the layouts of a frame type, or the error if it cannot be compiled."""
     try:
         check_compilable(frame.tree)
         return HeaderTree(frame.tree, frame.room)

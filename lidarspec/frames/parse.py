@@ -1,10 +1,11 @@
 """Parse one frame into a Container of raw values.
 
-A valid frame is read by its layout. An invalid frame raises a `WireError` with its first fault.
+A valid frame is read by its layout. For an invalid frame, a `WireError` with its first fault is
+raised.
 
-For each field, the values of all array elements are unpacked at once. The containers and lists are
-then built around them, the innermost first (`unpack`). construct parses the frames that have no
-layout (`lidarspec.frames.plain`).
+For each field, the values of all array elements are unpacked together. The containers and lists are
+then made from these values, innermost first (`unpack`). construct parses frames that have no layout
+(`lidarspec.frames.plain`).
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ def parse(
     """Return the Container of raw values of one frame.
 
     Args:
-        data: the bytes of the frame, without others before or after it.
-        frame: the frame type; by default the type that fits.
-        verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-        units: True converts scaled fields to their units.
+        data: the bytes of one frame, with nothing before or after it.
+        frame: the frame type; by default the first type that matches.
+        verify: False to accept wrong constants, a wrong checksum and trailing bytes.
+        units: True to convert scaled fields to their units.
 
     Raises:
         WireError: if the bytes are not a valid frame of this type.
@@ -85,7 +86,7 @@ def identify(sensor: SensorDescription, data: bytes, *, frame: str | None = None
         frame: the only type to try; by default all types.
 
     Raises:
-        WireError: if no type fits. It describes the fault of the type that fits best.
+        WireError: if no type matches. The error describes the fault for the type that matches best.
         UnknownFrame: if the sensor does not have this frame type.
     """
     data = _as_bytes(data)
@@ -198,7 +199,8 @@ def _find_field_fault(
     """Return the first fault of the fields of a frame as an error.
 
     Args:
-        to_wire_offset: converts an offset in the frame to an offset on the wire.
+        to_wire_offset: a function that converts an offset in the struct to an offset in the encoded
+            frame.
     """
     fault = _run_search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a checksum of a plugin returned a different value this time
@@ -287,12 +289,12 @@ def unpack(root: Node, layout: Layout, frame: bytes) -> Any:
     return reader(frame)[0]
 
 
-#: the byte orders in which a bit block can be read as one number.
+#: The byte orders in which a bit block can be read as one number.
 BYTE_ORDERS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
 
-#: Reads one part of a frame, and returns one value for each element of the arrays around the part,
-#: row by row. The argument is the bytes of the frame. For a part of a bit block, it is the numbers
-#: that the blocks are read as.
+#: A function that reads one part of a frame. It returns one value for each element of the arrays
+#: that contain the part, row by row. Its argument is the bytes of the frame or, for a part of a bit
+#: block, the blocks that were read as numbers.
 Reader = Callable[[Any], Sequence[Any]]
 
 
@@ -340,7 +342,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
 
 
 def _find_leaf(layout: Layout, path: str) -> Leaf:
-    """Return the position of a field, or of the field that a derived value repeats."""
+    """Return the position of a field, or of the field that a derived value is a copy of."""
     leaf = layout.column(path)
     assert isinstance(leaf, Leaf)
     return leaf
@@ -415,7 +417,8 @@ def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
 
     Args:
         offsets: ascending.
-        order, code: the byte order and the format character, as for `struct`.
+        order: the byte order, as in `struct`.
+        code: the format character, as in `struct`.
     """
     form = list[str]()
     size = struct.calcsize(order + code)
@@ -483,7 +486,8 @@ def _apply_adapter(adapter: Adapter, raw: Reader, frame: bytes) -> Sequence[Any]
 class _LabelCache(dict[int, Any]):
     """Cache of the values of an Enum, by raw value.
 
-    construct makes a new object for each value. This cache makes one for each distinct value.
+    construct makes a new object for each value. This cache makes one object for each distinct
+    value.
     """
 
     def __init__(self, info: FieldInfo) -> None:
@@ -500,8 +504,8 @@ def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequen
 def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
     """Return a reader of bit blocks.
 
-    Each block is read as one number, in the byte order that splits its parts into fewer runs of
-    bits.
+    Each block is read as one number. The byte order of this number is the one in which the values
+    consist of fewer runs of bits.
     """
     leaf = _find_leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
@@ -534,7 +538,7 @@ def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[A
 def _find_bit_runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """Return the runs of bits of a part in a block that is read as one number.
+    """Return the runs of bits of a value in a block that is read as one number.
 
     Each run is (lowest bit in the block, mask, lowest bit of the value).
     """
@@ -557,7 +561,7 @@ def _find_bit_runs(
 
 
 def _make_bits_reader(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
-    """Return a reader of one part from the numbers of its blocks."""
+    """Return a function that extracts a value from blocks that were read as numbers."""
     low, mask, target = runs[0]
     if len(runs) > 1 or field.signed or field.flag or target:
         return functools.partial(_join_runs, field, runs)
@@ -600,9 +604,9 @@ def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContaine
 
 
 def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | LayoutRefusal | None:
-    """Return the layout that the header of this frame leads to.
+    """Return the layout of one frame, or the refusal of its header.
 
-    Returns None if the type is not compiled, or if the header is incomplete.
+    Returns None if the frame type cannot be compiled, or if the header is incomplete.
     """
     layouts = frame_layouts(sensor.frames[name])
     if isinstance(layouts, NotCompilableError):
@@ -613,7 +617,7 @@ def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Lay
 def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
     """Return a sort key that is higher if the fault is later in the frame.
 
-    It is highest for a complete frame with trailing bytes, or with only a wrong checksum.
+    The key is highest for a complete frame with trailing bytes, or with a wrong checksum only.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset

@@ -1,11 +1,11 @@
-"""Find the parts of many frames at once. Parts are frames within a frame.
+"""Find the parts of many frames (frames within a frame) at once.
 
-The offset of a part is known when the size of the part before it is known. So the search runs in
-rounds. Each round finds the next part of every frame: its kind, from its constants; its layout,
-from its header; and whether another part follows.
+The offset of a part is known when the size of the previous part is known. The search therefore runs
+in rounds, and each round finds the next part of every frame. The kind of a part is found by its
+constants, and its layout by its header.
 
-The results are offsets in a buffer, as for frames. So parts have layouts, rows and tables like
-frames (`frame_table.Table.parts`).
+The results are offsets in a buffer, as for frames. Parts therefore have layouts, rows and tables as
+frames do (`frame_table.Table.parts`).
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from lidarspec.spec import tree
 
 Offsets = NDArray[np.intp]
 
-#: status of a frame: all parts were found.
+#: The status of a frame if all parts were found.
 FOUND = 0
-#: status of a frame: its bytes end before its last part does.
+#: The status of a frame if its bytes end before the end of its last part.
 CUT_OFF = 1
-#: status of a frame: a part has an impossible length.
+#: The status of a frame if a part has an invalid length.
 LENGTH = 2
-#: status of a frame: a part matches the constants of no kind.
+#: The status of a frame if the constants of a part match no kind of parts.
 CONSTANT = 3
-#: status of a frame: an expression of a plugin failed.
+#: The status of a frame if an expression of a plugin failed.
 FAILED = 4
 
-#: announced size of a part if no field outside the part declares it.
+#: The announced size of a part if no field outside the part declares it.
 ANY = -1
 
 
 class LayoutLookup(Protocol):
-    """Lookup of the layouts of a frame type or of a kind of parts.
+    """Returns the layouts of a frame type or of a kind of parts.
 
     `HeaderTree` implements it.
     """
@@ -70,11 +70,11 @@ class LayoutLookup(Protocol):
                 buffer.
 
         Returns:
-            Each layout, or reason for refusal, with the indices of its candidates.
+            Pairs of a layout or refusal and the indices of its candidates.
         """
 
     def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
-        """Return the layout for the values of the header fields that `read` returns."""
+        """Return the layout for the values of header fields, which `read` returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,9 @@ class PartKind:
     """A kind of parts.
 
     Attributes:
-        node: its fields, and the formula for the size of the part after it.
-        layouts: its layouts.
-        prefix: the constants that all its parts begin with: offset -> (mask, value).
+        node: the kind in the frame tree.
+        layouts: the layouts of its parts.
+        prefix: the constants that all parts of this kind begin with, as (mask, value) by offset.
     """
 
     node: tree.Kind
@@ -98,7 +98,7 @@ class PartKind:
 
     @cached_property
     def is_checked(self) -> bool:
-        """Whether it has a checksum or conditions, also in parts within it."""
+        """Whether its parts have checksums or conditions, or contain parts that have some."""
         return any(
             isinstance(node, tree.Sealed | tree.Check)
             or any(info.allowed for info in tree.infos(node))
@@ -124,9 +124,9 @@ class PartRule:
     """The values of the formulas of a `tree.PartSequence` for one header.
 
     Attributes:
-        count: the number of parts.
-        size: the bytes of the first part.
-        within: the bytes of all parts.
+        count: the number of parts, or None.
+        size: the size of the first part in bytes, or None.
+        within: the total size of all parts in bytes, or None.
     """
 
     count: int | None = None
@@ -139,9 +139,9 @@ class PartRound:
     """Parts of one layout that were found in one round.
 
     Attributes:
-        kind: the index of their kind.
-        owners: the indices of the frames that contain them.
-        offsets: their offsets in the buffer.
+        kind: the index of the kind of the parts.
+        owners: the indices of the frames that contain the parts.
+        offsets: the offsets of the parts in the buffer.
     """
 
     kind: int
@@ -156,9 +156,9 @@ class FoundParts:
 
     Attributes:
         status: `FOUND`, or the reason why not all parts were found, (n,).
-        sizes: the bytes of the parts found in each frame, (n,).
-        rounds: the parts found in each round.
-        errors: errors of plugin expressions.
+        sizes: the total size of the parts that were found in each frame, in bytes, (n,).
+        rounds: the parts that were found in each round.
+        errors: the errors of plugin expressions.
     """
 
     status: NDArray[np.uint8]
@@ -175,10 +175,10 @@ class Region:
         node: the parts in the frame tree.
         kinds: the kinds of parts, in the order in which they are tried.
         start: the offset of the first part.
-        rule: determines the last part.
+        rule: the rule that determines the last part.
         limit: the maximum size of a frame, in bytes.
-        given: values of the fields of the outer frame that formulas of the parts use.
-        size: the bytes of all parts; None if they are not measured yet.
+        given: the values of fields of the outer frame that formulas of the parts use.
+        size: the total size of all parts in bytes; None if it is not known yet.
     """
 
     node: tree.PartSequence
@@ -193,20 +193,20 @@ class Region:
     def is_measured(self) -> bool:
         """Whether the layout was chosen by the measured size of its parts.
 
-        Then all frames of this layout have these parts. Their checksums and conditions may still
-        fail.
+        If so, all frames of this layout have complete parts, but checksums and conditions of the
+        parts may still be wrong.
         """
         return self.rule.within is None
 
     @property
     def has_checks(self) -> bool:
-        """Whether any part has a checksum or conditions of its own."""
+        """Whether any part has checksums or conditions."""
         return any(kind.is_checked for kind in self.kinds)
 
     def walk(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> FoundParts:
-        """Return the parts of the frames at these offsets.
+        """Find the parts of the frames at these offsets.
 
         Args:
             stops: the offset after the last byte of each frame; by default the end of the buffer.
@@ -214,7 +214,7 @@ class Region:
         return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
-        """Return a buffer with whole frames, given as rows of bytes, and their parts."""
+        """Find the parts of frames given as rows of bytes; return a buffer and the parts in it."""
         return view_span(rows), self.walk(view_span(rows), np.arange(len(rows)) * rows.strides[0])
 
     def sound(self, frame: bytes) -> bool:
@@ -292,8 +292,8 @@ class _PartWalk:
     def _find_next_parts(self, active: Offsets) -> list[PartRound]:
         """Find the next part of each frame.
 
-        Its kind is the first one with matching constants. In a truncated part, the constants are
-        compared up to its end.
+        The kind of a part is the first kind with matching constants. In a truncated part, only the
+        available bytes are compared.
         """
         pieces = list[PartRound]()
         for number, kind in enumerate(self._region.kinds):
@@ -341,7 +341,7 @@ class _PartWalk:
     def _match_constants(
         self, which: Offsets, constants: tuple[Word, ...]
     ) -> NDArray[np.bool_] | None:
-        """Return in which frames the next part has these constants; None if in all."""
+        """Return whether the next part of each frame has these constants; None if all have."""
         if constants:
             return match_constants_at(
                 self._buffer, self._ends[which], constants, self._stops_of(which)
@@ -360,7 +360,7 @@ class _PartWalk:
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
         """Return the frames in which the next part declares its sizes correctly.
 
-        Sets the status of the others.
+        This sets the status of all other frames.
         """
         if not layout.held:
             return which
@@ -373,7 +373,7 @@ class _PartWalk:
     def _check_bounds(self, layout: Layout, which: Offsets) -> Offsets:
         """Return the frames in which the next part is complete and has the announced size.
 
-        Sets the status of the others.
+        This sets the status of all other frames.
         """
         ends = self._ends[which] + layout.size
         announced = self._announced[which]
@@ -389,7 +389,7 @@ class _PartWalk:
         return which
 
     def _advance(self, kind: PartKind, layout: Layout, which: Offsets) -> None:
-        """Move to the end of the parts of one layout, and read the size of the next part."""
+        """Move to the end of parts that have one layout, and read the size of the next part."""
         formula = kind.node.following
         offsets = self._ends[which]
         self._ends[which] = offsets + layout.size
@@ -406,7 +406,7 @@ class _PartWalk:
         self._status[which[announced < 0]] = LENGTH
 
     def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, offset: int) -> int:
-        """Return the value of a formula in one part; -1 if it fails."""
+        """Return the value of a formula in one part; -1 if the formula raises an error."""
         part = self._buffer[offset : offset + layout.size].tobytes()
 
         def read(path: str) -> int | None:
@@ -430,9 +430,9 @@ def match_constants_at(
     constants: tuple[Word, ...],
     stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
-    """Return which candidates have the right constants, (n,); None if all have them.
+    """Return whether each candidate has some constants, (n,); None if all have them.
 
-    In a truncated candidate, the constants are compared up to its end.
+    In a truncated candidate, only the available bytes are compared.
 
     Args:
         offsets: the offsets of the candidates.
@@ -461,7 +461,7 @@ def match_constants_at(
 
 
 def _is_start_of(data: bytes, word: Word) -> bool:
-    """Return whether the bytes are the beginning of a constant."""
+    """Return whether bytes match the first bytes of a constant."""
     mask, value = word[2:]
     every = (1 << 8 * len(data)) - 1
     return (
@@ -472,9 +472,9 @@ def _is_start_of(data: bytes, word: Word) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PartsSize:
-    """The size of all parts of a region, in the form of a header field.
+    """The total size of the parts of a region, with the methods of a header field.
 
-    A layout is chosen by the values of header fields, and by this size.
+    The layout of a frame depends on header fields and on this size.
     """
 
     info: tree.FieldInfo
@@ -485,7 +485,7 @@ class PartsSize:
     ) -> tuple[Offsets | None, NDArray[Any]]:
         """Return sizes as `Leaf.read` does.
 
-        For parts that cannot be a frame, the size is the negative status.
+        If the parts cannot be valid, the size is the negative status.
         """
         walked = self.region.walk(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))

@@ -1,8 +1,8 @@
 """Parse and build frames that have no layout, with construct, one at a time.
 
-These are frames with a part that no formula of header fields can locate: a text up to a terminator,
-a Python function that branches on values, parts without a declared length. `lidarspec show` names
-the part and the reason.
+A frame has no layout if the offset of a part is not a formula of header fields. Examples are a part
+after a text with a terminator, and a length that is a Python function with branches. `lidarspec
+show` prints the part and the reason.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import MismatchError, field_path, leaves, remove_private
 from lidarspec.spec.tree import FieldInfo
 
-#: maximum number of builds of one frame until its lengths no longer change.
+#: The maximum number of times that a frame is built until its lengths no longer change.
 MAX_BUILDS = 4
 
 
@@ -41,7 +41,8 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     """Return the bytes of a frame.
 
-    The values of length fields are only known after a build, so the frame is built again with them.
+    The values of length fields are known only after the frame was built, so it is built again with
+    them.
 
     Raises:
         UsageError: for values that construct does not accept.
@@ -73,7 +74,7 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
-    """Return the fields of the frame at the start of some bytes; None if it fails."""
+    """Return the fields of the frame at the start of some bytes; None if parsing fails."""
     try:
         values = frame.prepared.parse(data, _verify=False)
     except Exception:  # an expression of the struct may raise anything
@@ -114,8 +115,8 @@ def _iter_fields(
 def _has_spans(value: Any, start: int, end: int) -> bool:
     """Return whether a value is a struct with spans of its members in the frame.
 
-    If the bytes of the struct were converted first, the spans are in the converted bytes, and the
-    result is False.
+    False if the bytes of the struct were decoded first, because the spans are then offsets in the
+    decoded bytes.
     """
     if not isinstance(value, dict) or not value.get("_marks"):
         return False
@@ -124,7 +125,7 @@ def _has_spans(value: Any, start: int, end: int) -> bool:
 
 
 def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
-    """Return the first fault of bytes that are not a frame of this type.
+    """Return the first fault of bytes that are not a valid frame of this type.
 
     Raises:
         SpecError: if an expression of the struct fails.

@@ -1,31 +1,29 @@
 """Compute the checksums of many frames at once, given as rows of bytes.
 
-The results equal those of one call for each row.
-
 `compute_over_spans` and `compute_checksums` have fast methods for the algorithms of
-`lidarspec.spec.checksums`. For an algorithm of a plugin they call its `batch`.
-
-`load_words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight
+`lidarspec.spec.checksums`. For an algorithm of a plugin they call its method `batch`. `load_words`
+converts rows to columns of words of eight bytes, so that one call of NumPy processes the same eight
 bytes of every row.
 
-A CRC is linear: the register after a row is the XOR of the contributions of its bytes. To *advance*
-a byte by d is to compute its contribution d bytes later. `compute_registers` chooses one of four
-methods:
+A CRC is linear: the register after a row is the XOR of the contributions of its bytes. *Advancing*
+a byte by d means computing its contribution to the register d bytes later. `compute_registers`
+selects one of four methods:
 
-* `_compute_by_position`: for few and short rows. One table lookup for each byte; the table depends
-  on the position of the byte in the row.
-* `_compute_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
+* `_compute_by_position`: for few and short rows. There is one table lookup for each byte, in a
+  table for its position in the row.
+* `_compute_by_zlib`: for longer rows of the usual CRC-32, with one call of `zlib.crc32` for each
+  row.
 * `_compute_narrow`: for registers of at most one byte. The first half of each row is advanced to
   the second half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is
   left. For many rows, `_sum_words` first reduces each row to one word without tables.
-* `_compute_wide`: for all others. The register of all rows advances two bytes at a time, by a
-  table of 65,536 entries. Long rows are split into segments that are computed side by side and then
-  joined in pairs.
+* `_compute_wide`: for all other rows. The registers of all rows advance by two bytes at a time, by
+  a table of 65,536 entries. Long rows are split into segments that are computed side by side and
+  then joined in pairs.
 
-`_sum_words` uses that in GF(2) the eighth power of a polynomial p(x) is p(x**8). A byte advanced by
-eight is therefore the XOR of the same byte advanced by n, for each term x**n of the polynomial with
-n < 8. So each word is XORed onto some of eight sums, one for each n from 0 to 7, and these are
-advanced and combined.
+In GF(2), the eighth power of a polynomial p(x) is p(x**8). A byte advanced by eight is therefore
+the XOR of the same byte advanced by n, for each term x**n of the polynomial with n < 8.
+`_sum_words` uses this: it XORs each word onto some of eight sums, one for each n from 0 to 7, and
+then advances and combines the sums.
 
 The tables depend only on the polynomial and the distance. Registers are in wire order, see `Crc`.
 """
@@ -56,26 +54,27 @@ from lidarspec.spec.checksums import (
     byte_table,
 )
 
-#: below this number of bytes in all rows, a Python loop is faster than NumPy.
+#: For less than this number of bytes in all rows, a Python loop is faster than NumPy.
 LOOP_BYTES = 2048
-#: the same for registers of at most one byte.
+#: The limit for a Python loop if registers have at most one byte.
 NARROW_LOOP_BYTES = 256
-#: below this number of rows, one call for each row is faster (for checksums other than CRCs).
+#: For checksums that are not CRCs, one call for each row is faster below this number of rows.
 MIN_BATCH_ROWS = 4
-#: bytes of rows per block: small enough for the caches, large enough to hide NumPy's cost per call.
+#: The number of bytes of rows that are processed together. It is small enough for the caches, and
+#: large enough to make the cost of a call of NumPy negligible.
 BLOCK_BYTES = 1 << 20
-#: `_compute_by_position` is used up to this number of bytes in all rows, and ...
+#: `_compute_by_position` is used if all rows together have at most this number of bytes, ...
 MAX_TABLE_BYTES = 1 << 13
-#: ... up to this number of bytes in one row. Longer rows of the usual CRC-32 use zlib.
+#: ... and each row has at most this number of bytes. Longer rows of the usual CRC-32 use zlib.
 MAX_TABLE_ROW_BYTES = 1 << 7
-#: from this number of rows on, `_sum_words` is faster than tables.
+#: From this number of rows on, `_sum_words` is faster than tables.
 MIN_SUM_ROWS = 1024
 
-#: width, polynomial and reflection of the CRC-32 that `zlib` computes. On rows that are not short,
-#: one call for each row is several times as fast as NumPy.
+#: The width, polynomial and reflection of the CRC-32 that `zlib` computes. For long rows, one call
+#: for each row is several times as fast as NumPy.
 ZLIB_CRC = (32, 0x04C11DB7, True)
 
-#: ranges of bytes in a row: (offset of the first byte, offset after the last byte) of each.
+#: Ranges of bytes in a row, each as (offset of the first byte, offset after the last byte).
 Spans = tuple[tuple[int, int], ...]
 
 _BYTE = np.uint64(0xFF)
@@ -83,18 +82,15 @@ _BYTE_BITS = np.uint64(8)
 
 
 def compute_checksums(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
-    """Return the checksum of each row, (n,), for rows of equal length, (n, m).
+    """Return the checksum of each row, (n,), given rows of equal length, (n, m).
 
-    The rows may be contiguous or not.
+    The rows need not be contiguous.
     """
     return compute_over_spans(algorithm, rows, ((0, rows.shape[1]),))
 
 
 def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    """Return the checksum of the spans of each row, (n,).
-
-    The bytes of the spans are concatenated.
-    """
+    """Return the checksum of the concatenated spans of each row, (n,)."""
     values = _METHODS.get(type(algorithm))
     if values is None or _are_few(algorithm, rows, spans):
         return algorithm.batch(gather_spans(rows, spans))
@@ -136,7 +132,7 @@ def finalize(algorithm: Crc, left: NDArray[Any]) -> Values:
     """Return the checksums for the final registers, (n,), uint64.
 
     Args:
-        left: the registers after all bytes, (n,), in the smallest unsigned dtype that holds them.
+        left: the registers after all bytes, (n,), in the smallest possible unsigned dtype.
     """
     if not algorithm.refin:
         left = left.byteswap() >> 8 * left.itemsize - algorithm.width
@@ -172,9 +168,9 @@ def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans)
 def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return masks of the low and high bytes in `number` words of `load_words`.
+    """Return masks of the low and the high bytes in `number` words of `load_words`.
 
-    Words with equal masks are grouped: their indices, and (low, high).
+    Each item has the indices of words with equal masks, and their masks (low, high).
     """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
@@ -232,8 +228,8 @@ def load_words(
     The rows are padded with zeros.
 
     Args:
-        spans: the spans of each row to load, concatenated; by default the whole row.
-        zeros_first: True pads before the first byte, False after the last.
+        spans: the spans of each row to concatenate and load; by default the whole row.
+        zeros_first: True to pad before the first byte, False to pad after the last byte.
     """
     spans = spans or ((0, rows.shape[1]),)
     if rows.shape[1] < 8 or rows.strides[1] != 1:
@@ -267,8 +263,8 @@ def _plan_words(
 
     Returns:
         The number of words; the runs of whole words, as (first word, number of words, offset in the
-        row); and the parts of words, as (word, offset of the eight bytes that hold the part, right
-        shift, mask or None, left shift), in the order of these operations.
+        row); and the parts of words, as (word, offset of the eight bytes that contain the part,
+        right shift, mask or None, left shift), in the order of these operations.
     """
     total = _count_bytes(spans)
     number = -(-total // 8)
@@ -311,7 +307,7 @@ def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.u
 def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Return the XOR of the eight bytes of each word, (n,).
 
-    The result overwrites `total`.
+    `total` is overwritten.
     """
     part = np.empty_like(total)
     for bits in (32, 16, 8):
@@ -336,7 +332,7 @@ def compute_registers(
 ) -> NDArray[Any]:
     """Return the register after the spans of each row, (n,).
 
-    The dtype is the smallest integer that holds the register.
+    The dtype is the smallest integer type for the register.
     """
     length = _count_bytes(spans)
     if 0 < length <= MAX_TABLE_ROW_BYTES and len(rows) * length <= MAX_TABLE_BYTES:
@@ -357,9 +353,9 @@ def gather_spans(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
 
 
 def _compute_by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
-    """Return `compute_registers` of CRC-32 by `zlib`, row by row.
+    """Return `compute_registers` of CRC-32, computed by `zlib` row by row.
 
-    zlib starts from the inverted register and ends with it inverted.
+    zlib inverts the register at the start and at the end.
     """
     if rows.strides[1] != 1:
         rows = np.ascontiguousarray(rows)
@@ -379,7 +375,7 @@ def _compute_by_position(
 ) -> NDArray[Any]:
     """Return `compute_registers` of a few short rows, by a table for each position.
 
-    The result is the XOR of the final contributions of all bytes.
+    The result is the XOR of the contributions of all bytes to the final register.
     """
     table, firsts, begun = make_place_tables(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(
@@ -416,7 +412,7 @@ def make_place_tables(
 def _compute_narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
-    """Return `compute_registers` of at most one byte, as uint8."""
+    """Return `compute_registers` of registers of at most one byte, as uint8."""
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)
@@ -444,9 +440,9 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return one word of each row that gives the same register, (n,).
+    """Return one word for each row that has the same register as the row, (n,).
 
-    `poly` has eight bits.
+    The polynomial `poly` must have eight bits.
     """
     shares = _assign_sums(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
@@ -466,9 +462,9 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word the sums of `_sum_words` that it is XORed onto.
+    """Return for each word the sums of `_sum_words` that the word is XORed onto.
 
-    Bit n of a value is set for the sum that is advanced by n bytes, n from 0 to 7.
+    Bit n of a value stands for the sum that is advanced by n bytes, for n from 0 to 7.
     """
     found = [1]
     while len(found) < number:
@@ -510,9 +506,9 @@ def _compute_wide(
 
 @lru_cache(maxsize=1024)
 def _make_advance_table(distance: int, width: int, poly: int, refin: bool) -> bytes:
-    """Return the table, 256 bytes, that advances a byte by `distance` bytes.
+    """Return the table of 256 bytes that advances a byte by `distance` bytes.
 
-    The register has at most one byte.
+    The register must have at most one byte.
     """
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
@@ -540,7 +536,7 @@ def _make_word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
 def _make_jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """Return the register after 2**power zero bytes, (bytes, 256).
 
-    The axes are the position and the value of each byte of the register.
+    The axes are the position and the value of a byte of the register.
     """
     if power:
         half = _make_jump_table(power - 1, width, poly, refin)

@@ -1,4 +1,4 @@
-"""List the fields of a frame type from its tree, without any bytes."""
+"""List the fields of a frame type from its tree."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lidarspec.spec.tree import (
     refs,
 )
 
-#: the index of an array element in a path: "columns[0].timestamp".
+#: The index of an array element in a path, such as "columns[0].timestamp".
 _INDEX = re.compile(r"\[(-?\d+)\]")
 
 _Field = TypeVar("_Field")
@@ -43,7 +43,7 @@ _Field = TypeVar("_Field")
 def without_indices(path: str) -> tuple[str, dict[str, int]]:
     """Return a path without its indices, and the indices by the path of their array.
 
-    For "a[0].b" the result is "a.b", {"a": 0}.
+    For "a[0].b" the result is ("a.b", {"a": 0}).
     """
     names = ""
     indices = dict[str, int]()
@@ -61,9 +61,10 @@ class PathMapping(dict[str, _Field]):
     The path of an element has an index: "columns[0].timestamp".
 
     Args:
-        values: by the paths of the fields.
-        element: returns the value of an element, None if it does not exist. The arguments are the
-            value of the field, the path of the element, and the indices by the path of the array.
+        values: the values by the paths of the fields.
+        element: a function that returns the value of an element, or None if it does not exist. Its
+            arguments are the value of the field, the path of the element, and the indices by the
+            path of the array.
     """
 
     def __init__(
@@ -99,15 +100,15 @@ class PathMapping(dict[str, _Field]):
 
 @dataclass(frozen=True, eq=False)
 class Schema:
-    """All fields of a frame type and their arrays, in the order of the wire.
+    """All fields of a frame type and their arrays, in wire order.
 
     Attributes:
         fields: the fields, by path.
-        arrays: the declared length of each array, by path. It is a number if it is the same in all
-            frames, else a formula of header fields, or None.
-        parts: the parts (frames within the frame), by path. They are tables of their own.
-        inside: the fields of the parts, by path from the frame.
-        derived: values without bytes of their own, by path.
+        arrays: the declared length of each array, by path: a number if all frames have the same
+            length, else a formula of header fields, or None if only construct can determine it.
+        parts: the parts (frames within the frame), by path.
+        inside: the fields of the parts, by their path in the frame.
+        derived: the values without bytes of their own, by path.
     """
 
     fields: Mapping[str, FieldInfo]
@@ -115,12 +116,12 @@ class Schema:
     parts: Mapping[str, PartSequence] = field(default_factory=dict)
     inside: Mapping[str, FieldInfo] = field(default_factory=dict)
     derived: Mapping[str, FieldInfo] = field(default_factory=dict)
-    #: arrays with different formulas for the length in different branches.
+    #: The arrays whose length has different formulas in different branches.
     branched: frozenset[str] = frozenset()
 
     @cached_property
     def columns(self) -> Mapping[str, FieldInfo]:
-        """The fields after their adapters, and the derived values, by path."""
+        """The columns of a table by path: decoded fields and derived values."""
         every = {**self.fields, **self.derived}
         adapted = {
             path: _adapt(info)
@@ -140,9 +141,9 @@ class Schema:
 
     @cached_property
     def counting_fields(self) -> Mapping[str, str | None]:
-        """The field that gives the length of each array, by the path of the array.
+        """The field that contains the length of each array, by the path of the array.
 
-        It is None if no single field gives it.
+        The value is None if there is no such field.
         """
         return {
             axis: None if count is None else counting_field(count, self.fields)
@@ -151,7 +152,7 @@ class Schema:
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
-        """The axes of the deepest nesting of arrays; of equally deep ones, the first."""
+        """The axes of the deepest nested arrays, or of the first of several."""
         return max(
             (info.axes for info in self.fields.values() if info.kind != "bytes"),
             key=len,
@@ -162,7 +163,7 @@ class Schema:
     def scan_names(self) -> Mapping[str, FieldInfo]:
         """The fields of the frame and its parts, by the names that scans and clocks use.
 
-        A field of a kind follows the name of the kind: "tags.points.angle".
+        The path of a field in a part includes the name of the kind of part: "tags.points.angle".
         """
         names = dict(self.fields)
         for axis, node in self.parts.items():
@@ -175,12 +176,12 @@ class Schema:
         return names
 
     def within(self, path: str) -> tuple[str, str, str] | None:
-        """Return the axis, the kind and the remaining path of a path into parts.
+        """Split a path that leads into parts into axis, kind and remaining path.
 
         Returns None if the path does not lead into parts.
 
         Raises:
-            UnknownField: if the parts have several kinds and the path names none of them.
+            UnknownField: if there are several kinds of parts and the path has no name of a kind.
         """
         for axis, node in self.parts.items():
             if path == axis or path.startswith(f"{axis}."):
@@ -196,7 +197,7 @@ class Schema:
 
     @cached_property
     def places(self) -> Mapping[str, int]:
-        """The number of arrays around each array, by its path."""
+        """The number of arrays that contain each array, by its path."""
         return {
             axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)
         }
@@ -226,12 +227,12 @@ class Schema:
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:
-        """Return the number of arrays in the deepest nesting."""
+        """Return the number of the deepest nested arrays."""
         return len(self.chain)
 
 
 def _adapt(info: FieldInfo) -> FieldInfo:
-    """Return a field with the type of the values that its adapter returns."""
+    """Return a field with the type of its decoded values."""
     assert info.adapter is not None
     dtype = info.adapter.dtype
     kinds = {"i": "int", "f": "float"}
@@ -246,7 +247,7 @@ def _adapt(info: FieldInfo) -> FieldInfo:
 
 
 def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
-    """Return the path of the field that gives a count or length; None if none does."""
+    """Return the path of the first field in the formula of a count; None without one."""
     asked = refs(formula)
     return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
 
@@ -306,7 +307,7 @@ def _make_element(
 ) -> FieldInfo | None:
     """Return an element of a field as a field; None if no frame has it.
 
-    The element is optional if the header determines the number of elements.
+    The element is optional if the number of elements varies.
     """
     element = get_element(info, path, indices)
     counts = [(arrays.get(axis), index) for axis, index in indices.items()]
@@ -399,7 +400,7 @@ def _add_count(
 
 
 def _merge_fields(first: FieldInfo, other: FieldInfo) -> FieldInfo:
-    """Return one field for a field that several branches declare."""
+    """Merge the declarations of a field in two branches into one field."""
     kinds = {first.kind, other.kind}
     if (
         first.axes != other.axes

@@ -1,8 +1,9 @@
-"""Convert frames between their bytes on the wire and the bytes of their structs.
+"""Convert between encoded frames and the bytes of their structs.
 
-Most frames are the bytes of their struct (`Coder`). A frame type with a wire form
-(`lidarspec.spec.wire_forms`) has a `FormCoder`. It gives the form the fields that follow, from the
-layouts of the struct, and describes the fault of bytes that are not a frame of the form.
+Most frames are sent as the bytes of their struct (`Coder`). A frame type with a wire form
+(`lidarspec.spec.wire_forms`) has a `FormCoder`. It passes the next fields to the wire form, which
+it knows from the layouts of the struct, and describes the fault of bytes that are not a valid
+frame.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ MAX_SHOWN_BYTES = 12
 
 
 class _Undecoded(Decoded):
-    """The bytes of a frame that equal the bytes of its struct."""
+    """The decoded bytes of a frame that is sent as the bytes of its struct."""
 
     @property
     def offsets(self) -> list[int]:
@@ -50,7 +51,7 @@ class _Undecoded(Decoded):
 
 
 class Coder:
-    """Coder of frames that are sent as the bytes of their struct.
+    """Encodes and decodes frames that are sent as the bytes of their struct.
 
     Attributes:
         begins: the bytes that all frames begin with.
@@ -63,24 +64,24 @@ class Coder:
         )
 
     def decode(self, data: bytes) -> Decoded:
-        """Return the bytes of the struct of one frame, as far as it can be decoded."""
+        """Decode one frame up to the first error."""
         return _Undecoded(data, (), len(data))
 
     def encode(self, struct: bytes, spelling: object = None) -> bytes | None:
         """Return the frame for the bytes of a struct.
 
         Args:
-            spelling: a frame that is returned instead if it encodes the same struct.
+            spelling: another encoded frame, which is returned if it has the same struct.
 
         Returns:
-            None if the wire form cannot encode one of the values.
+            The encoded frame; None if the wire form cannot encode one of the values.
         """
         return struct
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
-        """Return parsed values; they keep a frame that `encode` cannot restore.
+        """Return parsed values; add the original frame if `encode` cannot restore it.
 
-        The original frame is added under the name `SPELLING`.
+        It is added under the name `SPELLING`.
         """
         return values
 
@@ -92,11 +93,11 @@ class Coder:
         return None
 
     def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
-        """Change random structs, given as rows of bytes, so that each can be encoded."""
+        """Change random structs, given as rows of bytes, so that they can be encoded."""
 
 
 class _FieldFinder:
-    """Finds the fields that follow the first bytes of a struct, while it grows."""
+    """Finds the next fields of a struct, given the first bytes that were decoded so far."""
 
     def __init__(self, tree: HeaderTree) -> None:
         self._tree = tree
@@ -114,7 +115,7 @@ class _FieldFinder:
 
 
 def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
-    """Return the fields that a header leads to, and the end of the last in the struct."""
+    """Return the fields that follow from a header, and the offset after the last one."""
     if isinstance(node.result, Layout):
         return tuple(node.result.leaves.values()), node.result.size
     if isinstance(node.leaf, Leaf):
@@ -123,13 +124,12 @@ def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
 
 
 class FormCoder(Coder):
-    """Coder of frames with a wire form.
+    """Encodes and decodes frames with a wire form.
 
     Attributes:
-        form: the form.
+        form: the wire form.
         tree: the layouts of the struct.
-        prefix: the bytes that all frames have at the same offsets: the texts before the first
-            number.
+        prefix: the bytes before the first number that are the same in all frames, by offset.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
@@ -171,7 +171,10 @@ class FormCoder(Coder):
         return replace(decoded, problem=self._problem(data, size, decoded))
 
     def decode_whole(self, data: bytes) -> Decoded:
-        """Decode a frame of exactly these bytes, without a reason text in its problem."""
+        """Decode a frame that consists of exactly these bytes.
+
+        The problem of the result may have no reason.
+        """
         return self.form.decode(data, _FieldFinder(self.tree))
 
     def find_size(self, data: bytes) -> int | None:
@@ -181,7 +184,7 @@ class FormCoder(Coder):
         return None
 
     def refusal(self, struct: bytes) -> LayoutRefusal | None:
-        """Return why a struct has no layout; None if its header may lead to one."""
+        """Return the refusal of a struct without a layout; None if it may have a layout."""
         result = self.tree.header(struct).result
         if isinstance(result, LayoutRefusal):
             return result
@@ -224,7 +227,7 @@ class FormCoder(Coder):
                 part[:] = part % 26 + ord("A")
 
     def _problem(self, data: bytes, size: int, decoded: Decoded) -> Problem | None:
-        """Return the fault of bytes that should be one frame; None if they are valid."""
+        """Return the first error in bytes that should be one frame; None if they are valid."""
         begins = self.begins
         if not data or not data.startswith(begins):
             got = data[: len(begins)]
@@ -258,7 +261,7 @@ class FormCoder(Coder):
 
 
 def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:
-    """Return path, offset and expected value of the field at an offset of the struct.
+    """Return path, offset and expected type of the field at an offset of the struct.
 
     Args:
         end: the size of the struct.
@@ -290,7 +293,7 @@ def frame_coder(frame: Frame) -> Coder:
 
 
 def list_runs(layout: Layout) -> Sequence[Run]:
-    """Return the runs of fields in the structs of a layout."""
+    """Return the runs of fields in a struct with this layout."""
     return list_runs_between(tuple(layout.leaves.values()), 0, layout.size)
 
 
@@ -298,7 +301,7 @@ def list_runs(layout: Layout) -> Sequence[Run]:
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
     """Return the runs of fields between two offsets of a struct.
 
-    Bytes between fields, for example constants without a name, are text.
+    Bytes between fields, such as constants without a name, are a text field.
     """
     offsets, owners = _locate_elements(leaves)
     inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))
@@ -334,7 +337,7 @@ def _number_types(
 ) -> tuple[NDArray[np.intp], NDArray[np.str_], NDArray[np.bool_]]:
     """Return the size, kind and byte order of one element of each field.
 
-    The size is in bytes. The kind is "S" for bytes. A block of bits is one number.
+    The size is in bytes. The kind is "S" for bytes. A bit block is one number.
     """
     kinds = list[str]()
     is_little = list[bool]()
@@ -361,7 +364,7 @@ def _number_types(
 def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the offset of each element of all fields, and the index of its field.
 
-    The offsets are ascending. For the fields of a bit block, it is the index of the first.
+    The offsets are ascending. All fields of a bit block have the index of the first of them.
     """
     offsets = [np.zeros(0, np.intp)]
     owners = [np.zeros(0, np.intp)]
@@ -387,6 +390,6 @@ def _join_bytes(bytes_by_offset: dict[int, int]) -> bytes:
 
 
 def _limit_values(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Reduce values modulo, so that each is at most its largest value."""
+    """Return values modulo their largest value plus 1."""
     count = largest + np.uint64(1)  # wraps to 0 if all values of eight bytes are allowed
     return np.where(count == 0, values, values % np.maximum(count, 1))

@@ -1,7 +1,7 @@
 """Find the fields of one frame with their offsets, even if it is invalid or truncated.
 
-`examine` finds the layout of the bytes, or the beginning of it if the bytes end early.
-`ExaminedFrame.fields` walks through the frame tree with this layout. Errors
+`examine` finds the layout of the bytes, or as much of it as truncated bytes determine.
+`ExaminedFrame.fields` iterates over the frame tree with this layout. Errors
 (`lidarspec.frames.diagnose`) and explanations use both.
 """
 
@@ -23,15 +23,17 @@ from lidarspec.spec.bits import BitField
 
 @dataclass(frozen=True)
 class WireField:
-    """A value on the wire.
+    """A field in the bytes of a frame, or one element of a field in an array.
 
     Attributes:
-        path: the path, with indices: "points[1].intensity".
-        block: the path of the bit block that contains it, with indices; for others its own path.
-        info: the field. For a constant without a name, its path is empty.
-        start, end: the range of its bytes in the frame, or of the bytes of its bit block.
-        bits: its bits in the block; None for a field that is not in a bit block.
-        raw: the value; None if it is truncated.
+        path: the path with indices, such as "points[1].intensity".
+        block: the path of the bit block that contains the field, with indices; the path of the
+            field if it is not in a bit block.
+        info: the description of the field. For a constant without a name, its path is empty.
+        start: the offset of the first byte of the field, or of its bit block.
+        end: the offset after the last byte of the field, or of its bit block.
+        bits: the bits of the field in the block; None if the field is not in a bit block.
+        raw: the raw value; None if it is truncated.
     """
 
     path: str
@@ -54,7 +56,7 @@ class WireField:
 class PlacedSeal:
     """A checksum in the bytes of a frame.
 
-    `prefix` is the path of the part that contains it; "" for the frame.
+    `prefix` is the path of the part that contains the checksum; "" if it is not in a part.
     """
 
     seal: Seal
@@ -65,28 +67,28 @@ class PlacedSeal:
 
     @property
     def path(self) -> str:
-        """The path of the first field that holds the checksum."""
+        """The path of the first field with the checksum."""
         return f"{self.prefix}.{self.seal.leaves[0].info.path}".strip(".")
 
     @property
     def offset(self) -> int:
-        """The offset of the first byte of that field."""
+        """The offset of the first byte of the first field with the checksum."""
         return self.start + self.seal.leaves[0].byte_span[0]
 
     @property
     def end(self) -> int:
-        """The offset after the last byte of the struct of the checksum."""
+        """The offset after the last byte of the struct with the checksum."""
         return self.start + self.seal.end
 
     @property
     def is_right(self) -> bool:
-        """Whether the stored checksum is correct, or means "not filled"."""
+        """Whether the stored checksum is correct, or means that none was computed."""
         return self.stored == self.computed or self.stored in self.seal.absent
 
 
 @dataclass(frozen=True)
 class ExaminedParts:
-    """The parts of a frame at a path. The last one is invalid unless `is_whole`."""
+    """The parts of a frame at a path; the last part is invalid unless `is_whole`."""
 
     parts: list[ExaminedFrame]
     is_whole: bool
@@ -99,10 +101,10 @@ class ExaminedFrame:
     Attributes:
         root: the tree of the frame type.
         data: the bytes.
-        known: the layout; if `failure` is set, the walk with the layout up to the failure.
-        failure: the error that ended the walk: `UnknownSelectorError` if the bytes end early,
-            `TooLongError`, `UnknownPartError`, or an error of an expression. None for a complete
-            layout.
+        known: the layout, or the `HeaderWalk` with the layout up to the error in `failure`.
+        failure: the error because of which there is no layout: `UnknownSelectorError` if the bytes
+            are truncated, `TooLongError`, `UnknownPartError`, or an error of an expression. None if
+            there is a layout.
         start: the offset of a part in the frame; 0 for a frame.
         prefix: the path of a part in the frame; "" for a frame.
         is_bounded: for a part, whether the frame has bytes after its parts.
@@ -126,15 +128,15 @@ class ExaminedFrame:
         return None
 
     def fields(self) -> Iterator[WireField]:
-        """Yield the fields in the order of the wire.
+        """Yield the fields in wire order.
 
-        The last field may be truncated: its `raw` is None.
+        If the last field is truncated, its `raw` is None.
         """
         cursor = _Cursor(self)
         yield from cursor.visit(self.root, "", self.prefix)
 
     def seals(self) -> Iterator[PlacedSeal]:
-        """Yield the checksums, inner ones first, of structs with complete bytes."""
+        """Yield the checksums whose structs are complete, inner ones first."""
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
         for seal in self.known.seals:
             if seal.end <= len(self.data):
@@ -186,8 +188,10 @@ def examine(
 
     Args:
         limit: the maximum size of a frame, in bytes.
-        given: for a part, values of fields of the outer frame, by their path there.
-        start, prefix, is_bounded: for a part, as in `ExaminedFrame`.
+        given: for a part, the values of fields of the outer frame, by their path in it.
+        start: for a part, its offset in the frame.
+        prefix: for a part, its path in the frame.
+        is_bounded: for a part, whether the frame has bytes after its parts.
     """
 
     def read(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
@@ -252,7 +256,7 @@ def _examine_part(
 
 
 def _choose_kind(region: Region, data: bytes) -> PartKind:
-    """Return the kind of part with a matching beginning, else the last kind."""
+    """Return the first kind of parts with matching constants, else the last kind."""
     for kind in region.kinds:
         known = [
             data[offset] & mask == value
@@ -265,7 +269,7 @@ def _choose_kind(region: Region, data: bytes) -> PartKind:
 
 
 class _Cursor:
-    """A walk through the fields of one frame."""
+    """Iterates over the fields of one frame."""
 
     def __init__(self, examined: ExaminedFrame) -> None:
         self._examined = examined
@@ -279,7 +283,8 @@ class _Cursor:
         """Yield the fields of a node.
 
         Args:
-            path, shown: the path of the node, without and with indices.
+            path: the path of the node without indices.
+            shown: the path of the node with indices.
         """
         if self._is_over:
             return
@@ -362,7 +367,7 @@ class _Cursor:
         return WireField(shown, shown, info, start, start + size, None, raw)
 
     def _take(self, size: int) -> bytes | None:
-        """Return the next bytes and move behind them; None if they are incomplete."""
+        """Return the next bytes and move to their end; None if they are not complete."""
         end = self._offset + size
         if end > len(self._data):
             self._is_over = True

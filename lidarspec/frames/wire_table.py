@@ -1,9 +1,9 @@
 """Make the wire table of a frame type: offset, size and meaning of each field.
 
-It is made from the tree, without the bytes of a frame. So a value that depends on the header is a
-formula of header fields ("10 + 3*i"), and a part that only some headers have is marked with its
-condition. `extent` returns the size of any part in this form. Exports and explanations use the same
-texts for fields, bits and formulas.
+The table is made from the tree, without the bytes of a frame. An offset or size that depends on
+header fields is therefore a formula ("10 + 3*i"), and a part that only some frames have is marked
+with its condition. `extent` returns the size of any part in this form. Exports and explanations use
+the same texts for fields, bits and formulas.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ class WireRow:
     Attributes:
         offset: the offset of the first byte in the frame, as a number or a formula of header fields
             and indices.
-        size: in bytes, as a number or a formula of header fields; "7 bits" for a part of a block.
-        type: "uint16 le", "bytes", or the bits of a part of a block, the most significant first.
-        field: the path, with names of indices for array elements: "points[i].distance".
-        unit: unit and scale: "0.01 deg".
-        meaning: the text of the spec, the constant, labels, checksum and condition.
+        size: the size in bytes, as a number or a formula of header fields; "7 bits" for a part of a
+            bit block.
+        type: the type, such as "uint16 le" or "bytes"; for a part of a bit block its bits, the most
+            significant first.
+        field: the path, with names of indices for array elements, such as "points[i].distance".
+        unit: the scale and unit, such as "0.01 deg".
+        meaning: the documentation, constant, labels, checksum and condition of the field.
     """
 
     offset: str
@@ -43,7 +45,7 @@ class WireRow:
 
 @dataclass(frozen=True)
 class SizeFormula:
-    """A number of bytes: a constant plus formulas of header fields and indices."""
+    """A number of bytes, as the sum of a constant and of formulas."""
 
     number: int = 0
     terms: tuple[str, ...] = ()
@@ -83,7 +85,7 @@ class SizeFormula:
 
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
-    """Return the rows of a frame type in the order of the wire."""
+    """Return the rows of a frame type in wire order."""
     seals = {
         path: _describe_seal(node)
         for node in tree.nodes(frame.tree)
@@ -102,8 +104,8 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
     """Return the size of a part.
 
     Args:
-        shown: the name of the part, for a size that only its bytes determine:
-            "size(points[i].text)".
+        shown: the path of the part. It is used for a size that only the bytes of the part
+            determine, as in "size(points[i].text)".
     """
     match node:
         case tree.Number() | tree.Block():
@@ -134,7 +136,7 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
 
 
 def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
-    """Return a declared length; for None, the name of an unknown size."""
+    """Return a declared length; "size(...)" if the length is None."""
     if isinstance(size, int):
         return SizeFormula(size)
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
@@ -152,7 +154,7 @@ def _member_path(shown: str, member: tree.Node) -> str:
 
 
 def _element(shown: str) -> tuple[str, str]:
-    """Return the path of an array element, "points[i]", and its index."""
+    """Return the path of an array element, such as "points[i]", and the name of its index."""
     index = INDICES[shown.count("[") % len(INDICES)]
     return f"{shown}[{index}]", index
 
@@ -250,7 +252,7 @@ def _part(shown: str, part: tree.Part) -> str:
 def _describe_bits(part: tree.Part) -> tuple[str, str]:
     """Return the size and type of a part of a block.
 
-    The size is in bits. For an integer that is wider than the number types, it is in bytes.
+    The size is in bits. For an integer that is wider than 64 bits, it is in bytes.
     """
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
@@ -286,7 +288,7 @@ def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
 
 
 def describe_end(node: tree.PartSequence) -> str:
-    """Describe how the last part of a sequence of parts is determined."""
+    """Return a description of how the last part of a sequence of parts is determined."""
     if node.count is not None:
         return f"{format_formula(node.count)} parts of variable size"
     if node.within is not None:
@@ -298,8 +300,8 @@ def describe_end(node: tree.PartSequence) -> str:
         )
     )
     return (
-        f"a chain: the first part has {format_formula(node.size)} bytes, each part gives the"
-        f" size of the next in {following}; 0 ends it"
+        f"the first part has {format_formula(node.size)} bytes; {following} of each part is the"
+        " size of the next part, 0 after the last part"
     )
 
 
@@ -323,7 +325,7 @@ def format_formula(formula: tree.Formula) -> str:
 
 
 def _is_enclosed(text: str) -> bool:
-    """Return whether the first bracket of a text is closed by its last character."""
+    """Return whether the last character of a text closes the bracket at its start."""
     depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
     return text.startswith("(") and depths.index(0) == len(text) - 1
 
@@ -331,7 +333,7 @@ def _is_enclosed(text: str) -> bool:
 def bit_text(bits: BitField) -> str:
     """Return the bits of a value in its block, the most significant first.
 
-    Example: "byte 1 bits 1-0, byte 0 bits 7-2".
+    An example is "byte 1 bits 1-0, byte 0 bits 7-2".
     """
     parts = []
     for part in sorted(bits.segments, key=lambda segment: -segment.target):
@@ -344,7 +346,7 @@ def bit_text(bits: BitField) -> str:
 
 
 def unit_text(info: tree.FieldInfo) -> str:
-    """Return unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
+    """Return scale, unit and offset of a field, such as "0.01 deg - 327.68"."""
     if not info.scaled:
         return info.unit
     if info.offset:
@@ -357,7 +359,7 @@ def unit_text(info: tree.FieldInfo) -> str:
 def describe_field(info: tree.FieldInfo) -> str:
     """Return the description of a field.
 
-    It consists of its constant, the formula of its value, its text and the names of its values.
+    It consists of its constant, the formula of its value, its documentation and its labels.
     """
     if info.const is not None:
         const = f"always {format_hex(info.const, info.bits)}"
@@ -381,7 +383,7 @@ def describe_field(info: tree.FieldInfo) -> str:
 def format_hex(value: object, bits: int) -> str:
     """Return bytes or an integer in hexadecimal.
 
-    An integer has all digits of its width.
+    An integer has as many digits as its width requires.
     """
     if isinstance(value, bytes | bytearray):
         return value.hex(" ")
@@ -391,7 +393,7 @@ def format_hex(value: object, bits: int) -> str:
 
 
 def _describe_seal(node: tree.Sealed) -> str:
-    """Describe the fields that hold a checksum."""
+    """Return a description of a checksum, with the range of bytes that it covers."""
     if node.declared:
         name = node.declared.describe()
     else:

@@ -91,10 +91,10 @@ class Simulation:
         answers: for each command, a list of the items that the sensor sends before any data, or a
             function that returns this list for the raw fields of the request. An item is a frame by
             name, (name, physical values by path), bytes, or a pause in seconds in which the sensor
-            sends its fillers. The raw fields contain the values of a `Template` as texts, by name in
-            braces: "{handle}", and "{data_port}" is the port at which the simulated sensor serves
-            its data. The default for a command is its reply. Only for a sensor, not for a frame
-            type.
+            sends its fillers. The raw fields contain the values of a `Template` as texts, by name
+            in braces: "{handle}", and "{data_port}" is the port at which the simulated sensor
+            serves its data. The default for a command is its reply. Only for a sensor, not for a
+            frame type.
         directions: a function of the frame number i that returns the azimuths and elevations of its
             points, radians, as two arrays that broadcast to the points of a frame. Needed for
             `Cartesian` points.
@@ -244,8 +244,9 @@ class Command:
     Args:
         frame: the outgoing frame; None for a command that only sets control lines.
         values: the values of fields of the frame, by path. `Count(16)` is a running number.
-            `Address()` and `Port()` are this computer's own address and the port at which it expects
-            the data. `Template(...)` is a text with arguments and values of earlier replies.
+            `Address()` and `Port()` are this computer's own address and the port at which it
+            expects the data. `Template(...)` is a text with arguments and values of earlier
+            replies.
         args: the arguments by name, each as (path of the field, lowest, highest) in the field's
             unit, (path, Text(16)), (path, Address()), (path, Port()) or (path, bytes). A path may
             have an index, such as "ports[1]", or may lead to a `Template` with the name of the
