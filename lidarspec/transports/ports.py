@@ -75,6 +75,11 @@ def list_serial_ports() -> list[SerialPort]:
     return ports
 
 
+def list_usb_ids() -> list[tuple[int, int]]:
+    """Return the USB ids, vendor and product, of the serial ports of this computer."""
+    return [(port.vid, port.pid) for port in list_ports.comports() if port.vid is not None]
+
+
 def find_lasting_path(port: str) -> str:
     """Return the name of a port in /dev/serial/by-id; "" if it has none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))

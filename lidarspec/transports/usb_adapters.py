@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from serial.tools import list_ports
+from lidarspec.transports.ports import list_usb_ids
 
 LIST_TIMEOUT_S = 10.0
 #: prints the USB devices of a Windows computer as JSON.
@@ -140,7 +140,7 @@ def list_usb_devices(platform: str = sys.platform) -> list[UsbDevice]:
         return list(read_sysfs(Path("/sys/bus/usb/devices")))
     if platform == "darwin":
         listed = _run("ioreg", "-p", "IOUSB", "-a", "-l")
-        return list(parse_ioreg(listed, _list_ids_of_ports()))
+        return list(parse_ioreg(listed, list_usb_ids()))
     if platform == "win32":
         listed = _run("powershell", "-NoProfile", "-Command", _WINDOWS_QUERY)
         return list(parse_windows(listed))
@@ -190,10 +190,6 @@ def parse_windows(listed: bytes) -> Iterator[UsbDevice]:
         if found:
             ids = [int(digits, 16) for digits in found.groups()]
             yield UsbDevice(ids[0], ids[1], entry["ConfigManagerErrorCode"] == 0)
-
-
-def _list_ids_of_ports() -> list[tuple[int, int]]:
-    return [(port.vid, port.pid) for port in list_ports.comports() if port.vid is not None]
 
 
 def _run(*command: str) -> bytes:
