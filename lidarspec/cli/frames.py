@@ -24,6 +24,7 @@ from lidarspec.explaining.listing import LINE_BYTES, Line, list_differences
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
 from lidarspec.sensor_operations import Sensor
+from lidarspec.spec.enum_values import EnumValue
 
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
 
@@ -70,14 +71,27 @@ def parse(
 def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
     """Return a frame as a JSON object."""
     facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
-    return {**facts, "fields": plain(sensor.parse(piece.data, piece.frame))}
+    parsed = sensor.parse(piece.data, piece.frame)
+    return {**facts, "fields": plain(parsed), "names": dict(_iter_names(parsed, ""))}
+
+
+def _iter_names(parsed: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the path and the name of each code in a parsed frame; "" for an unknown code."""
+    if isinstance(parsed, dict):
+        for name, value in parsed.items():
+            yield from _iter_names(value, f"{path}.{name}" if path else name)
+    elif isinstance(parsed, list):
+        for index, value in enumerate(parsed):
+            yield from _iter_names(value, f"{path}[{index}]")
+    elif isinstance(parsed, EnumValue):
+        yield path, parsed.name
 
 
 def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
         field_values = values(piece.data, sensor, piece.frame).values()
         rows = [
-            [value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""]
+            [value.path, _raw_text(value.raw), str(value) if value.has_meaning else ""]
             for value in field_values
         ]
         yield (
@@ -454,8 +468,6 @@ def plain(parsed: Any) -> Any:
         return [plain(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
-    if isinstance(parsed, str):
-        return getattr(parsed, "intvalue", None)
     if isinstance(parsed, int):
         return int(parsed)
     return number(parsed)

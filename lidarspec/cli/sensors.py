@@ -331,12 +331,12 @@ def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _format_command(sensor: Sensor, name: str) -> str:
-    from lidarspec.explaining.formatting import format_argument_type
+    from lidarspec.explaining.formatting import describe_argument
 
     command = _command_to_dict(sensor, name)
     args = "".join(
-        f" {name}={format_argument_type(argument.kind)}"
-        for name, argument in sensor.commands[name].arguments.items()
+        f" {argument}={describe_argument(sensor, name, argument)}"
+        for argument in sensor.commands[name].arguments
     )
     if command["reply"]:
         answer = (

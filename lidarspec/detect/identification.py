@@ -59,8 +59,6 @@ PACE_TOLERANCE = 0.03
 MAX_NAMED_FRAMES = 3
 #: Number of packets to simulate, to find the clock step per packet of a sensor.
 SIMULATED_PACKETS = 64
-#: Matches a value and its meaning in the documentation of a field.
-_DOCUMENTED_VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
 #: Maximum number of bytes to show in an error.
 MAX_SHOWN_BYTES = 16
 #: A sensor fits if at least this share of the bytes is in its frames, from 0 to 1.
@@ -139,7 +137,7 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     fits = any(
         _normalise(part) in _normalise(sensor.model)
         for name in names
-        for part in re.split(r",| and ", name)
+        for part in _split_names(name)
     )
     if fits or not names:
         return ""
@@ -276,7 +274,7 @@ def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
         (
             f"{sensor.reported['model'].paths[0]} is {text}"
             for text in _read_model_names(sensor, frames)
-            if _normalise(text) == _normalise(sensor.model)
+            if _normalise(sensor.model) in map(_normalise, _split_names(text))
         ),
         "",
     )
@@ -376,14 +374,15 @@ def _get_nested(parsed: Any, path: str) -> Any:
 
 
 def _describe_value(value: Any, info: FieldInfo) -> str:
-    """Return the text in a field, or the documented meaning of its number; else ""."""
+    """Return the text in a field, or the name of its code, or ""."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
-    meanings = {
-        int(number, 0): text.strip() for number, text in _DOCUMENTED_VALUE.findall(info.docs)
-    }
-    meanings |= dict(info.labels)
-    return str(meanings.get(value, ""))
+    return info.labels.get(value, "")
+
+
+def _split_names(text: str) -> list[str]:
+    """Return the model names in a text, which may be that of several models."""
+    return re.split(r",| and ", text)
 
 
 def _normalise(text: str) -> str:

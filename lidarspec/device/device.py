@@ -21,6 +21,7 @@ from lidarspec.detect.identification import (
     find_simulated_sensor,
     read_info,
 )
+from lidarspec.detect.unknown_codes import find_unknown_codes
 from lidarspec.device.device_input import DeviceInput, FileInput, FrameBatch
 from lidarspec.device.live_input import PERIOD_S, LiveInput
 from lidarspec.device.named_devices import find_device
@@ -82,8 +83,9 @@ class Device(ClosingContext):
         # The batch in which `latest` found its last scan of a file.
         self._ahead: FrameBatch | None = None
         self._first_frames: list[Found] = []
-        self._is_checked = not sensor.relatives and "model" not in sensor.info
+        self._is_checked = False
         self._contradiction = ""
+        self._unknown_codes: list[str] = []
         self._own_recorders: list[TrafficLog] = []
         self._input = self._open_input(backend, record, overflow, period, will_begin=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
@@ -122,8 +124,8 @@ class Device(ClosingContext):
         """The current warnings about the source and the sensor.
 
         Examples are a truncated file, silence, a baud rate that is probably wrong, a small receive
-        buffer, frames of another sensor, scans without an end, times without a date, a nominal
-        calibration, and errors of the plugin.
+        buffer, frames of another sensor, unknown codes, scans without an end, times without a date,
+        a nominal calibration, and errors of the plugin.
         """
         stats = self.stats
         warnings = [*self._input.warnings, *self._check_first_frames()]
@@ -575,7 +577,7 @@ class Device(ClosingContext):
         return batch
 
     def _check_first_frames(self) -> list[str]:
-        """Return a warning if the first frames belong to another sensor or model.
+        """Return warnings if the first frames belong to another model, or have unknown codes.
 
         They are checked once: when enough of them have arrived, or at the end of the input.
         """
@@ -584,13 +586,16 @@ class Device(ClosingContext):
             self._is_checked = True
             simulated = find_simulated_sensor(self.source)
             if simulated is None or simulated.id != self.sensor.id:
-                self._contradiction = find_contradiction(self.sensor, self._first_frames)
-        if not self._contradiction:
-            return []
-        return [
-            f"{self.source}: read as {self.sensor.id}, but {self._contradiction}; next:"
-            f" lidarspec detect {quote(str(self.source))}"
-        ]
+                if self.sensor.relatives or "model" in self.sensor.info:
+                    self._contradiction = find_contradiction(self.sensor, self._first_frames)
+                self._unknown_codes = find_unknown_codes(self.sensor, self._first_frames)
+        warnings = [f"{self.source}: {text}" for text in self._unknown_codes]
+        if self._contradiction:
+            warnings.append(
+                f"{self.source}: read as {self.sensor.id}, but {self._contradiction}; next:"
+                f" lidarspec detect {quote(str(self.source))}"
+            )
+        return warnings
 
 
 class _YieldTimer:

@@ -32,6 +32,7 @@ from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Count, Port
 from lidarspec.spec.description import Command
+from lidarspec.spec.enum_values import EnumValue, find_code, name_value
 from lidarspec.spec.options import Learned
 from lidarspec.spec.tree import FieldInfo
 
@@ -163,8 +164,11 @@ class ExpectedReply:
         """
         if frame not in self.tables:
             return [f"a {frame} frame"]
+        table = self.tables[frame]
         expected = {
-            path: value for path, value in self.values.items() if path in self.tables[frame]
+            path: find_code(table[path], value)
+            for path, value in self.values.items()
+            if path in table
         }
         got = {path: get_nested(values, path) for path in expected}
         wrong = [
@@ -172,7 +176,10 @@ class ExpectedReply:
             for path in expected
             if got[path] != expected[path]
         ]
-        return [f"{path} {value} instead of {expected[path]}" for path, value in wrong]
+        return [
+            f"{path} {value} instead of {name_value(table[path], expected[path])}"
+            for path, value in wrong
+        ]
 
     def overlaps(self, other: ExpectedReply) -> bool:
         """Return whether a frame could be the reply to both requests."""
@@ -703,14 +710,13 @@ def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
 
 
 def _describe_labels(fields: Mapping[str, FieldInfo], values: Any) -> str:
-    """Return the labels and numbers of all values with a label; "" if there are none."""
-    reasons = [
-        f"{path} {name} ({number})"
-        for path, info in fields.items()
-        for number, name in info.labels.items()
-        if get_nested(values, path) == name
-    ]
-    return ", ".join(reasons)
+    """Return all values that have a name, as text; "" if there are none."""
+    named = {path: get_nested(values, path) for path, info in fields.items() if info.labels}
+    return ", ".join(
+        f"{path} {value}"
+        for path, value in named.items()
+        if isinstance(value, EnumValue) and value.name
+    )
 
 
 def _make_timeout_error(sensor: Sensor, request: _PendingCommand) -> CommandError:

@@ -127,6 +127,10 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
     return number * per_unit, unit_text
 
 
+def _begins_a_number(text: str) -> bool:
+    return text.lstrip("+-.")[:1].isdigit()
+
+
 def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
     """Return the raw value nearest to a physical value."""
     raw: int | float = info.raw(number)
@@ -188,7 +192,9 @@ def parse_arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> di
         slot = argument_slot(sensor, name, argument)
         kind = command.arguments[argument].kind
         place = f"{sensor.id} {name}: {argument}"
-        if isinstance(kind, Range):
+        if isinstance(kind, Range) and slot.info.labels and not _begins_a_number(value.strip()):
+            given[argument] = value.strip()
+        elif isinstance(kind, Range):
             unit = slot.info.unit
             number, _ = _parse_number(
                 value.strip(), unit, place, f"a number in {unit}" if unit else "a number"

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
+from lidarspec.frames.commands import argument_slot, list_choices
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
+from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
 from lidarspec.spec.timing import EPOCHS, Clock
 
 if TYPE_CHECKING:
@@ -87,7 +89,8 @@ class FieldValue:
         physical: the value in `unit`; None if the value is not a number.
         unit: the unit; "" if the field has none.
         digits: number of decimals to print; None for a float field.
-        label: the label of the raw value; "" if it has none.
+        label: the name of the raw value; "" if it has none.
+        is_unknown: whether other raw values of the field have names, but this one has none.
         bits: text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
         docs: the documentation of the field.
         start: offset of the first byte in the frame.
@@ -104,11 +107,17 @@ class FieldValue:
     docs: str = ""
     start: int = 0
     masks: bytes = b""
+    is_unknown: bool = False
 
     @property
     def name(self) -> str:
         """The last part of the path."""
         return self.path.rpartition(".")[2]
+
+    @property
+    def has_meaning(self) -> bool:
+        """Whether the text says more than the raw value: a unit, or the name of a code."""
+        return bool(self.unit or self.label) or self.is_unknown
 
     def contains_bit(self, offset: int, bit: int) -> bool:
         """Return whether a bit of the frame belongs to the field.
@@ -130,7 +139,9 @@ class FieldValue:
                 return ascii_text(self.raw)
             return repr(self.raw)
         if self.label:
-            return f"{self.raw} {self.label}"
+            return format_code(self.raw, self.label)
+        if self.is_unknown:
+            return format_code(self.raw, UNKNOWN_CODE)
         plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
         if plain:
             text = str(self.raw)
@@ -161,6 +172,7 @@ class FieldValue:
             for name in ("unit", "label", "bits", "docs")
             if (text := getattr(self, name))
         }
+        more |= {"unknown": True} if self.is_unknown else {}
         more |= {"text": text} if (text := str(self)) else {}
         return {"path": self.path, "raw": raw, **physical, **more, **position}
 
@@ -384,6 +396,16 @@ def format_argument_type(kind: Taken, between: str = "..") -> str:
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)
+
+
+def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
+    """Describe the values of a command argument: their names, or as `format_argument_type`."""
+    kind = sensor.commands[command].arguments[argument].kind
+    if isinstance(kind, Range):
+        choices = list_choices(argument_slot(sensor, command, argument).info, kind)
+        if choices:
+            return "|".join(choices)
+    return format_argument_type(kind, between)
 
 
 def ascii_text(data: bytes | bytearray) -> str:

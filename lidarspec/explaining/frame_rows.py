@@ -193,6 +193,7 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
         info.docs,
         field.start,
         b"\xff" * size if field.bits is None else field.bits.masks(size),
+        bool(info.labels) and field.raw not in info.labels,
     )
 
 

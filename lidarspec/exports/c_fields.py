@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -80,6 +80,15 @@ def comment(*texts: str) -> str:
     if text:
         return f"/* {text} */"
     return ""
+
+
+def quote(text: str) -> str:
+    """Return a text as a C string, in UTF-8."""
+    data = text.encode()
+    plain = all(32 <= byte < 127 and byte not in b'"\\?' for byte in data)
+    if plain:
+        return f'"{text}"'
+    return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
 
 
 def quote_bytes(data: bytes) -> str:
@@ -563,6 +572,15 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
         )
     if kind and (first.info.scaled or first.info.unit):
         yield from _iter_conversions(first.info, name, kind)
+    if first.info.labels:
+        yield _write_names(first.info.labels, layout.name(path, "name"))
+
+
+def _write_names(labels: Mapping[int, str], name: str) -> str:
+    """Return the function that gives the name of a code, or NULL for an unknown code."""
+    cases = [f"    case {code}: return {quote(label)};" for code, label in labels.items()]
+    head = f"static inline const char *{name}(long long code)"
+    return "\n".join([head, "{", "    switch (code) {", *cases, "    }", "    return NULL;", "}"])
 
 
 def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:

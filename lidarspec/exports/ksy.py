@@ -1,14 +1,15 @@
 """Export a spec as a Kaitai Struct format for Kaitai's compiler, web IDE and visualizer.
 
 Each frame type, and each struct in a frame type, becomes a Kaitai type. A type has attributes in
-wire order (`seq`), calculated `instances` and inner `types`. Types are plain data until `yaml`
-writes the document. Kaitai has no absolute paths, so formulas refer to a field by its path from the
-current type (`format_reference`).
+wire order (`seq`), calculated `instances`, `enums` and inner `types`. Types are plain data until
+`yaml` writes the document. Kaitai has no absolute paths, so formulas refer to a field by its path
+from the current type (`format_reference`).
 
 A bit block becomes bit-sized integers if its parts are consecutive in one of Kaitai's two bit
 orders. Otherwise it becomes bytes, and an instance calculates each part. A field with a scale gets
-an instance with the physical value. Kaitai cannot express checksums, plausibility tests and points.
-The documentation of a checksum's field names the algorithm.
+an instance with the physical value, a code an instance with its name. Kaitai cannot express
+checksums, plausibility tests and points. The documentation of a checksum's field names the
+algorithm.
 """
 
 from __future__ import annotations
@@ -346,6 +347,7 @@ class _KaitaiType:
 
     seq: list[Attribute] = field(default_factory=list)
     instances: dict[str, Attribute] = field(default_factory=dict)
+    enums: dict[str, Attribute] = field(default_factory=dict)
     types: dict[str, Attribute] = field(default_factory=dict)
 
     def done(self, path: str) -> Attribute:
@@ -556,14 +558,33 @@ class _KaitaiWriter:
     def _physical(
         self, kaitai: _KaitaiType, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
     ) -> None:
-        """Add an instance with the physical value of a field that has a scale."""
+        """Add instances with the physical value and the name of a field that has them."""
         own = identifier(name or info.name)
+        if info.labels and own:
+            kaitai.enums[own] = _make_enum(info.labels)
+            number = f"{own}.to_i" if info.bits == 1 else own
+            kaitai.instances[f"{own}_name"] = {"value": number, "enum": own, **_condition(more)}
         if info.scaled and own:
             value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
             kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {
                 "value": value.replace("+ -", "- "),
                 **_condition(more),
             }
+
+
+def _make_enum(labels: Mapping[int, str]) -> Attribute:
+    """Return an enum of Kaitai: code -> name, with the original name as its documentation."""
+    members: dict[Any, Any] = {}
+    taken = set[str]()
+    for code, label in labels.items():
+        name = identifier(label)
+        if not name[:1].isalpha():
+            name = f"code_{name}"
+        if name in taken:
+            name = f"{name}_{code}"
+        taken.add(name)
+        members[code] = name if name == label else {"id": name, "doc": label}
+    return members
 
 
 def _size(formula: tree.Formula, scope: Scope) -> int | str:

@@ -15,10 +15,10 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.explaining.formatting import (
+    describe_argument,
     describe_declared_clock,
     describe_declared_status,
     describe_losses,
-    format_argument_type,
 )
 from lidarspec.exports.quick_start import list_commands, read_notes, write_python
 from lidarspec.frames.wire_table import frame_size, wire_table
@@ -137,8 +137,8 @@ def _find_request(sensor: Sensor, name: str) -> str:
     parts = _list_levels(command.lines)
     if command.frame and command.args:
         args = " and ".join(
-            f"`{name}` {format_argument_type(argument.kind, ' to ')}"
-            for name, argument in command.arguments.items()
+            f"`{argument}` {describe_argument(sensor, name, argument, ' to ')}"
+            for argument in command.arguments
         )
         parts.insert(0, f"`{command.frame}` with {args}")
     elif command.frame:

@@ -17,9 +17,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from lidarspec.exports import ExportedFrame, ExportError, messages
+from lidarspec.frames.commands import argument_slot, list_choices
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_table import describe_field, unit_text
-from lidarspec.spec import Command, Sensor
+from lidarspec.spec import Sensor
 from lidarspec.spec.arguments import Address, Octets, Port, Range, Text
 from lidarspec.spec.tree import (
     Blob,
@@ -82,7 +83,8 @@ _HEAD = '''"""{title}: types of the results of `parse` and of the arguments of `
 
 from typing import Any, Literal, overload
 
-from lidarspec import Sensor'''
+from lidarspec import Sensor
+from lidarspec.spec import EnumValue'''
 
 
 @dataclass
@@ -132,7 +134,7 @@ class _StubClasses:
                 this name.
         """
         if isinstance(node, list):
-            kind = "int" if len(node) == 1 else "Any"
+            kind = _number_type(node[0]) if len(node) == 1 else "Any"
             infos = node
         else:
             kind = self._type(owner, name, node)
@@ -154,14 +156,12 @@ class _StubClasses:
     def _type(self, owner: str, name: str, node: Node) -> str:
         match node:
             case Number():
-                if node.kind == "float":
-                    return "float"
-                return "int"
+                return _number_type(node.info)
             case Blob():
                 return "bytes"
             case Block() if not node.parts[0].names:
                 if len(node.parts) == 1:
-                    return "int"
+                    return _number_type(node.parts[0].info)
                 return "list[int]"
             case Struct() | Sealed() | Block():
                 return self.add(node, owner + to_class_name(name), f"`{name}` of `{owner}`.")
@@ -185,6 +185,14 @@ class _StubClasses:
                 return "None"
 
 
+def _number_type(info: FieldInfo) -> str:
+    if info.kind == "float":
+        return "float"
+    if info.labels:
+        return "EnumValue"
+    return "int"
+
+
 def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
     """Return the class with the sensor's `parse`, `build`, `example` and `command`."""
     parses = "\n".join(
@@ -193,7 +201,7 @@ def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, 
         for frame, name in names.items()
     )
     builds = "\n".join(_build(message) for message in frames)
-    commands = "\n".join(_command(name, command) for name, command in sensor.commands.items())
+    commands = "\n".join(_command(sensor, name) for name in sensor.commands)
     if len(sensor.commands) > 0:
         rest = "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..."
     else:
@@ -236,15 +244,24 @@ def _build(message: ExportedFrame) -> str:
     )
 
 
-def _command(name: str, command: Command) -> str:
+def _command(sensor: Sensor, name: str) -> str:
     args = "".join(
-        f", {arg}: {ARGUMENT_TYPES[type(argument.kind)]}"
-        for arg, argument in command.arguments.items()
+        f", {argument}: {_argument_type(sensor, name, argument)}"
+        for argument in sensor.commands[name].args
     )
     return (
         f'    @overload\n    def command(self, _name: Literal["{name}"],'
         f" /{', *' * bool(args)}{args}) -> bytes: ..."
     )
+
+
+def _argument_type(sensor: Sensor, command: str, argument: str) -> str:
+    kind = sensor.commands[command].arguments[argument].kind
+    if isinstance(kind, Range):
+        choices = list_choices(argument_slot(sensor, command, argument).info, kind)
+        if choices:
+            return f"float | Literal[{', '.join(map(repr, choices))}]"
+    return ARGUMENT_TYPES[type(kind)]
 
 
 def _quote(text: str) -> str:

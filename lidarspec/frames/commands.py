@@ -215,6 +215,8 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
     """
     info = slot.info
     if isinstance(kind, Range):
+        if isinstance(value, str) and info.labels:
+            value = _find_named(info, kind, value, f"{place}: {argument}")
         if not isinstance(value, int | float | np.number):
             raise UsageError(f"{place}: {argument} must be a number, not {value!r:.60}")
         if not kind.low <= value <= kind.high:
@@ -233,6 +235,24 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
             return data
         return str(value)
     return _to_raw_value(slot, data)
+
+
+def list_choices(info: FieldInfo, kind: Range) -> dict[str, float]:
+    """Return the names that an argument takes, and their physical values."""
+    values = {name: info.physical(raw) for raw, name in info.labels.items()}
+    return {name: value for name, value in values.items() if kind.low <= value <= kind.high}
+
+
+def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
+    """Return the physical value of a name.
+
+    Raises:
+        UsageError: if the argument takes no such name.
+    """
+    choices = list_choices(info, kind)
+    if name not in choices:
+        raise UsageError(f"{place} must be {' or '.join(choices) or 'a number'}, not {name!r:.60}")
+    return choices[name]
 
 
 def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:

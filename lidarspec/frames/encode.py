@@ -25,6 +25,7 @@ from lidarspec.frames.layout import Layout, Leaf, Seal
 from lidarspec.frames.layout_tree import TooLongError, find_kinds
 from lidarspec.frames.parts import FOUND, LayoutLookup, PartsSize
 from lidarspec.frames.schema import Schema, counting_field, make_schema
+from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.syntax import WireNaN, get_member
 from lidarspec.spec.tree import (
     Adapter,
@@ -444,8 +445,8 @@ def to_raw(info: FieldInfo, value: Any) -> Any:
     """
     if info.adapter is not None and info.kind == "int" and value is not None:
         return info.adapter.encode(value, 0)
-    if isinstance(value, str) and info.labels:
-        return next((raw for raw, name in info.labels.items() if name == value), value)
+    if isinstance(value, str):
+        return find_code(info, value)
     if info.kind == "int" and isinstance(value, bytes) and len(value) == info.bits // 8 == 1:
         return value[0]
     return value

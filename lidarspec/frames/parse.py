@@ -30,8 +30,9 @@ from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import ExaminedFrame, examine
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
+from lidarspec.spec.enum_values import EnumValue
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import WireNaN, to_seen, to_unnamed
+from lidarspec.spec.syntax import WireNaN
 from lidarspec.spec.tree import (
     Adapter,
     Blob,
@@ -484,17 +485,13 @@ def _apply_adapter(adapter: Adapter, raw: Reader, frame: bytes) -> Sequence[Any]
 
 
 class _LabelCache(dict[int, Any]):
-    """Cache of the values of an Enum, by raw value.
-
-    construct makes a new object for each value. This cache makes one object for each distinct
-    value.
-    """
+    """Cache of the values of an Enum, by raw value, with one object for each name."""
 
     def __init__(self, info: FieldInfo) -> None:
-        super().__init__({raw: to_seen(info, raw) for raw in info.labels})
+        super().__init__({raw: EnumValue(raw, name) for raw, name in info.labels.items()})
 
-    def __missing__(self, raw: int) -> Any:
-        return to_unnamed(raw)
+    def __missing__(self, raw: int) -> EnumValue:
+        return EnumValue(raw)
 
 
 def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequence[Any]:

@@ -19,7 +19,7 @@ from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import MismatchError, field_path, leaves, remove_private
+from lidarspec.spec.syntax import MismatchError, field_path, leaves, to_public
 from lidarspec.spec.tree import FieldInfo
 
 #: The maximum number of times that a frame is built until its lengths no longer change.
@@ -35,7 +35,7 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
     """
     stream = io.BytesIO(data)
     values = frame.prepared.parse_stream(stream, _verify=verify)
-    return remove_private(values), stream.tell()
+    return to_public(values), stream.tell()
 
 
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:

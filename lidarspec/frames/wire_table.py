@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
+from lidarspec.spec.enum_values import format_code
 
 INDICES = "ijklmn"
 
@@ -374,7 +375,7 @@ def describe_field(info: tree.FieldInfo) -> str:
         follows = format_formula(info.rebuilt)
     else:
         follows = "?"
-    labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())
+    labels = ", ".join(format_code(value, name) for value, name in info.labels.items())
     return "; ".join(
         filter(None, (const, "" if follows == "?" else f"= {follows}", info.docs, labels))
     )

@@ -35,6 +35,7 @@ from lidarspec.simulation.simulator import (
 )
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
 from lidarspec.spec.description import Answer, Command, Frame, Sweep
+from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.links import Http, is_datagram
 from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
@@ -206,6 +207,7 @@ class ReplyMaker:
         If several commands match, returns the one with the most fixed values.
         """
         values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
+        fields = get_codec(self._sensor.frames[frame]).schema.fields
         sent = [
             one
             for one in self._sensor.commands.items()
@@ -213,7 +215,7 @@ class ReplyMaker:
         ]
         best: ReceivedCommand | None = None
         for command_name, command in sent:
-            texts = _match_command(command, values)
+            texts = _match_command(command, values, fields)
             if texts is None:
                 continue
             if best is None or _rank(command) > _rank(best.command):
@@ -221,12 +223,18 @@ class ReplyMaker:
         return best
 
 
-def _match_command(command: Command, values: Mapping[str, Any]) -> dict[str, str] | None:
+def _match_command(
+    command: Command, values: Mapping[str, Any], fields: Mapping[str, FieldInfo]
+) -> dict[str, str] | None:
     """Return {name in braces: text} of the placeholders of a command's templates.
 
     Returns None if the values of the frame do not match the command.
     """
-    if any(values.get(path) != value for path, value in command.fixed.items()):
+    fixed = {
+        path: find_code(fields[path], value) if path in fields else value
+        for path, value in command.fixed.items()
+    }
+    if any(values.get(path) != value for path, value in fixed.items()):
         return None
     texts = dict[str, str]()
     for path, template in command.templates.items():
@@ -271,7 +279,7 @@ def _to_physical(info: FieldInfo, value: Any) -> Any:
         return value
     if isinstance(value, list | tuple):
         return [_to_physical(info, element) for element in value]
-    return info.physical(next((raw for raw, name in info.labels.items() if name == value), value))
+    return info.physical(find_code(info, value))
 
 
 def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

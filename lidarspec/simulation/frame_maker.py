@@ -23,6 +23,7 @@ from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.sensor_operations import Sensor
+from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.syntax import get_member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
 
@@ -96,8 +97,8 @@ class FrameMaker:
     def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return a table with one frame for each mapping of field paths to values.
 
-        Values are physical. An array of bytes may be given as bytes, and a part as a mapping of the
-        same form.
+        Values are physical; codes may be given by their names. An array of bytes may be given as
+        bytes, and a part as a mapping of the same form.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -262,7 +263,8 @@ class FrameMaker:
                     path=path,
                     sensor=self._sensor,
                 )
-            leaf.store(rows, leaf.raw([values.get(path, 0) for values, _ in frames]))
+            given = [find_code(leaf.info, values.get(path, 0)) for values, _ in frames]
+            leaf.store(rows, leaf.raw(given))
         for axis, region in layout.regions.items():
             parts = b"".join(made[axis] for _, made in frames)
             rows[:, region.start : region.start + region.size] = np.frombuffer(
@@ -279,6 +281,8 @@ class FrameMaker:
         if info is None:
             return int(values[path])  # the total size of parts
         base, indices = without_indices(path)
+        if isinstance(values.get(base), str):
+            return int(find_code(info, values[base]))
         if base in values:
             return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
         if isinstance(info.const, int):

@@ -10,6 +10,7 @@ Modules in reading order:
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
 * `sensor`: `SensorDescription`, which combines these values. `Sensor`, in
   `lidarspec.sensor_operations`, is a description with methods that decode, build and so on.
+* `enum_values`: the values of codes, with their names.
 * `options`: the values that options of `configure` accept, from their annotations.
 * `arguments`: arguments of commands, and values filled in when a command is sent.
 * `fields`: units, checksums and parts, as members of a struct.
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
         Reported as Reported,
         Simulation as Simulation,
     )
+    from lidarspec.spec.enum_values import EnumValue as EnumValue
     from lidarspec.spec.fields import (
         Checksummed as Checksummed,
         HttpReply as HttpReply,
@@ -133,6 +135,7 @@ _NAMES = {
     "sensor_operations": ("Sensor",),
     "spec.options": ("Learned",),
     "spec.description": ("Frame", "Command", "Relative", "Reported", "Simulation"),
+    "spec.enum_values": ("EnumValue",),
     "spec.arguments": ("Text", "Address", "Port", "Count", "Template"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": (

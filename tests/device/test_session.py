@@ -61,7 +61,7 @@ def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
     assert (reply.values.firmware, reply["firmware"], reply["mode"]) == (3, 3, 0x50)
     assert (
         repr(reply)
-        == f"Reply(start, ack: mode 80, firmware 3, reserved {bytes(6)!r}, checksum 171)"
+        == f"Reply(start, ack: mode start (0x50), firmware 3, reserved {bytes(6)!r}, checksum 171)"
     )
     with pytest.raises(UnknownField):
         reply["firmwar"]

@@ -20,6 +20,7 @@ from construct import Construct
 from lidarspec import Packets, Sensor, SpecError, WireError
 from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Every, Fields, Frame, Polar, Udp
+from lidarspec.spec.enum_values import EnumValue
 from lidarspec.spec.syntax import frame_tree
 from tests.by_construct import reader
 
@@ -62,11 +63,13 @@ def parse_by_construct(struct: Construct, data: bytes, *, max_length: int = 200)
 
 
 def plain(value: Any) -> Any:
-    """Return a parsed value as dicts, lists, numbers and bytes."""
+    """Return a parsed value as dicts, lists, numbers and bytes; codes of construct as ours."""
     if isinstance(value, dict):
         return {name: plain(part) for name, part in value.items() if not name.startswith("_")}
     if isinstance(value, list):
         return [plain(part) for part in value]
+    if isinstance(value, construct.EnumIntegerString):
+        return EnumValue(value.intvalue, str(value))
     return value
 
 
@@ -210,10 +213,9 @@ def same(column: Any, wanted: Any, where: str) -> None:
             same(one, part, where)
         assert not np.any(column[len(wanted) :]), where
     else:
-        number = int(wanted) if isinstance(wanted, construct.EnumIntegerString) else wanted
         assert not np.shape(column), where
         assert (
-            column == number or (column != column and number != number) or column == float(number)
+            column == wanted or (column != column and wanted != wanted) or column == float(wanted)
         ), where
 
 

@@ -42,7 +42,7 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
         "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no"
         " return" in told
     )
-    assert "000a ......00 .. .. exposure 0; 1 high, 2 low" in told
+    assert "000a ......00 .. .. exposure unknown code (0)" in told
     assert not any(line.startswith("000d  ..") for line in listed)
     assert sum(join_text(line).startswith("000d") for line in found.lines(every=True)) == 4
 

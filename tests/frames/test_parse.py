@@ -34,7 +34,7 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import HeaderTree, frame_layouts
 from lidarspec.frames.parse import unpack
 from lidarspec.spec import Checksum, Checksummed, Frame
-from lidarspec.spec.syntax import remove_private
+from lidarspec.spec.syntax import to_public
 from tests.engine import against_construct
 from tests.engine.engines import is_compiled
 from tests.representatives import each_sensor, each_shape, load_sensor
@@ -90,7 +90,7 @@ def test_frames_unpack_to_what_construct_parses(name: str) -> None:
             data = sensor.example(frame, seed=seed)
             found = unpack_by_layout(sensor.frames[frame], data)
             assert found is not None, "left to construct"
-            same(found, remove_private(sensor.frames[frame].prepared.parse(data)))
+            same(found, to_public(sensor.frames[frame].prepared.parse(data)))
 
 
 @each_shape
@@ -103,7 +103,7 @@ def test_damaged_frames_are_left_to_construct(name: str) -> None:
             damaged = data[:offset] + bytes([data[offset] ^ 0x41]) + data[offset + 1 :]
             found = unpack_by_layout(sensor.frames[frame], damaged)
             try:
-                expected = remove_private(sensor.frames[frame].prepared.parse(damaged))
+                expected = to_public(sensor.frames[frame].prepared.parse(damaged))
             except construct.ConstructError:
                 assert found is None
             else:
@@ -152,7 +152,7 @@ def test_arrays_of_all_kinds(name: str) -> None:
     for data in map(np.ndarray.tobytes, rows):
         found = unpack_by_layout(frame, data)
         assert found is not None
-        same(found, remove_private(frame.prepared.parse(data)))
+        same(found, to_public(frame.prepared.parse(data)))
         assert unpack_by_layout(frame, data + b"\0") is None
         assert unpack_by_layout(frame, data[:-1]) is None
 
@@ -177,7 +177,7 @@ def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(
             data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(
                 2 * count + {1: 1, 2: 2}.get(kind, 3) + 1
             )
-            same(unpack_by_layout(frame, data), remove_private(frame.prepared.parse(data)))
+            same(unpack_by_layout(frame, data), to_public(frame.prepared.parse(data)))
             assert unpack_by_layout(frame, data[:-1]) is None
             assert unpack_by_layout(frame, b"\x5b" + data[1:]) is None
     assert unpack_by_layout(frame, b"\x5a\x02") is None

@@ -45,6 +45,7 @@ ALLOWED = {
         "spec.options",
         "spec.sensor",
         "spec.timing",
+        "spec.enum_values",
         "spec.tree",
     ),
     *(

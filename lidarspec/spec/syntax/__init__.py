@@ -17,8 +17,6 @@ from __future__ import annotations
 from lidarspec.spec.syntax.meaning import (
     bytes_of as bytes_of,
     frame_tree as frame_tree,
-    to_seen as to_seen,
-    to_unnamed as to_unnamed,
 )
 from lidarspec.spec.syntax.refusals import check_struct as check_struct
 from lidarspec.spec.syntax.replacements import (
@@ -45,7 +43,7 @@ from lidarspec.spec.syntax.structs import (
     leaves as leaves,
     prepare as prepare,
     random_value as random_value,
-    remove_private as remove_private,
     seals as seals,
+    to_public as to_public,
     unwrap as unwrap,
 )

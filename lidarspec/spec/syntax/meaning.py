@@ -132,22 +132,6 @@ def _expand_path(path: str, way: re.Match[str]) -> str:
     return ".".join(names)
 
 
-def to_seen(info: tree.FieldInfo, raw: int) -> Any:
-    """Return a raw value in the form that expressions of a struct read.
-
-    If the Enum of the field has a name for the value, expressions can compare the value with the
-    name.
-    """
-    if raw in info.labels:
-        return construct.EnumIntegerString.new(raw, info.labels[raw])
-    return raw
-
-
-def to_unnamed(raw: int) -> Any:
-    """Return a raw value without a name in its Enum, in the form of construct."""
-    return construct.EnumInteger(raw)
-
-
 @dataclass(frozen=True)
 class _Context:
     """The context of a construct.

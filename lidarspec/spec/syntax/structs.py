@@ -30,6 +30,7 @@ from construct import (
 )
 from construct.expr import ExprMixin
 
+from lidarspec.spec.enum_values import EnumValue
 from lidarspec.spec.syntax.raw_checksums import extract_seals, seal
 from lidarspec.spec.syntax.replacements import (
     BareNamedTuple,
@@ -481,18 +482,18 @@ def fixed_size(con: Construct) -> int:
         return 0
 
 
-def remove_private(parsed: Any) -> Any:
-    """Return a parsed object without private entries."""
+def to_public(parsed: Any) -> Any:
+    """Return a parsed object as users see it: without private entries, codes as `EnumValue`."""
     if isinstance(parsed, dict):
         return Container(
-            {
-                name: remove_private(value)
-                for name, value in parsed.items()
-                if not name.startswith("_")
-            }
+            {name: to_public(value) for name, value in parsed.items() if not name.startswith("_")}
         )
     if isinstance(parsed, list):
-        return construct.ListContainer(remove_private(value) for value in parsed)
+        return construct.ListContainer(to_public(value) for value in parsed)
+    if isinstance(parsed, construct.EnumIntegerString):
+        return EnumValue(parsed.intvalue, str(parsed))
+    if isinstance(parsed, construct.EnumInteger):
+        return EnumValue(parsed)
     return parsed
 
 
@@ -636,7 +637,7 @@ def random_value(
     if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
         return _draw_leaf(con, source, scope, path)
     if isinstance(con, construct.Adapter):
-        return remove_private(
+        return to_public(
             con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
         )
     return random_value(con.subcon, source, drawn, scope, path)

@@ -39,6 +39,7 @@ from construct import (
     Computed,
     Const,
     Construct,
+    Enum,
     Int8ul,
     Int16ul,
     Struct,
@@ -81,10 +82,14 @@ LOW_EXPOSURE_BELOW_HZ = 6.0
 HIGH_EXPOSURE_ABOVE_HZ = 6.5
 TURNS_BEFORE_EXPOSURE = 3
 
+#: Codes of commands (manual 2.1.3); FC is from the SDK.
+MODES = {"start": 0xF0, "low_exposure": 0xF1, "high_exposure": 0xF2, "stop": 0xF5, "version": 0xFC}
+EXPOSURES = {"high": 1, "low": LOW_EXPOSURE}
+
 COMMAND = Checksummed(
     Struct(
         "header" / Const(b"\xaa\x55"),
-        "mode" / Int8ul * "F0 start, F1 low exposure, F2 high exposure, F5 stop; FC version (SDK)",
+        "mode" / Enum(Int8ul, **MODES),
         "checksum" / Int8ul,
     ),
     field="checksum",
@@ -97,7 +102,9 @@ def make_ack(header: bytes) -> Checksummed:
     return Checksummed(
         Struct(
             "header" / Const(header),
-            "mode" / Int8ul * "mode of the command ^ A0",
+            "mode"
+            / Enum(Int8ul, **{name: mode ^ 0xA0 for name, mode in MODES.items()})
+            * "mode of the command ^ A0",
             "length" / Const(7, Int8ul) * "bytes of data: firmware and reserved",
             "firmware" / Int8ul * "in the reply to start: 3 is V3.0",
             "reserved" / Bytes(6),
@@ -118,7 +125,7 @@ INFO = Checksummed(
         "zero_angle"
         / Scaled(Int16ul, 1, "deg")
         * "from the zero direction of the data to the mark on the housing, clockwise",
-        "direction" / Int8ul * "0: clockwise",
+        "direction" / Enum(Int8ul, clockwise=0),
         "correction" / Int8ul * "1: the host must correct the angles",
         "reserved" / Bytes(3),
         "revision" / Int8ul * "software revision",
@@ -207,7 +214,7 @@ DATA = make_data(
     M_AND_T,
     ByteSwapped(
         BitStruct(
-            DISTANCE, "intensity" / BitsInteger(8), "exposure" / BitsInteger(2) * "1 high, 2 low"
+            DISTANCE, "intensity" / BitsInteger(8), "exposure" / Enum(BitsInteger(2), **EXPOSURES)
         )
     ),
     (1, 2),
@@ -383,13 +390,13 @@ def older_sweep(i: int) -> dict[str, float]:
     }
 
 
-def make_request(mode: int, **more: Any) -> Command:
+def make_request(mode: str, **more: Any) -> Command:
     """Return the command that is acknowledged with the same mode.
 
     A repeated command has no further effect, so it is sent again if no reply arrives.
     """
     return Command(
-        "command", {"mode": mode}, reply="ack", matches={"mode": mode ^ 0xA0}, retries=1, **more
+        "command", {"mode": mode}, reply="ack", matches={"mode": mode}, retries=1, **more
     )
 
 
@@ -461,11 +468,11 @@ M1C1_MINI = Sensor(
     # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the 2-byte format
     links={"data": Serial(150_000, 115_200, dtr=False)},
     commands={
-        "start": make_request(0xF0, starts=True),
-        "stop": make_request(0xF5, stops=True),
-        "low_exposure": Command("command", {"mode": 0xF1}),
-        "high_exposure": Command("command", {"mode": 0xF2}),
-        "get_version": make_request(0xFC),
+        "start": make_request("start", starts=True),
+        "stop": make_request("stop", stops=True),
+        "low_exposure": Command("command", {"mode": "low_exposure"}),
+        "high_exposure": Command("command", {"mode": "high_exposure"}),
+        "get_version": make_request("version"),
     },
     fillers=b"\xfe\xff",
     # the device information printed in the manual, 2.2.2

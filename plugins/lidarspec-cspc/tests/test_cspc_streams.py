@@ -156,8 +156,8 @@ def test_which_commands_are_answered_and_by_what() -> None:
     for name, vector in {"start": "cspc_ack_start", "stop": "cspc_ack_stop"}.items():
         command = SENSOR.commands[name]
         assert command.reply == "ack"
-        assert dict(command.matches) == {"mode": SENSOR.parse(vector_bytes(FILE, vector)).mode}
-    assert dict(SENSOR.commands["get_version"].matches) == {"mode": 0x5C}
+        assert dict(command.matches) == {"mode": SENSOR.parse(vector_bytes(FILE, vector)).mode.name}
+    assert dict(SENSOR.commands["get_version"].matches) == {"mode": "version"}
     assert [SENSOR.commands[name].reply for name in ("low_exposure", "high_exposure")] == [
         None,
         None,

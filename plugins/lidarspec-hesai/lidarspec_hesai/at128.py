@@ -52,7 +52,7 @@ from lidarspec_hesai.crc_packets import (
     plausible,
 )
 from lidarspec_hesai.family import make_spinning_sensor
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, count_returns, rotation_values
+from lidarspec_hesai.parts import FACTORY, RETURN_MODE, UTC, count_returns, rotation_values
 
 AZIMUTH_STEPS_PER_DEG = 256 * 100  # per degree, with the finer azimuth
 CORRECTION_STEP_DEG = 2  # from correction to correction, of the mirror
@@ -183,7 +183,7 @@ TAIL = (
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
-    "return_mode" / Int8ul * RETURN_MODES,
+    "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
 )

@@ -41,7 +41,7 @@ from lidarspec_hesai.crc_packets import (
 from lidarspec_hesai.family import make_spinning_sensor
 from lidarspec_hesai.parts import (
     FACTORY,
-    RETURN_MODES,
+    RETURN_MODE,
     UTC,
     count_returns,
     make_points,
@@ -161,7 +161,7 @@ def make_tail(speed: float) -> Any:
         "tail_reserved" / Bytes(9),
         "azimuth_state" / Int16ul * "two bits per block, first block in the highest bits",
         "operational_state" / Int8ul * "0 high performance; else standard or energy saving",
-        "return_mode" / Int8ul * RETURN_MODES,
+        "return_mode" / RETURN_MODE,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,
         "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",

@@ -10,15 +10,22 @@ import datetime
 from typing import Any
 
 import numpy as np
-from construct import Bytes, Int8ul, Int16ul, Int32ul, Struct
+from construct import Bytes, Enum, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Clock, Fields, Polar, Scaled, unix_time
 from lidarspec_hesai.calibration import Calibration
 
-RETURN_MODES = (
-    "33 first, 34 second, 37 strongest, 38 last, 39 last and strongest, 3b first and last, 3c first"
-    " and strongest, 3d three"
-)
+RETURN_MODES = {
+    "first": 0x33,
+    "second": 0x34,
+    "strongest": 0x37,
+    "last": 0x38,
+    "last_and_strongest": 0x39,
+    "first_and_last": 0x3B,
+    "first_and_strongest": 0x3C,
+    "three": 0x3D,
+}
+RETURN_MODE = Enum(Int8ul, **RETURN_MODES)
 FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
 #: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models).
@@ -49,7 +56,7 @@ TAIL_40P = (
     "tail_reserved" / Bytes(2),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
-    "return_mode" / Int8ul * RETURN_MODES,
+    "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
 )

@@ -14,28 +14,49 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct, Switch, this
+from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32ub, Struct, Switch, this
 
 from lidarspec.spec import Address, Command, Fields, Frame, Scaled, SizeOf, Tcp
 
 CONTROL = Tcp(9347)
 MAX_PAYLOAD_BYTES = 1 << 16  # the longest known payload, the angles of an AT128, has 47,176
 
-RESULTS = (
-    "0 done, 1 bad parameter, 2 connection, 3 data, 4 memory, 5 not supported, 6 FPGA, 7 other"
-)
+RESULTS = {
+    "done": 0,
+    "bad_parameter": 1,
+    "connection": 2,
+    "data": 3,
+    "memory": 4,
+    "not_supported": 5,
+    "fpga": 6,
+    "other": 7,
+}
+CODES = {
+    "get_calibration": 0x05,
+    "get_inventory": 0x07,
+    "get_status": 0x09,
+    "reboot": 0x10,
+    "speed": 0x17,
+    "standby": 0x1C,
+    "return_mode": 0x1E,
+    "send_to": 0x20,
+    "get_firing_times": 0xA9,
+}
+RETURN_SETTINGS = {
+    "last": 0,
+    "strongest": 1,
+    "both": 2,
+    "first": 3,
+    "first_and_last": 4,
+    "first_and_strongest": 5,
+}
 SETTINGS = {
-    0x17: Struct("rate" / Scaled(Int16ub, 1, "rpm")),
-    0x1C: Struct("standby" / Int8ub * "1: the motor is stopped"),
-    0x1E: Struct(
-        "mode"
-        / Int8ub
-        * (
-            "0 last, 1 strongest, 2 both, 3 first, 4 first and last, 5 first and strongest, if"
-            " the model supports it"
-        )
+    "speed": Struct("rate" / Scaled(Int16ub, 1, "rpm")),
+    "standby": Struct("standby" / Enum(Int8ub, run=0, stop=1) * "whether the motor is stopped"),
+    "return_mode": Struct(
+        "mode" / Enum(Int8ub, **RETURN_SETTINGS) * "a mode that the model supports"
     ),
-    0x20: Struct(
+    "send_to": Struct(
         "host" / Bytes(4), "port" / Int16ub * "destination port of data", "gps_port" / Int16ub
     ),
 }
@@ -45,8 +66,8 @@ def make_message(payload: Construct) -> Struct:
     """Return the struct of a request or a reply with this payload."""
     return Struct(
         "sync" / Const(b"\x47\x74"),
-        "code" / Int8ub,
-        "result" / Int8ub * RESULTS,
+        "code" / Enum(Int8ub, **CODES),
+        "result" / Enum(Int8ub, **RESULTS),
         "length" / SizeOf(Int32ub, "payload"),
         "payload" / payload,
     )
@@ -69,7 +90,7 @@ FRAMES = {
 }
 
 
-def make_command(code: int, **more: Any) -> Command:
+def make_command(code: str, **more: Any) -> Command:
     fixed = {"code": code, "result": 0, **({} if code in SETTINGS else {"payload": b""})}
     return Command(
         "request",
@@ -87,17 +108,17 @@ def make_commands(rates: tuple[int, int]) -> Mapping[str, Command]:
     """Return the commands of a unit; `rates` are its lowest and highest speed in rpm."""
     return {
         "get_calibration": make_command(
-            0x05, learns=lambda reply: {"calibration": bytes(reply.payload)}
+            "get_calibration", learns=lambda reply: {"calibration": bytes(reply.payload)}
         ),
-        "get_firing_times": make_command(0xA9),
-        "get_inventory": make_command(0x07),
-        "get_status": make_command(0x09),
-        "reboot": make_command(0x10),
-        "speed": make_command(0x17, args={"rate": ("payload.rate", *rates)}),
-        "standby": make_command(0x1C, args={"standby": ("payload.standby", 0, 1)}),
-        "return_mode": make_command(0x1E, args={"mode": ("payload.mode", 0, 5)}),
+        "get_firing_times": make_command("get_firing_times"),
+        "get_inventory": make_command("get_inventory"),
+        "get_status": make_command("get_status"),
+        "reboot": make_command("reboot"),
+        "speed": make_command("speed", args={"rate": ("payload.rate", *rates)}),
+        "standby": make_command("standby", args={"standby": ("payload.standby", 0, 1)}),
+        "return_mode": make_command("return_mode", args={"mode": ("payload.mode", 0, 5)}),
         "send_to": make_command(
-            0x20,
+            "send_to",
             args={
                 "host": ("payload.host", Address()),
                 "port": ("payload.port", 1, 65535),

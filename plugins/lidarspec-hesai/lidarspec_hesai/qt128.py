@@ -30,7 +30,7 @@ from lidarspec_hesai.crc_packets import (
 from lidarspec_hesai.family import make_spinning_sensor
 from lidarspec_hesai.parts import (
     FACTORY,
-    RETURN_MODES,
+    RETURN_MODE,
     UTC,
     count_returns,
     make_points,
@@ -103,7 +103,7 @@ TAIL = (
     "tail_reserved" / Bytes(5),
     "mode_flag" / Int8ul * "bit 0: loop of the packet, with dual return",
     "tail_reserved_2" / Bytes(6),
-    "return_mode" / Int8ul * RETURN_MODES,
+    "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",

@@ -24,7 +24,7 @@ from lidarspec_hesai.header_packets import (
 )
 from lidarspec_hesai.parts import (
     FACTORY,
-    RETURN_MODES,
+    RETURN_MODE,
     UTC,
     count_returns,
     make_points,
@@ -63,7 +63,7 @@ TAIL = (
     "reserved" / Bytes(10),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
-    "return_mode" / Int8ul * RETURN_MODES,
+    "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
 )

@@ -27,7 +27,7 @@ from lidarspec_hesai.header_packets import (
 )
 from lidarspec_hesai.parts import (
     FACTORY,
-    RETURN_MODES,
+    RETURN_MODE,
     UTC,
     count_returns,
     make_points,
@@ -40,7 +40,7 @@ SHOT_PERIOD_S = 50e-6  # the last shot is at the packet's time
 
 TAIL = (
     "reserved" / Bytes(10),
-    "return_mode" / Int8ul * RETURN_MODES,
+    "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",

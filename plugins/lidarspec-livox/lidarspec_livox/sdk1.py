@@ -20,7 +20,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Float32l, Int8ul, Int16ul, Int32sl, Int32ul, Struct
+from construct import Array, Bytes, Const, Enum, Float32l, Int8ul, Int16ul, Int32sl, Int32ul, Struct
 
 from lidarspec.spec import (
     Address,
@@ -71,8 +71,9 @@ TIMESTAMP_TYPES = {
     4: ClockState("synchronized by PPS without a date", True, epoch="boot"),
 }
 IMU_RATE_HZ = 200
-MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
-STATES = "0 starting, 1 normal, 2 power saving, 3 standby, 4 error"
+MODEL_TYPES = {"Mid-40": 1, "Tele-15": 2, "Horizon LiDAR": 3, "Mid-70": 6, "Avia": 7}
+STATES = {"starting": 0, "normal": 1, "power_saving": 2, "standby": 3, "error": 4}
+CLOCKS = {"power_up": 0, "ptp": 1, "gps_and_pps": GPS, "pps": 4}
 COMMAND_PORT = 55_501
 DATA_PORT = 56_001
 IMU_PORT = 56_002  # of the host
@@ -98,7 +99,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
         / Int32ul
         * "bits 0-1 temperature, 2-3 voltage, 4-5 motor, 6-7 dirt ... 30-31 system: 0 normal, 1"
         " warning, 2 error",
-        "timestamp_type" / Int8ul * "0 since power-up, 1 PTP, 3 GPS and PPS: a date, 4 PPS",
+        "timestamp_type" / Enum(Int8ul, **CLOCKS) * "gps_and_pps: a date",
         "data_type" / Const(kind, Int8ul),
         "timestamp" / TIMESTAMP,
         *members,
@@ -253,9 +254,9 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
     )
 
 
-RESULT = "result" / Int8ul * "0 done, 1 failed"
+RESULT = "result" / Enum(Int8ul, done=0, failed=1)
 NET = (
-    "mode" / Int8ul * "0 DHCP, 1 static",
+    "mode" / Enum(Int8ul, dhcp=0, static=1),
     *(name / Bytes(4) for name in ("ip", "mask", "gateway")),
 )
 POSE = (
@@ -312,7 +313,7 @@ CONTROL: dict[str, Frame] = {
             NOTIFICATION,
             (0, 0),
             "broadcast_code" / Bytes(16),
-            "device_type" / Int8ul * MODEL_TYPES,
+            "device_type" / Enum(Int8ul, **MODEL_TYPES),
             "data_reserved" / Int16ul,
         )
     ),
@@ -325,7 +326,7 @@ CONTROL: dict[str, Frame] = {
             REPLY,
             (0, 3),
             RESULT,
-            "work_state" / Int8ul * STATES,
+            "work_state" / Enum(Int8ul, **STATES),
             "feature" / Int8ul * "bit 0: rain and fog",
             STATUS,
         )
@@ -375,7 +376,7 @@ def make_getter(number: tuple[int, int]) -> Command:
     return make_command("ask", "number", number)
 
 
-DONE = {"result": 0}
+DONE = {"result": "done"}
 COMMANDS: dict[str, Command] = {
     "handshake": make_command(
         "handshake",

@@ -25,6 +25,7 @@ from construct import (
     Bytes,
     Const,
     Default,
+    Enum,
     Float32l,
     Int8ul,
     Int16ul,
@@ -85,7 +86,7 @@ MAX_DATAGRAM_BYTES = 1472  # without fragmentation
 VARIABLE_COUNT = {"LS203": "a datagram contains any number of parameters"}
 SHOTS = np.arange(96)  # shot numbers of a simulated packet
 IMU_RATE_HZ = 200
-DEVICE_TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
+DEVICE_TYPES = {"MID-360": 9, "HAP, industrial": 10, "HAP": 15, "MID-360S": 35}
 
 
 #: Mid-360 protocol document, point data, time_type.
@@ -106,7 +107,7 @@ def make_packet(kind: int, *members: Any) -> Checksummed:
         "udp_cnt" / Int16ul * "packet counter within the frame",
         "frame_cnt" / Int8ul * "unused with a non-repetitive pattern",
         "data_type" / Const(kind, Int8ul),
-        "time_type" / Int8ul * "0 since power-up, 1 PTP or gPTP, 2 GPS",
+        "time_type" / Enum(Int8ul, power_up=0, ptp_or_gptp=1, gps=2),
         "pack_info" / Default(Int8ul, 0) * "tag format, for some firmware versions",
         "reserved" / Default(Bytes(11), bytes(11)),
         "crc32" / Int32ul * "CRC of all following bytes; 0: not set",
@@ -198,10 +199,10 @@ FOV = Struct(
 )
 #: Name -> key and value type of a parameter (Mid-360 protocol document; livox_lidar_def.h).
 PARAMETERS: dict[str, tuple[int, Any]] = {
-    "point_type": (0x0000, NUMBER * "1 millimetres, 2 centimetres, 3 spherical"),
+    "point_type": (0x0000, Enum(NUMBER, millimetres=1, centimetres=2, spherical=3)),
     "scan_pattern": (
         0x0001,
-        NUMBER * "0 non-repetitive, 1 repetitive, 2 repetitive at a low frame rate",
+        Enum(NUMBER, non_repetitive=0, repetitive=1, repetitive_low_frame_rate=2),
     ),
     "lidar_address": (0x0004, NET),
     "state_host": (0x0005, HOST),
@@ -211,9 +212,9 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "fov_0": (0x0015, FOV),
     "fov_1": (0x0016, FOV),
     "fov_enabled": (0x0017, NUMBER * "bit 0: fov_0, bit 1: fov_1"),
-    "detect_mode": (0x0018, NUMBER * "0 normal, 1 sensitive"),
+    "detect_mode": (0x0018, Enum(NUMBER, normal=0, sensitive=1)),
     "io_functions": (0x0019, Bytes(4)),
-    "work_mode": (0x001A, NUMBER * "1 sampling, 2 idle, 9 ready"),
+    "work_mode": (0x001A, Enum(NUMBER, sampling=1, idle=2, ready=9)),
     "imu_enabled": (0x001C, NUMBER),
     "serial": (0x8000, Bytes(16)),
     "app_version": (0x8002, Array(4, Int8ul)),
@@ -222,16 +223,25 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "mac": (0x8005, Bytes(6)),
     "work_state": (
         0x8006,
-        NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starting, 8 upgrade, 9 ready",
+        Enum(
+            NUMBER,
+            sampling=1,
+            idle=2,
+            error=4,
+            self_check=5,
+            motor_starting=6,
+            upgrade=8,
+            ready=9,
+        ),
     ),
     "core_temperature": (0x8007, Scaled(Int32sl, 0.01, "degC")),
     "power_ups": (0x8008, Int32ul),
     "local_time": (0x8009, Scaled(Int64ul, 1, "ns")),
     "last_sync": (0x800A, Scaled(Int64ul, 1, "ns")),
     "time_offset": (0x800B, Scaled(Int64sl, 1, "ns")),
-    "time_sync": (0x800C, NUMBER * "0 none, 1 PTP, 2 gPTP, 3 GPS"),
+    "time_sync": (0x800C, Enum(NUMBER, none=0, ptp=1, gptp=2, gps=3)),
     "diagnosis": (0x800E, Int16ul),
-    "firmware_type": (0x8010, NUMBER * "0 loader, 1 application"),
+    "firmware_type": (0x8010, Enum(NUMBER, loader=0, application=1)),
     "hms_codes": (0x8011, Array(8, Int32ul)),
 }
 
@@ -255,13 +265,17 @@ PARAMETER_LIST = (
     ),
 )
 RESERVED = "data_reserved" / Default(Int16ul, 0)
-RESULT = (
-    "result"
-    / Int8ul
-    * (
-        "0 done, 1 failed, 2 not now, 3 out of range, 20 unknown, 21 after a reboot, 22 read"
-        " only, 23 length, 24 keys"
-    )
+RESULT = "result" / Enum(
+    Int8ul,
+    done=0,
+    failed=1,
+    not_now=2,
+    out_of_range=3,
+    unknown_key=20,
+    after_a_reboot=21,
+    read_only=22,
+    wrong_length=23,
+    wrong_number_of_keys=24,
 )
 
 
@@ -371,7 +385,7 @@ FRAMES: dict[str, Frame] = {
         make_message(
             0x0000,
             RESULT,
-            "device_type" / Int8ul * DEVICE_TYPES,
+            "device_type" / Enum(Int8ul, **DEVICE_TYPES),
             "serial" / Bytes(16),
             "address" / Bytes(4),
             "command_port" / Int16ul,

@@ -21,7 +21,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Int8ub, Int8ul, Int16ub, Int16ul, Int32ul, Struct
+from construct import Array, Bytes, Const, Enum, Int8ub, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
 from lidarspec.spec import (
@@ -90,8 +90,8 @@ DATA = Struct(
     ),
     *DATE,
     "nanosecond" / Scaled(Int32ul, 1e-9, "s"),
-    "return_mode" / Int8ub * "0x37 single, 0x39 dual",
-    "model" / Int8ub * "0x10 C16, 0x12 C16 domestic",
+    "return_mode" / Enum(Int8ub, single=STRONGEST, dual=DUAL),
+    "model" / Enum(Int8ub, **{"C16": 0x10, "C16 domestic": 0x12}),
 )
 DIFOP = Struct(
     "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),

@@ -30,7 +30,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
+from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32ub, Struct
 
 from lidarspec.spec import Fields, Frame, PacketCounter, Polar, Relative, Scaled, Sensor, Simulation
 from lidarspec_robosense.rotor import (
@@ -61,6 +61,7 @@ STRONGEST = 4  # return modes (manual 5.4.2)
 FIRING_PERIOD_S = 55.56e-6  # from one firing of all lasers to the next (rs_driver, nebula)
 TYPE_5515 = 6
 TYPE_1615 = 7  # and 16P
+LIDAR_TYPES = {"Helios-5515": TYPE_5515, "Helios-1615 and Helios-16P": TYPE_1615}
 #: Microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
 TIMES_16P_US = (
     0,
@@ -107,15 +108,15 @@ def make_packet(rows: Construct) -> Struct:
     """Return the struct of a data packet with these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
-        "protocol_version" / Int16ub * "0 old, 1 latest",
+        "protocol_version" / Enum(Int16ub, old=0, latest=1),
         "reserved_6" / Bytes(2),
         "top_packet_count" / Bytes(4) * "four counts, each 3 above the previous one",
         "bottom_packet_count" / Int32ub * "packet counter",
         "reserved_16" / Bytes(1),
-        "range_resolution" / Int8ub * "1: 2.5 mm, 0: 5 mm",
+        "range_resolution" / Enum(Int8ub, **{"5 mm": 0, "2.5 mm": 1}),
         "angle_pulse_interval" / Scaled(Int16ub, 1e-6, "s"),
         *TIME,
-        "lidar_type" / Int8ub * "6 Helios-5515, 7 Helios-1615 and Helios-16P",
+        "lidar_type" / Enum(Int8ub, **LIDAR_TYPES),
         "reserved_31" / Bytes(7),
         "temperature" / TEMPERATURE,
         "reserved_40" / Bytes(2),

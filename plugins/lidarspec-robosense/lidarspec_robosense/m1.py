@@ -34,11 +34,12 @@ from construct import (
     Check,
     Const,
     Construct,
+    Enum,
     Int8sb,
     Int8ub,
     Int16ub,
     Int24ub,
-    OneOf,
+    Mapping,
     Struct,
     this,
 )
@@ -56,7 +57,14 @@ from lidarspec.spec import (
     Simulation,
     Udp,
 )
-from lidarspec_robosense.rotor import TIME, make_clock_status
+from lidarspec_robosense.rotor import (
+    RETURN_NUMBERS,
+    SYNC_MODES,
+    SYNC_STATES,
+    TIME,
+    WAVE_MODES,
+    make_clock_status,
+)
 
 BLOCKS = 25
 CHANNELS = 5
@@ -72,11 +80,11 @@ HEADER_START: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
     "pkt_psn" / Int16ub * "packet counter within the frame; M1: 1 to 630, with dual return to 1260",
     "protocol_version" / Int16ub,
-    "wave_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
-    "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
+    "wave_mode" / Enum(Int8ub, **WAVE_MODES),
+    "time_sync_mode" / Enum(Int8ub, **SYNC_MODES),
     *TIME,
     "reserved" / Bytes(10),
-    "lidar_type" / Int8ub * "0x10: M1",
+    "lidar_type" / Int8ub * "of an M1: 0x10",
 )
 #: Firmware -> temperature of the mirror. "current": as in the M1P user guide and rs_driver; "2021":
 #: as in rs_driver of April 2021; "": unknown.
@@ -92,7 +100,7 @@ BLOCKS_AND_TAIL: tuple[Construct, ...] = (
         BLOCKS,
         Struct(
             "time_offset" / Scaled(Int8ub, 1e-6, "s") * "added to the time of the packet",
-            "return_seq" / Int8ub * "0 single return, 1 first (nearer), 2 second (farther)",
+            "return_seq" / Enum(Int8ub, **RETURN_NUMBERS) * "the first is nearer",
             "channels"
             / Array(
                 CHANNELS,
@@ -123,9 +131,9 @@ DIFOP_HEAD: tuple[Construct, ...] = (
 )
 FIRMWARE = ("pl_firmware" / Bytes(5), "ps_firmware" / Bytes(5))
 MODES: tuple[Construct, ...] = (
-    "return_mode" / OneOf(Int8ub, [0, 4, 5, 6]) * "0 dual, 4 strongest, 5 last, 6 first",
-    "time_sync_mode" / OneOf(Int8ub, range(4)) * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
-    "time_sync_status" / OneOf(Int8ub, range(3)) * "0 none, 1 locked, 2 timeout",
+    "return_mode" / Mapping(Int8ub, WAVE_MODES),
+    "time_sync_mode" / Mapping(Int8ub, SYNC_MODES),
+    "time_sync_status" / Mapping(Int8ub, SYNC_STATES),
     *TIME,
     "in_range" / Check((this.microseconds < 1_000_000) & (this.seconds < 2**36)),
 )

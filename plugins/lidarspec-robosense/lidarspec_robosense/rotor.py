@@ -27,6 +27,7 @@ from construct import (
     ByteSwapped,
     Const,
     Construct,
+    Enum,
     Int8ub,
     Int16ub,
     Int24ub,
@@ -106,11 +107,15 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
 
     `step` is the step of the size in degrees.
     """
-    sign = Int8ub * "0 positive, 1 negative, 255 not calibrated"
+    sign = Enum(Int8ub, positive=0, negative=1, not_calibrated=255)
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
 
 
-SYNC_MODES = "0 internal, 1 PPS, 2 PTP, 3 gPTP"
+#: Codes of DIFOP and of the packets of an M1 (user guides).
+SYNC_MODES = {"internal": 0, "PPS": 1, "PTP": 2, "gPTP": 3}
+SYNC_STATES = {"none": 0, "locked": 1, "timeout": 2}
+WAVE_MODES = {"dual": 0, "strongest": 4, "last": 5, "first": 6}
+RETURN_NUMBERS = {"single": 0, "first": 1, "second": 2}
 SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
 
 
@@ -172,8 +177,8 @@ DIFOP_UNIT: tuple[Construct, ...] = (
 )
 #: Bytes 301 to 312 of the second layout.
 DIFOP_TIME: tuple[Construct, ...] = (
-    "time_sync_mode" / Int8ub * SYNC_MODES,
-    "time_sync_status" / Int8ub * "0 none, 1 locked, 2 timeout",
+    "time_sync_mode" / Enum(Int8ub, **SYNC_MODES),
+    "time_sync_status" / Enum(Int8ub, **SYNC_STATES),
     *TIME,
 )
 #: Bytes 313 to 467 of the first layout.

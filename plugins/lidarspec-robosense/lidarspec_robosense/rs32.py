@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, Struct
+from construct import Array, Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int24ub, Struct
 
 from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled, Sensor, Simulation, unix_time
 from lidarspec_robosense.rotor import (
@@ -116,7 +116,7 @@ def make_packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
         "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
         "reserved_8" / Bytes(12),
         *time,
-        "lidar_type" / Int8ub * "1 RS-LiDAR-16, 2 RS-LiDAR-32",
+        "lidar_type" / Enum(Int8ub, **{"RS-LiDAR-16": RS16_TYPE, "RS-LiDAR-32": RS32_TYPE}),
         "series" / Int8ub * "3: RS-Bpearl version 4",
         "version" / Int8ub * "4: RS-Bpearl version 4",
         "reserved_33" / Bytes(5),

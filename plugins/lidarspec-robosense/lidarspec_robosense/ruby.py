@@ -26,7 +26,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import BitsInteger, BitStruct, Bytes, Const, Int8ub, Int16ub, Struct
+from construct import BitsInteger, BitStruct, Bytes, Const, Enum, Int8ub, Int16ub, Struct
 from numpy.typing import NDArray
 
 from lidarspec.spec import Clock, Fields, Frame, Polar, Relative, Sensor, Simulation
@@ -55,6 +55,12 @@ DUAL = 3
 PLUS_SERIES = 5
 #: Lasers -> model number of a Ruby Plus.
 MODELS = {128: 1, 80: 2, 48: 4}
+MODEL_NAMES = {
+    "RS-Ruby Plus": 1,
+    "RS-Ruby Plus 80": 2,
+    "RS-Ruby Plus 80V": 3,
+    "RS-Ruby Plus 48": 4,
+}
 MODEL_80V = 3
 #: Lasers -> blocks per packet.
 BLOCKS = {128: 3, 80: 4, 48: 8}
@@ -71,16 +77,15 @@ def make_packet(lasers: int) -> Struct:
         "reserved_6" / Bytes(1),
         "wave_mode"
         / BitStruct(
-            "reserved" / BitsInteger(4), "returns" / BitsInteger(4) * "1 first, 2 second, 3 both"
+            "reserved" / BitsInteger(4),
+            "returns" / Enum(BitsInteger(4), first=1, second=2, both=3),
         ),
         "temperature" / TEMPERATURE_BE,
         *TIME,
         "reserved_20" / Bytes(10),
         "type_30" / Int8ub * "the series, according to rs_driver",
         "series" / Int8ub * "5 RS-Ruby Plus; the model, according to rs_driver",
-        "model"
-        / Int8ub
-        * "1 RS-Ruby Plus, 2 RS-Ruby Plus 80, 3 RS-Ruby Plus 80V, 4 RS-Ruby Plus 48",
+        "model" / Enum(Int8ub, **MODEL_NAMES),
         "reserved_33" / Bytes(47),
         "blocks" / make_blocks(BLOCKS[lasers], lasers, 0.005, flag=flag),
         "reserved_end" / Bytes(END_BYTES[lasers]),

@@ -24,6 +24,7 @@ from construct import (
     Bytes,
     Const,
     Construct,
+    Enum,
     Float32b,
     Int8ub,
     Int16sb,
@@ -44,7 +45,7 @@ from lidarspec.spec import (
     stack,
 )
 from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1, count_returns, number_firings
-from lidarspec_robosense.rotor import TIME, make_clock_status
+from lidarspec_robosense.rotor import RETURN_NUMBERS, TIME, make_clock_status
 
 # return modes
 DUAL = 0
@@ -101,7 +102,7 @@ def make_packet(
 
 
 RADIUS = "radius" / Scaled(Int16ub, 0.005, "m") * "0: no return"
-ATTRIBUTE = "attribute" / Int8ub * "E1: 1 normal, 2 noise"
+ATTRIBUTE = "attribute" / Enum(Int8ub, normal=1, noise=2) * "of an E1"
 ONE_RETURN = (RADIUS, *UNIT_VECTOR, "intensity" / Int8ub, ATTRIBUTE)
 TWO_RETURNS = (
     RADIUS,
@@ -111,7 +112,7 @@ TWO_RETURNS = (
     "second_intensity" / Int8ub,
     ATTRIBUTE,
 )
-RETURN_NUMBER = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
+RETURN_NUMBER = "return_seq" / Enum(Int8ub, **RETURN_NUMBERS)
 UNCHECKED_NOTE = "not checked: the covered bytes are not documented"
 CRC_AND_COUNTER = ("crc" / Int32ub * UNCHECKED_NOTE, "rolling_counter" / Int16ub)
 
@@ -151,12 +152,12 @@ E1_DIFOP = Struct(
     "reserved_74" / Bytes(25),
     "frame_rate" / Scaled(Int8ub, 1, "Hz"),
     "return_mode"
-    / Int8ub
-    * "0 farthest, 4 strongest, 7 nearest, 8 second strongest, 9 to 11 two of these",
-    "time_sync_mode" / Int8ub * "0 internal, 2 E2E L2, 3 gPTP",
-    "time_sync_status" / Int8ub * "0 failed, 1 success, 2 timeout",
+    / Enum(Int8ub, farthest=0, strongest=4, nearest=7, second_strongest=8)
+    * "9 to 11: two of these",
+    "time_sync_mode" / Enum(Int8ub, **{"internal": 0, "E2E L2": 2, "gPTP": 3}),
+    "time_sync_status" / Enum(Int8ub, failed=0, success=1, timeout=2),
     *TIME,
-    "phy_mode" / Int8ub * "0 negotiated, 1 master, 2 slave",
+    "phy_mode" / Enum(Int8ub, negotiated=0, master=1, slave=2),
     "reserved_114" / Bytes(94),
     *(f"acceleration_{axis}" / Scaled(Float32b, GRAVITY, "m/s2") * "sent in g" for axis in "xyz"),
     *(f"rotation_{axis}" / Scaled(Float32b, 1, "rad/s") for axis in "xyz"),

@@ -163,7 +163,7 @@ def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, co
 def test_a_refusal_is_reported_at_once_in_words(cola: str) -> None:
     sensor = TIM551.configure(cola=cola)
     if cola == "A":
-        assert sensor.parse(b"\x02sFA 3\x03", "refused").error == "variable_unknown"
+        assert sensor.parse(b"\x02sFA 3\x03", "refused").error.name == "variable_unknown"
     refused = (("refused", {"error": 4}),)
     sensor = replace(
         sensor,

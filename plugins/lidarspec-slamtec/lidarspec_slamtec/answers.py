@@ -20,6 +20,7 @@ from construct import (
     ByteSwapped,
     Const,
     Construct,
+    Enum,
     Int8ul,
     Int16ul,
     Int32ul,
@@ -38,9 +39,22 @@ MAX_MODE_NAME_BYTES = 64  # SDK, LidarScanMode
 #: GetModelNameStringByModelID).
 SERIES = {0x1: ("A1", (8,)), 0x2: ("A2", (4, 6, 7, 8, 12)), 0x3: ("A3", (1,)), 0x4: ("C1", (1,))}
 SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T1", (1,))}
-MODEL_NUMBERS = ", ".join(
-    f"0x{high:x}{low:x} RPLIDAR {name}" for high, (name, models) in SERIES.items() for low in models
-)
+
+
+def name_model(series: str, low: int) -> str:
+    """Return the name of a model; with its own name if the series has several models."""
+    several = {"A2", "S2", "S3"}
+    if series in several:
+        return f"RPLIDAR {series}, {series}M{low}"
+    return f"RPLIDAR {series}"
+
+
+MODEL_NUMBERS = {
+    name_model(series, low): high << 4 | low
+    for high, (series, models) in SERIES.items()
+    for low in models
+}
+STATUSES = Enum(Int8ul, good=0, warning=1, error=2)
 
 #: Keys of configuration values: the first two of the sensor, the others of one of its scan modes.
 MODE_COUNT = 0x70
@@ -50,6 +64,10 @@ MAX_DISTANCE = 0x74
 ANSWER_TYPE = 0x75
 MODE_NAME = 0x7F
 
+#: Streams -> the type of their descriptors.
+STREAMS = {"scan": 0x81, "express": 0x82, "hq": 0x83, "ultra": 0x84, "dense": 0x85}
+STREAMS |= {"ultra_dense": 0x86}
+
 #: Configuration values of fixed width, by key.
 VALUES: dict[int, Construct] = {
     MODE_COUNT: "mode_count" / Int16ul,
@@ -57,7 +75,7 @@ VALUES: dict[int, Construct] = {
     US_PER_SAMPLE: "us_per_sample" / Scaled(Int32ul, 1 / 256, "us"),
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
     ANSWER_TYPE: "answer_type"
-    / Int8ul
+    / Enum(Int8ul, **STREAMS)
     * "type in the descriptor that precedes the data frames of the mode",
 }
 _VALUE_BYTES = np.full(MODE_NAME + 1, np.nan)
@@ -125,15 +143,13 @@ ANSWERS = {
     "info": make_reply(
         0x04,
         20,
-        "model" / Int8ul * f"high nibble: series, low nibble: model; {MODEL_NUMBERS}",
+        "model" / Enum(Int8ul, **MODEL_NUMBERS) * "high nibble: series, low nibble: model",
         "firmware_minor" / Int8ul,
         "firmware_major" / Int8ul,
         "hardware" / Int8ul,
         "serial" / Bytes(16),
     ),
-    "health": make_reply(
-        0x06, 3, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul
-    ),
+    "health": make_reply(0x06, 3, "status" / STATUSES, "error" / Int16ul),
     "sample_rate": make_reply(
         0x15, 4, "standard" / Scaled(Int16ul, 1, "us"), "express" / Scaled(Int16ul, 1, "us")
     ),

@@ -21,7 +21,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Const, Int8ul
+from construct import Const, Enum, Int8ul
 
 from lidarspec.spec import Clock, Frame, OnWrap, Relative, Sensor, Simulation, Udp, hookimpl
 from lidarspec_velodyne.firings import Firings, configure, pace, points, sweep
@@ -197,7 +197,7 @@ VLS128_FRAMES = {
         make_packet(
             BANK,
             0.004,
-            Int8ul * "0x37 strongest, 0x38 last",
+            Enum(Int8ul, strongest=0x37, last=0x38),
             Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
         ),
         data=True,

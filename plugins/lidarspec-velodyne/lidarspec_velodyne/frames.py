@@ -19,6 +19,7 @@ from construct import (
     Bytes,
     Const,
     Construct,
+    Enum,
     Int8ul,
     Int16sl,
     Int16ub,
@@ -73,11 +74,17 @@ def make_packet(
     )
 
 
-MODE = Int8ul * "0x37 strongest, 0x38 last, 0x39 dual; not set by HDL-32E firmware before 2.2.20"
-BANK = Int16ub * "0xFFEE lasers 1 to 32, 0xFFDD 33 to 64, 0xFFCC 65 to 96, 0xFFBB 97 to 128"
-PRODUCT = Int8ul * (
-    "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; unreliable: VLP-16 with old firmware sends 0x21"
-)
+MODE_CODES = {"strongest": STRONGEST, "last": 0x38, "dual": DUAL}
+MODE = Enum(Int8ul, **MODE_CODES) * "not set by HDL-32E firmware before 2.2.20"
+BANK_CODES = {
+    "lasers_1_to_32": 0xFFEE,
+    "lasers_33_to_64": 0xFFDD,
+    "lasers_65_to_96": 0xFFCC,
+    "lasers_97_to_128": 0xFFBB,
+}
+BANK = Enum(Int16ub, **BANK_CODES)
+PRODUCT_CODES = {"HDL-32E": 0x21, "VLP-16": 0x22, "Puck Hi-Res": 0x24}
+PRODUCT = Enum(Int8ul, **PRODUCT_CODES) * "unreliable: VLP-16 with old firmware sends 0x21"
 
 POSITION = Struct(
     "zeros" / Const(bytes(14)),
@@ -101,11 +108,11 @@ POSITION = Struct(
     "adc_temperature" / Scaled(Int8ul, 1, "degC") * "at the last calibration of the ADC",
     "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "change since the last calibration",
     "adc_age" / Scaled(Int32ul, 1, "s") * "time since the last calibration",
-    "adc_reason" / Int8ul * "0 none, 1 power-on, 2 manual, 3 temperature, 4 periodic",
+    "adc_reason" / Enum(Int8ul, none=0, power_on=1, manual=2, temperature=3, periodic=4),
     "adc_status" / Int8ul * "bit 0 calibrating, 1 temperature limit met, 2 time limit met",
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full hour",
-    "pps" / Int8ul * "0 absent, 1 synchronizing, 2 locked, 3 error",
-    "thermal_status" / Int8ul * "0 ok, 1 shut down",
+    "pps" / Enum(Int8ul, absent=0, synchronizing=1, locked=2, error=3),
+    "thermal_status" / Enum(Int8ul, ok=0, shut_down=1),
     "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "at the last thermal shutdown",
     "power_up_temperature" / Scaled(Int8ul, 1, "degC"),
     "nmea"

@@ -25,7 +25,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from construct import Array, Int8ul, Int16ub, Int16ul, Int32ul, Struct
+from construct import Array, Enum, Int8ul, Int16ub, Int16ul, Int32ul, Struct
 
 from lidarspec import UsageError
 from lidarspec.spec import (
@@ -159,7 +159,7 @@ S3 = Unit(
 
 CHANNEL = Struct("distance" / Scaled(Int16ul, 0.002, "m") * "0: no return", "intensity" / Int8ul)
 BLOCK = Struct(
-    "flag" / Int16ub * "0xFFEE lasers 1 to 32, 0xFFDD 33 to 64",
+    "flag" / Enum(Int16ub, lasers_1_to_32=UPPER_BANK, lasers_33_to_64=LOWER_BANK),
     "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise from the forward axis",
     "channels" / Array(SLOTS, CHANNEL),
 )

@@ -7,7 +7,7 @@ from typing import Any
 from lidarspec import Sensor
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.exports.reference import effect
-from lidarspec.frames.commands import argument_slot
+from lidarspec.frames.commands import argument_slot, list_choices
 from lidarspec.spec.arguments import Range
 
 
@@ -58,10 +58,7 @@ def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
     if not isinstance(kind, Range):
         text = ": ".join(filter(None, (info.docs, format_argument_type(kind))))
         return {**field, "text": text, "low": None, "high": None, "choices": []}
-    labels = {float(info.physical(raw)): label for raw, label in info.labels.items()}
     choices = [
-        {"value": f"{value:g}", "text": label}
-        for value, label in labels.items()
-        if kind.low <= value <= kind.high
+        {"value": f"{value:g}", "text": label} for label, value in list_choices(info, kind).items()
     ]
     return {**field, "text": info.docs, "low": kind.low, "high": kind.high, "choices": choices}

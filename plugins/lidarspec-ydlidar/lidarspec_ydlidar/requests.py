@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from construct import Bytes, Const, Construct, Int8ul, Int16ul, Int32ul, Struct
+from construct import Bytes, Const, Construct, Enum, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Checksummed, Command, Frame, Scaled, Xor
 from lidarspec_ydlidar.models import MODELS
@@ -34,15 +34,14 @@ ANSWERS = {
     "info": make_reply(
         0x04,
         "model"
-        / Int8ul
-        * ", ".join(f"{model.number} {name}" for name, model in MODELS.items() if model.number),
+        / Enum(Int8ul, **{name: model.number for name, model in MODELS.items() if model.number}),
         "firmware" / Struct("minor" / Int8ul, "major" / Int8ul),
         "hardware" / Int8ul,
         "serial" / Bytes(16) * "one digit per byte",
         size=20,
     ),
     "health": make_reply(
-        0x06, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul, size=3
+        0x06, "status" / Enum(Int8ul, good=0, warning=1, error=2), "error" / Int16ul, size=3
     ),
     "speed": make_reply(
         0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "scans per second", size=4

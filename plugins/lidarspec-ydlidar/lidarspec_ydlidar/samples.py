@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from construct import BitsInteger, BitStruct, ByteSwapped, Construct, Int16ul, Struct
+from construct import BitsInteger, BitStruct, ByteSwapped, Construct, Enum, Int16ul, Struct
 
 from lidarspec.spec import Scaled
 
@@ -60,13 +60,13 @@ def make_packed_sample(*lower_fields: Construct) -> Construct:
     )
 
 
-FLAGS = "flags" / BitsInteger(2)
-REFLECTION_FLAGS = FLAGS * "2: mirror or glass, 3: sunlight"
-SAMPLE_8 = make_packed_sample(REFLECTION_FLAGS, "intensity" / BitsInteger(8))
+REFLECTION = "flags" / Enum(BitsInteger(2), plain=0, mirror_or_glass=2, sunlight=3)
+SAMPLE_8 = make_packed_sample(REFLECTION, "intensity" / BitsInteger(8))
 
 TRIANGLE = Form(make_plain_distance(0.00025), correction=camera_angle)
 TRIANGLE_FLAGGED = Form(
-    make_packed_sample(FLAGS * "not 0: interference from another lidar"), correction=camera_angle
+    make_packed_sample("flags" / BitsInteger(2) * "not 0: interference from another lidar"),
+    correction=camera_angle,
 )
 TRIANGLE_8 = Form(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
 TRIANGLE_10 = Form(

@@ -1,0 +1,165 @@
+"""Tests of codes: a field with construct's Enum is a number with a name."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from pathlib import Path
+
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Enum,
+    GreedyBytes,
+    Int8ul,
+    Int16ul,
+    NullTerminated,
+    Struct,
+)
+
+import lidarspec as ls
+from lidarspec import Sensor, UsageError
+from lidarspec.device.session import Session
+from lidarspec.explaining.assignments import parse_arguments, parse_values
+from lidarspec.explaining.explanation import explain
+from lidarspec.explaining.formatting import describe_argument
+from lidarspec.frames.schema import make_schema
+from lidarspec.framing.results import Found
+from lidarspec.spec import Command, EnumValue, Frame, Serial
+
+MODE = Enum(Int8ul, idle=1, strongest=0x37, **{"last and strongest": 0x39})
+HEAD = (
+    "sync" / Const(b"\xa5"),
+    "mode" / MODE,
+    "flags" / BitStruct("level" / Enum(BitsInteger(6), low=0, high=1), "on_air" / BitsInteger(2)),
+    "modes" / Array(2, MODE),
+    "model" / Enum(Int16ul, **{"ACME X1": 0x18, "ACME X2": 0x1F}),
+)
+FRAMES = {
+    "report": Frame(Struct(*HEAD)),
+    "text": Frame(
+        Struct("sync" / Const(b"\x5a"), "mode" / MODE, "text" / NullTerminated(GreedyBytes)),
+        max_length=20,
+    ),
+    "set": Frame(Struct("sync" / Const(b"\xc3"), "mode" / MODE), direction="out"),
+}
+DATA = bytes.fromhex("a5 37 06 39 63 18 00")
+
+
+def make_sensor(**more: object) -> Sensor:
+    return Sensor(
+        "acme-codes",
+        vendor="ACME",
+        model="ACME X1",
+        frames=FRAMES,
+        links={"data": Serial(9600)},
+        commands={
+            "set_mode": Command("set", args={"mode": ("mode", 0, 0x37)}, reply="report"),
+            "idle": Command("set", {"mode": "idle"}, reply="report", matches={"mode": "idle"}),
+        },
+        info={"model": "report.model"},
+        status="manual",
+        source="invented",
+        **more,
+    )
+
+
+SENSOR = make_sensor()
+
+
+def test_a_code_is_its_number_with_a_name() -> None:
+    for value in (SENSOR.parse(DATA).mode, SENSOR.parse(b"\x5a\x37ab\0").mode):
+        assert isinstance(value, EnumValue)
+        assert value == 0x37 == int(value)
+        assert hash(value) == hash(0x37)
+        assert {0x37: "found"}[value] == "found"
+        assert (value.name, str(value), f"{value}", f"{value:#04x}") == (
+            "strongest",
+            "strongest (0x37)",
+            "strongest (0x37)",
+            "0x37",
+        )
+        assert json.dumps([value]) == "[55]"
+        for again in (copy.deepcopy(value), pickle.loads(pickle.dumps(value))):
+            assert (again, again.name) == (0x37, "strongest")
+
+
+def test_names_of_bits_arrays_and_unknown_codes() -> None:
+    parsed = SENSOR.parse(DATA)
+    assert (str(parsed.flags.level), parsed.flags.on_air) == ("high (1)", 2)
+    assert [value.name for value in parsed.modes] == ["last and strongest", ""]
+    assert str(parsed.modes[1]) == "99"
+    assert SENSOR.parse(b"\x5a\x63\0").mode.name == ""
+
+
+@pytest.mark.parametrize("data", [DATA, b"\x5a\x37ab\0", b"\x5a\x63\0"])
+def test_parsed_codes_rebuild_the_bytes(data: bytes) -> None:
+    parsed = SENSOR.parse(data)
+    frame = "report" if data == DATA else "text"
+    assert SENSOR.build(frame, parsed) == data
+    assert SENSOR.build(frame, dict(parsed, mode="strongest"))[1] == 0x37
+
+
+def test_columns_stay_integers() -> None:
+    packets = SENSOR.decode(DATA * 3, frame="report")
+    assert packets.raw["mode"].dtype == "u1"
+    assert packets["mode"].tolist() == [55] * 3
+
+
+def test_explanations_show_names_and_unknown_codes() -> None:
+    fields = explain(DATA, SENSOR).fields
+    assert str(fields["mode"]) == "strongest (0x37)"
+    assert str(fields["flags.level"]) == "high (1)"
+    assert str(fields["modes[1]"]) == "unknown code (0x63)"
+    assert fields["modes[1]"].to_dict()["unknown"] is True
+    assert fields["flags.on_air"].has_meaning is False
+
+
+def test_build_on_the_command_line_takes_a_name_or_a_number() -> None:
+    schema = make_schema(FRAMES["report"].tree)
+    for text in ("mode=last and strongest", "mode=0x39", "mode=57"):
+        assert parse_values(schema, [text], "x") == {"mode": 0x39}
+
+
+def test_arguments_take_names_within_their_range() -> None:
+    assert SENSOR.command("set_mode", mode="strongest") == b"\xc3\x37"
+    assert SENSOR.command("set_mode", mode=0x37) == b"\xc3\x37"
+    assert SENSOR.command("set_mode", mode=EnumValue(1, "idle")) == b"\xc3\x01"
+    for name in ("last and strongest", "fastest"):  # one is beyond the range, one is no name
+        with pytest.raises(UsageError, match="idle or strongest"):
+            SENSOR.command("set_mode", mode=name)
+    assert parse_arguments(SENSOR, "set_mode", ["mode=idle"]) == {"mode": "idle"}
+    assert parse_arguments(SENSOR, "set_mode", ["mode=0x37"]) == {"mode": 0x37}
+    assert describe_argument(SENSOR, "set_mode", "mode") == "idle|strongest"
+
+
+def test_a_reply_must_have_the_code_that_is_named() -> None:
+    session = Session(SENSOR)
+    request = session.request("idle", 0)
+    session.tick(0)
+    session.receive([Found("report", 0, DATA)], 1)
+    assert not request.done
+    session.receive([Found("report", 0, b"\xa5\x01" + DATA[2:])], 2)
+    assert request.done
+
+
+def test_info_gives_names(tmp_path: Path) -> None:
+    path = tmp_path / "some.bin"
+    path.write_bytes(DATA * 70)
+    with ls.open(path, SENSOR) as device:
+        list(device.packets("report"))
+        assert device.info == {"model": "ACME X1"}
+        assert not device.warnings
+
+
+def test_unknown_codes_are_a_warning_once(tmp_path: Path) -> None:
+    path = tmp_path / "some.bin"
+    path.write_bytes(b"\xa5\x00" + DATA[2:] + (b"\xa5\x63" + DATA[2:]) * 70)
+    with ls.open(path, SENSOR) as device:
+        list(device.packets("report"))
+        assert len(device.warnings) == 1
+        assert "report.mode is 99, an unknown code" in device.warnings[0]
