@@ -11,10 +11,12 @@ from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
 from lidarspec.frames.parse import identify
+from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
+from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -70,8 +72,10 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
         return
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, "building it gives other bytes"
+    fields = make_schema(sensor.frames[command.frame].tree).fields
     for path, value in command.fixed.items():
-        assert get_nested(parsed, path) == value, (
+        expected = find_code(fields[path], value) if path in fields else value
+        assert get_nested(parsed, path) == expected, (
             f"{path} is {get_nested(parsed, path)}, expected {value}"
         )
     for argument, value in arguments_given.items():
