@@ -1,17 +1,17 @@
-"""Find and judge the candidates in a piece of a stream.
+"""Find and check the candidates in a piece of a stream.
 
 A candidate is an offset at which the constants of a frame type match.
 
-A frame type with `after` is active only after the frame that it names, until another frame that
-some `after` names is found. The active types can therefore change with every frame. To keep this
-fast, all candidates of one type in a piece are checked in one call, when the type first becomes
-active.
+A frame type with `after` is active from the frame type that its `after` names, until a frame of a
+type that is named in another `after`. The active types can therefore change with every frame. To
+keep this fast, all candidates of one type in a piece are checked together when the type first
+becomes active.
 
 Weak types (`confirm` > 1) are checked in the same way, but only the first frame of a run is a live
 candidate (`weak_frames`).
 
-A candidate whose constants have not all arrived waits for them without a check, unless its type is
-weak: such candidates are near the end of the piece alone, but may be of many types.
+If the constants of a candidate have not all arrived, it is not checked yet, unless its type is
+weak. Such candidates are only at the end of the piece, but may be of many types.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.weak_frames import WeakRuns, find_runs
 
-#: the largest number of candidates of one type in a piece; a piece with more is shortened, so that
-#: memory stays small.
+#: The maximum number of candidates of one type in a piece. A piece with more candidates is
+#: shortened, so that memory is limited.
 MAX_CANDIDATES = 1 << 15
-#: the number of constants of a type that are compared at every offset; types with equal constants
-#: share the result. Two exclude nearly all offsets.
+#: The number of constants of a type that are compared at every offset. Two constants exclude nearly
+#: all offsets. Types with equal constants share the result.
 SHARED_MARKS = 2
-#: the largest number of types that are filtered together: the bits of an integer.
+#: The maximum number of types that are filtered together, which is the number of bits of an
+#: integer.
 MAX_TYPES = 64
 
 Bytes1D = NDArray[np.uint8]
@@ -45,14 +46,15 @@ Offsets = NDArray[np.intp]
 
 @dataclass
 class SearchState:
-    """Search state that is kept between the pieces of a stream.
+    """The state of the search that is kept between the pieces of a stream.
 
     Attributes:
-        after: name of the last frame that some `after` names; None before the first one.
-        changed: stream offset at which the active types last changed.
-        run: name of the weak type of the last accepted run.
-        run_end: stream offset of the end of that run.
-        size: size of the last frame in bytes.
+        after: the name of the last frame type that is named in an `after`; None before the first
+            such frame.
+        changed: the stream offset at which the active types last changed.
+        run: the name of the weak type of the last accepted run.
+        run_end: the stream offset of the end of this run.
+        size: the size of the last frame in bytes.
         steady: whether the last frames had this size and no bytes between them.
     """
 
@@ -70,11 +72,11 @@ class PieceResult:
 
     Attributes:
         frames: the accepted frames; their offsets count from the start of the piece.
-        end: offset of the first byte that must be searched again.
+        end: the offset of the first byte that must be searched again.
         waiting: whether more bytes are required to decide about the candidate at `end`.
-        need: number of bytes from `end` that the next search requires; 0 if unknown.
-        rejected: number of rejected candidates by counter name.
-        errors: exceptions raised by plugin code.
+        need: the number of bytes from `end` on that the next search requires; 0 if unknown.
+        rejected: the number of rejected candidates, by the name of the counter.
+        errors: the exceptions that plugin code has raised.
     """
 
     frames: Frames
@@ -85,7 +87,12 @@ class PieceResult:
     errors: list[PluginError] = field(default_factory=list)
 
     def reject(self, numbers: Sequence[int], errors: Sequence[PluginError]) -> None:
-        """Count rejected candidates, given the number of each status."""
+        """Count rejected candidates.
+
+        Args:
+            numbers: the number of candidates with each status.
+            errors: the exceptions that plugin code has raised.
+        """
         for reason, number in enumerate(numbers):
             name = COUNTED.get(reason)
             if number and name:
@@ -98,9 +105,9 @@ class Framing:
     """The frame types of one stream, prepared for searching.
 
     Args:
-        codecs: codecs of the incoming frame types by name. If several types match at one offset,
-            the first in this order is used.
-        sums: computes checksums; by default the declared algorithms.
+        codecs: the codecs of the incoming frame types by name. If several types match at one
+            offset, the first one in this order is used.
+        sums: a function that computes checksums; by default the declared algorithms are used.
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
@@ -110,13 +117,13 @@ class Framing:
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
         self.words = [merge_constants(marks) for marks in self.marks]
-        #: bytes up to the end of the last constant of each type.
+        #: The number of bytes up to the end of the last constant of each type.
         self.ends = [
             max((offset + dtype.itemsize for offset, dtype, _, _ in own), default=0)
             for own in self.words
         ]
         lengths = [codec.frame.max_length for codec in self.codecs]
-        #: upper bound on the number of bytes required to decide about one candidate.
+        #: The maximum number of bytes that are required to decide about one candidate.
         self.reach = max(lengths) + max(
             codec.frame.max_length * codec.frame.confirm for codec in self.codecs
         )
@@ -126,7 +133,7 @@ class Framing:
         self._filters: dict[tuple[int, ...], ConstantFilter] = {}
 
     def active_types(self, mode: SearchState) -> list[int]:
-        """Return the active types, in order."""
+        """Return the indices of the active types, in order."""
         active = self._active.get(mode.after)
         if active is None:
             active = [
@@ -138,7 +145,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return the filter by the constants of some types, after the first two of each."""
+        """Return a filter by the constants of some types, without the first two of each type."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -155,7 +162,7 @@ class Framing:
     def switching(self, mode: SearchState) -> NDArray[np.bool_]:
         """Return whether a frame of each type changes the active types, (types + 1,).
 
-        The index is the type. The last value, for -1, is False.
+        The index is the type. The last value, for the index -1, is False.
         """
         return np.array([*(self.switches(kind, mode) for kind in range(len(self.names))), False])
 
@@ -168,9 +175,18 @@ class Framing:
         *,
         gathered: bool = True,
     ) -> Frames:
-        """Return the candidates of a type at offsets with its constants.
+        """Check the candidates of a type at some offsets.
 
-        Each has its layout and its status.
+        Args:
+            kind: the index of the type.
+            buffer: the bytes.
+            offsets: offsets at which the constants of the type match.
+            stops: the offset at which the bytes of each candidate end; by default the end of the
+                buffer.
+            gathered: whether to copy the bytes of candidates to `Frames.rows`.
+
+        Returns:
+            The candidates, each with its layout and its status.
         """
         return self.codecs[kind].survey(
             buffer, offsets, stops, kind=kind, gathered=gathered, sums=self.sums
@@ -178,9 +194,9 @@ class Framing:
 
 
 def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Return the ascending offsets at which up to two constants match.
+    """Return the offsets at which at most two constants match, ascending.
 
-    A constant after the end of the buffer counts as matching.
+    A constant beyond the end of the buffer counts as matching.
     """
     match: NDArray[np.bool_] | None = None
     for position, mask, value in constants:
@@ -201,10 +217,10 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 
 
 class ConstantFilter:
-    """A filter of offsets by the constants of several types, all types at once.
+    """Finds the offsets at which the constants of types match, for several types at once.
 
-    A set of types is an integer with one bit for each. For each offset in a frame there is a table
-    of the set of types that allow a byte there, by its value.
+    A set of types is an integer with one bit for each type. For each offset in a frame, a table
+    has, for each value of the byte, the set of types that allow this value.
 
     Args:
         constants: the constants of each type, for at most `MAX_TYPES` types.
@@ -221,7 +237,8 @@ class ConstantFilter:
     def sort(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
         """Return the offsets at which the constants of each type match, by type index.
 
-        Constants after the end of the buffer count as matching. Types without matches are missing.
+        Constants beyond the end of the buffer count as matching. Types without matches are left
+        out.
 
         Args:
             offsets: the offsets to test, ascending.
@@ -249,9 +266,11 @@ class LiveCandidates:
     """The candidates of a piece that may be accepted under the same active types.
 
     Attributes:
-        frames: valid and incomplete candidates by offset, at most one per offset, of the first type
-            in declaration order. Of a weak type, only the first frame of each run.
-        ends: end offset of each candidate, (n,); for the first frame of a run, the end of the run.
+        frames: the valid and incomplete candidates, sorted by offset. There is at most one for each
+            offset, which is of the first type in declaration order. For a weak type, only the first
+            frame of each run is included.
+        ends: the end offset of each candidate, (n,); for the first frame of a run, the end of the
+            run.
         runs: the runs of each weak type, by type index.
     """
 
@@ -266,13 +285,13 @@ class Candidates:
     Args:
         buffer: the bytes to search.
         mode: the search state at the start of the buffer.
-        final: no more bytes follow: reject incomplete candidates.
+        final: whether no more bytes follow, so that incomplete candidates are rejected.
 
-    Attributes:
-        buffer: the bytes to search, shortened if there are too many candidates.
-        is_whole: whether `buffer` was not shortened.
-        judged: the candidates of each type searched so far, by type index; types without candidates
-            are missing.
+        Attributes:
+            buffer: the bytes to search, shortened if there are too many candidates.
+            is_whole: whether `buffer` was not shortened.
+            judged: the checked candidates of each type that was searched so far, by type index.
+                Types without candidates are left out.
     """
 
     def __init__(
@@ -308,7 +327,7 @@ class Candidates:
         self._judge(offsets_by_kind)
 
     def find_live(self, mode: SearchState) -> LiveCandidates | None:
-        """Return the candidates that may be accepted; None if there are too many."""
+        """Return the candidates that may be accepted; None if there are too many of them."""
         offsets_by_kind = self._find(mode)
         if any(len(offsets) > MAX_CANDIDATES for offsets in offsets_by_kind.values()):
             return None
@@ -348,9 +367,9 @@ class Candidates:
         return Frames.make_empty(self.buffer)
 
     def _wait(self, kinds: Sequence[int]) -> list[Frames]:
-        """Return the candidates of some types with constants that have not arrived.
+        """Return the candidates of some types whose constants have not all arrived.
 
-        There is at most one for each offset, of the first type.
+        At each offset, only the candidate of the first type is returned.
         """
         first_kinds: dict[int, int] = {}
         for kind in reversed(kinds):
@@ -370,7 +389,7 @@ class Candidates:
         ]
 
     def _find(self, mode: SearchState) -> dict[int, Offsets]:
-        """Return the offsets of new types at which their constants match, by type index."""
+        """Return the offsets at which the constants of each new type match, by type index."""
         groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active_types(mode):
             if kind not in self._known:
@@ -405,7 +424,7 @@ class Candidates:
             self.judged[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return the number of candidates of a type, from the first on, to judge now."""
+        """Return how many candidates of a type, from the first on, can be checked now."""
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]
@@ -413,7 +432,7 @@ class Candidates:
 
 
 def select_live(candidates: Frames, *, final: bool) -> Frames:
-    """Return the candidates that are valid or, if more bytes follow, incomplete."""
+    """Return the valid candidates and, unless `final`, the incomplete ones."""
     if candidates.is_sound:
         return candidates
     is_live = candidates.status <= (VALID if final else SHORT)
@@ -426,9 +445,9 @@ def select_live(candidates: Frames, *, final: bool) -> Frames:
 
 
 def merge_by_offset(candidates: Sequence[Frames]) -> Frames:
-    """Return live candidates of several types by offset, one for each offset.
+    """Merge the live candidates of several types, sorted by offset.
 
-    At one offset, the first type in the order is kept.
+    At each offset, only the candidate of the first type is kept.
     """
     parts = [own for own in candidates if len(own)]
     if not parts:

@@ -1,11 +1,11 @@
 """Join messages that arrive in several datagrams, before they are framed.
 
 A fragment contains the key of its message, its index and the number of fragments
-(`lidarspec.spec.links.Assembled`). Fragments may arrive in any order and twice. A message is
-complete with its last fragment, and never contains a fragment of another message. An incomplete
-message is dropped once a few newer messages have begun, a second has passed, or the line is silent.
-Fragments of it that arrive later are dropped too; both are counted. Datagrams that are not
-fragments pass unchanged.
+(`lidarspec.spec.links.Assembled`). Fragments may arrive in any order, and may arrive twice. A
+message is returned when all its fragments have arrived. An incomplete message is dropped when a few
+newer messages have begun, when a second has passed, or when no data arrives. If further fragments
+of a dropped message arrive, they are dropped as well. All dropped fragments are counted. Datagrams
+that are not fragments are returned unchanged.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: the largest number of incomplete messages, and of remembered messages that are complete or
-#: dropped; and how long an incomplete message waits.
+#: The maximum number of incomplete messages, the maximum number of stored keys of messages that
+#: were completed or dropped, and the time after which an incomplete message is dropped.
 MAX_WAITING_MESSAGES = 8
 MAX_WAIT_NS = 10**9
 
-#: the largest payload of a datagram.
+#: The maximum payload of a datagram in bytes.
 MAX_DATAGRAM_BYTES = 65_535
 
 
@@ -46,9 +46,9 @@ class _PartialMessage:
     """An incomplete message.
 
     Attributes:
-        count: the number of its fragments, or of its bytes.
+        count: the number of fragments of the message, or its size in bytes.
         place: the offset in the input of the fragment that arrived first.
-        at: the arrival time of that fragment, ns.
+        at: the arrival time of this fragment, ns.
         parts: the payloads of the fragments by index.
     """
 
@@ -67,9 +67,12 @@ class JoinedMessages:
     """Messages, in the order in which they were completed.
 
     Attributes:
-        buffer, starts, sizes, at: the messages in the form in which the decoder accepts datagrams.
-        places: the offset of each in the input.
-        dropped: the number of bytes dropped before each message, and after the last.
+        buffer: the bytes that contain the messages.
+        starts: the offset of each message in the buffer.
+        sizes: the size of each message in bytes.
+        at: the arrival time of each message, ns.
+        places: the offset of each message in the input.
+        dropped: the number of bytes that were dropped before each message, and after the last one.
         heads: the number of bytes of fragments that are not payload.
     """
 
@@ -83,12 +86,12 @@ class JoinedMessages:
 
 
 class FragmentAssembler:
-    """A buffer that joins the fragments of one link.
+    """Joins the fragments of one link to messages.
 
     Args:
-        rule: declares the fields of a fragment.
-        longest: the maximum size of a message, bytes.
-        stats: counts lost and late fragments.
+        rule: the declaration of the fields of a fragment.
+        longest: the maximum size of a message in bytes.
+        stats: the counters, which include lost and late fragments.
 
     Raises:
         SpecError: if the struct of a fragment cannot be compiled.
@@ -119,11 +122,13 @@ class FragmentAssembler:
         at: NDArray[np.int64],
         base: int,
     ) -> JoinedMessages:
-        """Return completed messages, and the datagrams that are not fragments.
+        """Add datagrams; return completed messages, and datagrams that are not fragments.
 
         Args:
-            buffer, starts, sizes: the datagrams.
-            at: their arrival times, ns.
+            buffer: the bytes that contain the datagrams.
+            starts: the offset of each datagram in the buffer.
+            sizes: the size of each datagram in bytes.
+            at: the arrival times, ns.
             base: the offset of the first datagram in the input.
         """
         data = list[bytes]()
@@ -161,7 +166,7 @@ class FragmentAssembler:
         )
 
     def give_up(self) -> int:
-        """Drop all incomplete messages, and return the number of bytes dropped."""
+        """Drop all incomplete messages, and return the number of dropped bytes."""
         for key in list(self._waiting):
             self._drop(key)
         dropped = self._dropped
@@ -169,7 +174,7 @@ class FragmentAssembler:
         return dropped
 
     def _parse_fragment(self, datagram: bytes) -> _Fragment | None:
-        """Return the fragment in a datagram; None if it is not one."""
+        """Return the fragment in a datagram; None if the datagram is not a fragment."""
         rule = self._rule
         layout = self._layouts.layout(datagram)
         if not isinstance(layout, Layout) or not layout.sound(datagram[: layout.size]):

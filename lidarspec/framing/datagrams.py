@@ -1,12 +1,12 @@
-"""Find the frame type of each datagram; a datagram is one whole frame or none.
+"""Find the frame type of each datagram, which is one whole frame or invalid.
 
-The rule of streams applies, without the search: at the first byte of a datagram the order of the
-types decides, a type with `after` counts only while it is active, and a frame must be as long as
-its datagram. Datagrams of one size and type are judged as rows (`lidarspec.framing.regular_rows`).
-Otherwise each type judges the datagrams that no earlier type has accepted. Only a datagram that
-makes a plugin fail is judged alone, so that it does not cost the others.
+As in a stream, the first active type in order that matches is used, and a type with `after` may be
+inactive. A frame must be as long as its datagram. Datagrams of one size and type are checked as the
+rows of an array (`lidarspec.framing.regular_rows`). Otherwise the datagrams are checked type by
+type, each type with the datagrams that no earlier type has accepted. A datagram for which a plugin
+raises an error is checked alone, so that the other datagrams are not lost.
 
-A message in several datagrams is joined before this (`lidarspec.framing.datagram_assembly`).
+The fragments of a message are joined before this (`lidarspec.framing.datagram_assembly`).
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ def sort_datagrams(
 
     Args:
         buffer: the bytes that contain the datagrams.
-        starts, sizes: of each datagram, in the order of their arrival.
-        mode: state between batches; changed here.
+        starts: the offset of each datagram in the buffer, in the order of arrival.
+        sizes: the size of each datagram in bytes.
+        mode: the state between batches, which is updated.
 
     Returns:
         All datagrams as frames; datagrams that are not frames have the kind -1.
@@ -54,10 +55,11 @@ def sort_datagrams(
 
 
 class _DatagramBatch:
-    """Some datagrams, judged once for each set of active types.
+    """Checks some datagrams, once for each set of active types.
 
     Args:
-        steady: the verdict on them as frames of one type and layout, if that was tried.
+        steady: the result of checking them as frames of one type and layout; None if this was not
+            possible.
     """
 
     def __init__(
@@ -89,7 +91,10 @@ class _DatagramBatch:
         return self._piece
 
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
-        """Return the types from `position` to the datagram that changes the active types."""
+        """Return the types of datagrams from `position` on.
+
+        The last one is a frame that changes the active types, or the last datagram.
+        """
         if mode.after not in self._known:
             frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
@@ -118,10 +123,10 @@ class _DatagramBatch:
         return frames
 
     def _judge(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """Return the type and layout of each datagram, and why others are invalid.
+        """Return the type and layout of each datagram, and the reasons of invalid datagrams.
 
-        The active types are those of `mode` throughout. The reason is 0 for datagrams without the
-        constants of any type, and `PLUGIN` for datagrams that must be judged alone.
+        All datagrams are checked with the active types of `mode`. The reason is 0 for datagrams
+        without the constants of any type, and `PLUGIN` for datagrams that must be checked alone.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -180,7 +185,7 @@ class _DatagramBatch:
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
 
     def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
-        """Return the verdict on datagrams as frames of a type."""
+        """Return the result of checking datagrams as frames of one type."""
         steady = self._steady
         self._steady = None
         if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
@@ -190,9 +195,10 @@ class _DatagramBatch:
     def _count_rejected(
         self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
     ) -> Frames:
-        """Count invalid datagrams; judge again the datagrams at which the plugin failed.
+        """Count invalid datagrams, and check again those for which the plugin has failed.
 
-        Return the datagrams up to a frame that changes the active types.
+        Returns:
+            The datagrams up to the first frame that changes the active types.
         """
         parts = list[Frames]()
         begun = 0
@@ -212,7 +218,7 @@ class _DatagramBatch:
         return frames
 
     def _judge_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
-        """Return one datagram as a frame; if it is invalid, count the reason and return None."""
+        """Return one datagram as a frame; count the reason and return None if it is invalid."""
         rejected = 0
         start = datagram.starts
         size = datagram.sizes
@@ -248,7 +254,7 @@ class _DatagramBatch:
         self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 
     def _has_constants(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
-        """Return the mask of datagrams that have the constants of a type."""
+        """Return whether each datagram has the constants of a type, (n,)."""
         constants = self._framing.words[kind]
         end = self._framing.ends[kind]
         size = broadcast_value(sizes)

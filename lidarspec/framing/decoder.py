@@ -1,10 +1,10 @@
-"""Decode incrementally: bytes in, frames out, everything counted.
+"""`Decoder`: finds frames as input arrives, and counts all other bytes.
 
-This module has no clock, port or thread.
+This module uses no clock, port or thread.
 
-A byte stream is cut into pieces that stay in the cache; what a piece leaves undecided is looked at
-again together with the next. Datagram links frame by datagram. However the input is cut, the frames
-and counters are the same.
+A byte stream is divided into pieces that fit in the cache. Bytes at the end of a piece that cannot
+be decided yet are searched again with the next piece. On a datagram link, each datagram is one
+frame. The frames and counters do not depend on the division of the input.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ from lidarspec.spec.sensor import SensorDescription
 
 __all__ = ["BACKENDS", "Decoder", "select_backend", "decode_all", "is_stream"]
 
-#: bytes of a stream looked at in one go: at most, where frames follow one another and where not;
-#: and at least.
-LONGEST = 24 << 16
-PIECE = 6 << 16
-LEAST = 1 << 12
+#: The maximum size of a piece of a stream in which most bytes belong to frames, the maximum size of
+#: all other pieces, and the minimum size of a piece.
+MAX_REGULAR_PIECE_BYTES = 24 << 16
+MAX_PIECE_BYTES = 6 << 16
+MIN_PIECE_BYTES = 1 << 12
 
-#: datagrams of a list judged together; rows of an array, which need not be gathered first; and
-#: bytes of either, about.
-TOGETHER = 1 << 14
-ROWS = 1 << 17
-ROW_BYTES = 1 << 23
+#: The maximum number of datagrams of a list that are decoded together, of rows of an array, and the
+#: approximate maximum size of both.
+MAX_LIST_DATAGRAMS = 1 << 14
+MAX_ARRAY_DATAGRAMS = 1 << 17
+MAX_BATCH_BYTES = 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
 BACKENDS = ("auto", "numpy", "jit")
-#: the variable of the environment that names the default.
+#: The environment variable with the default back end.
 BACKEND = "LIDARSPEC_BACKEND"
 
 
 class DecoderObserver(Protocol):
-    """Observer of the input and the results of a decoder."""
+    """Receives the input and the frames of a decoder."""
 
     def observe_input(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
-        """Observe a piece of a stream, or datagrams, given to a decoder.
+        """Receive a piece of a stream, or datagrams, that a decoder is about to decode.
 
-        `decoder.stats` does not count it yet. The buffer does not change.
+        `decoder.stats` does not count the input yet. The buffer is not changed later.
         """
 
     def observe_frames(self, frames: Frames) -> None:
-        """Observe frames, in stream order."""
+        """Receive frames, in stream order."""
 
 
 class Decoder:
@@ -72,13 +72,13 @@ class Decoder:
 
     Args:
         sensor: the sensor; only its incoming frames are searched for.
-        stream: True for a byte stream, False if each `feed` is one datagram.
-        backend: how points are computed from its packets, "auto", "numpy" or "jit".
-        sums: function that computes checksums; by default the algorithm of each checksum.
+        stream: True for a byte stream, False if the argument of each `feed` is one datagram.
+        backend: the back end that computes the points of packets: "auto", "numpy" or "jit".
+        sums: a function that computes checksums; by default the algorithm of each checksum is used.
 
     Attributes:
         framing: the frame types, prepared for the search.
-        observer: receives the input and the frames; None for no observer.
+        observer: the observer that receives the input and the frames, or None.
     """
 
     def __init__(
@@ -114,12 +114,12 @@ class Decoder:
         if isinstance(link, Udp) and link.assembled is not None and not stream:
             longest = max(frame.max_length for frame in sensor.incoming.values())
             self._assembly = FragmentAssembler(link.assembled, longest, self.stats)
-        self._least = max(LEAST, 2 * self.framing.reach)
+        self._least = max(MIN_PIECE_BYTES, 2 * self.framing.reach)
         # Weak frames take long to find, but not as regular rows, which follow the first piece.
         if self.framing.has_weak_types:
             self._size = self._least
         else:
-            self._size = max(PIECE, self._least)
+            self._size = max(MAX_PIECE_BYTES, self._least)
 
     def __repr__(self) -> str:
         return (
@@ -133,38 +133,40 @@ class Decoder:
         return self._assembly is not None
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
-        """Return the frames that these bytes complete, in stream order. No input raises.
+        """Return the frames that these bytes complete, in stream order.
+
+        No input bytes raise an exception.
 
         Args:
             data: the next bytes of the stream, or one datagram.
-            at: their arrival time in ns, if known.
+            at: the arrival time of the bytes, ns; None if unknown.
         """
         return [found for frames in self.frames(data, at) for found in frames.found()]
 
     def idle(self) -> list[Found]:
-        """Handle silence on the line: reject incomplete candidates, search their bytes again.
+        """Reject incomplete candidates, because no data has arrived for a while.
 
         Returns:
-            The frames in these bytes.
+            The frames that are found when their bytes are searched again.
         """
         return [found for frames in self.take_pending() for found in frames.found()]
 
     def finish(self) -> list[Found]:
-        """Handle the end of the input: reject incomplete candidates, search their bytes again.
+        """Reject incomplete candidates, because the input has ended.
 
         Returns:
-            The frames in these bytes.
+            The frames that are found when their bytes are searched again.
         """
         return self.idle()
 
     def frames(self, data: Data, at: int | None = None) -> list[Frames]:
         """Return the frames that these bytes complete, in stream order.
 
-        They are structs of arrays. No input raises.
+        This is `feed` with arrays as the result, which is faster for many frames.
 
         Args:
             data: the next bytes of the stream, or one datagram.
-            at: their arrival time in ns, if known.
+            at: the arrival time of the bytes, ns; None if unknown.
         """
         if isinstance(data, np.ndarray):
             view = np.ascontiguousarray(data).data.cast("B")
@@ -193,7 +195,7 @@ class Decoder:
         return parts
 
     def take_pending(self) -> list[Frames]:
-        """Return the frames in the pending bytes as arrays, since no more input follows."""
+        """Reject incomplete candidates; return the frames in their bytes, as arrays."""
         parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:
@@ -207,11 +209,11 @@ class Decoder:
     def datagrams(
         self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None
     ) -> Frames:
-        """Return the frames in datagrams, each of which is one whole frame or none.
+        """Return the frames in datagrams; each datagram is one whole frame or invalid.
 
         Args:
-            data: a list of bytes, or the rows of an array.
-            at: their arrival times in ns, None if unknown.
+            data: a list of bytes, or an array with a datagram in each row, (n, size).
+            at: the arrival time of each datagram, ns; None if unknown.
         """
         if isinstance(data, np.ndarray):
             buffer = data.reshape(-1)
@@ -237,14 +239,15 @@ class Decoder:
         sizes: NDArray[np.intp],
         at: NDArray[np.int64],
     ) -> Frames:
-        """Return the frames in datagrams that are in one buffer, without a copy.
+        """Return the frames in datagrams that are in one buffer, without copying them.
 
-        Each datagram is one whole frame or none.
+        Each datagram is one whole frame or invalid.
 
         Args:
-            buffer: one-dimensional and contiguous; bytes between the datagrams are ignored.
-            starts, sizes: of each datagram, in the order of their arrival.
-            at: their arrival times in ns, -1 if unknown.
+            buffer: the bytes, one-dimensional and contiguous; bytes between datagrams are ignored.
+            starts: the offset of each datagram in the buffer, in the order of arrival.
+            sizes: the size of each datagram in bytes.
+            at: the arrival time of each datagram, ns; -1 if unknown.
         """
         size = broadcast_value(sizes)
         if size is None:
@@ -299,9 +302,9 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: JoinedMessages | None,
     ) -> NDArray[np.int64]:
-        """Return the invalid bytes before each frame in datagrams, and count them.
+        """Count invalid bytes in datagrams, and return their number before each frame.
 
-        Fillers are left out.
+        Fillers are not included in these numbers.
         """
         lost = self._count_skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         if joined is not None:
@@ -314,7 +317,7 @@ class Decoder:
         return np.diff(before)
 
     def _drop(self, size: int) -> None:
-        """Count bytes that belong to no frame, before the next frame."""
+        """Count bytes before the next frame that belong to no frame."""
         self._gap = self._gap + size
         self.stats.bytes_skipped = self.stats.bytes_skipped + size
 
@@ -330,8 +333,8 @@ class Decoder:
         """Find frames in bytes, piece by piece, and add them to `parts`.
 
         Args:
-            lasting: the bytes will not be changed, so they need not be copied.
-            final: no bytes follow.
+            lasting: whether the bytes will not be changed later, so that they need not be copied.
+            final: whether no bytes follow.
 
         Returns:
             The offset of the pending bytes.
@@ -349,14 +352,17 @@ class Decoder:
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
-            most = LONGEST if 2 * frames.total_bytes > piece.end else PIECE
+            most = (
+                MAX_REGULAR_PIECE_BYTES if 2 * frames.total_bytes > piece.end else MAX_PIECE_BYTES
+            )
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
         """Return the frames of a piece of a stream.
 
-        Regular frames are judged as rows of an array; other pieces are searched.
+        Frames at equal distances are checked as the rows of an array. All other pieces are
+        searched.
         """
         piece = None
         if not final:
@@ -366,7 +372,7 @@ class Decoder:
         return piece
 
     def _enter(self, buffer: NDArray[np.uint8], piece: PieceResult, at: int | None) -> Frames:
-        """Return the frames of a piece at their offsets in the input; count everything."""
+        """Count all bytes of a piece, and return its frames with their offsets in the input."""
         frames = piece.frames
         base = self._base
         gaps = self._gaps(buffer, frames, piece.end)
@@ -384,9 +390,9 @@ class Decoder:
         )
 
     def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """Return the bytes skipped before each frame of a piece, and count them.
+        """Count skipped bytes in a piece, and return their number before each frame.
 
-        Fillers are left out. The piece ends at `end`.
+        Fillers are not included in these numbers. The piece ends at `end`.
         """
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
@@ -403,7 +409,13 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count skipped bytes that end at these stops; return their numbers without fillers."""
+        """Count skipped bytes, and return their numbers without fillers.
+
+        Args:
+            buffer: the bytes.
+            sizes: the number of bytes that were skipped at each place.
+            stops: the offset after the skipped bytes at each place.
+        """
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
             skipped = buffer[stops[index] - sizes[index] : stops[index]]
@@ -453,9 +465,9 @@ def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
 
 
 def select_backend(name: str) -> str:
-    """Return the back end for a name.
+    """Return the back end to use for a name.
 
-    For "auto" it is the value of LIDARSPEC_BACKEND, if that is set.
+    If LIDARSPEC_BACKEND is set, it replaces "auto".
 
     Raises:
         UsageError: for an unknown name.
@@ -473,16 +485,17 @@ def decode_all(decoder: Decoder, data: Any) -> list[Frames]:
     """Return all frames of a whole input.
 
     Args:
-        data: bytes for a decoder of a stream, or an iterable or (n, size) array of datagrams.
+        data: bytes if the decoder decodes a stream, else an iterable or (n, size) array of
+            datagrams.
     """
     if decoder.stream:
         return decoder.frames(data) + decoder.take_pending()
     packets: Any = (
         np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
     )
-    most = ROWS if isinstance(data, np.ndarray) else TOGETHER
+    most = MAX_ARRAY_DATAGRAMS if isinstance(data, np.ndarray) else MAX_LIST_DATAGRAMS
     if len(packets):
-        step = max(1, min(most, ROW_BYTES // max(len(packets[0]), 1)))
+        step = max(1, min(most, MAX_BATCH_BYTES // max(len(packets[0]), 1)))
     else:
         step = 1
     return [
@@ -491,7 +504,7 @@ def decode_all(decoder: Decoder, data: Any) -> list[Frames]:
 
 
 def is_stream(data: Any) -> bool:
-    """Return whether an input is one run of bytes, not datagrams.
+    """Return whether an input is a byte stream, not datagrams.
 
     Raises:
         UsageError: for a text or a path.

@@ -1,8 +1,9 @@
 """Make valid frames with seeded random content, for tests, docs and the REPL.
 
-A random header gives a layout. The rest of the frame is random bytes, with constants and checksums
-set. Frames that are not plausible are drawn again, and in the end near the values that the sensor's
-`sweep` declares. Frames that are not compiled are drawn field by field.
+A random header determines a layout. The rest of the frame is filled with random bytes, and
+constants and checksums are set. Frames that are not plausible are drawn again. If random frames are
+never plausible, the values of the sensor's `sweep` are used. Frames without layouts are drawn field
+by field.
 """
 
 from __future__ import annotations
@@ -41,27 +42,27 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Fault, get_member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
-#: how often random frames are made, and how often if the sensor declares a `sweep` to use if none
-#: is plausible.
+#: The number of attempts with random frames, and this number if the sensor declares a `sweep`,
+#: which is then used if no random frame is plausible.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8
-#: the first try makes one random frame. Each further try makes `GROWTH` times as many as the one
-#: before, at most `LARGEST_BATCH`.
+#: The first attempt makes one random frame. Each further attempt makes `GROWTH` times as many
+#: frames as the previous one, at most `LARGEST_BATCH`.
 GROWTH = 4
 LARGEST_BATCH = 64
-#: the largest size of a batch, bytes, beyond its first frame.
+#: The maximum size of a batch in bytes, unless it has only one frame.
 BATCH_BYTES = 1 << 22
-#: how many random headers are tried.
+#: The number of random headers that are tried.
 HEADERS = 400
-#: numbers up to these limits are drawn more often, because counts and keys are mostly low.
+#: Numbers up to these limits are drawn more often, because most counts and keys are low.
 LOW_NUMBERS = (8, 40)
-#: how often a named value or the key of a switch may be drawn for a header field, and the number of
+#: The probability of drawing a label or the key of a switch for a header field, and the number of
 #: these values.
 NAMED_SHARE = 0.7
 MAX_NAMED_VALUES = 16
-#: the rule of `lidarspec check` for a frame type without an example.
+#: The rule of `lidarspec check` for a frame type without an example.
 NO_EXAMPLE = "LS301"
-#: field path -> function that draws a raw value.
+#: Functions that draw the raw values of certain fields, by path.
 Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
@@ -70,7 +71,7 @@ def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
     """Return the bytes of a valid frame with seeded random content.
 
     Raises:
-        UnknownFrame: if there is no such frame; it suggests the closest name.
+        UnknownFrame: if the sensor has no such frame type. The error suggests the closest name.
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -83,7 +84,8 @@ def random_frame(
     """Return a valid frame with a random header and random content.
 
     Args:
-        drawn: field path -> function that draws its raw value, for values that chance does not hit.
+        drawn: functions that draw the raw values of certain fields, by path, for values that are
+            hardly ever valid if they are random.
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
@@ -104,12 +106,12 @@ def random_row(
     """Return the layout of a random header, and a valid struct with it, (size,).
 
     Args:
-        frame: a type with layouts and without parts.
-        drawn: field path -> function that draws its raw value.
-        tries: how often random frames are made, and then how often frames along the sweep.
+        frame: the name of a frame type with layouts and without parts.
+        drawn: functions that draw the raw values of certain fields, by path.
+        tries: the number of attempts with random frames, and then with frames of the `sweep`.
 
     Raises:
-        SpecError: if none of them is plausible.
+        SpecError: if none of the frames is plausible.
     """
     engine = get_codec(sensor.frames[frame])
     random_tries = tries
@@ -131,15 +133,15 @@ def random_row(
 def make_random_header(
     engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
-    """Return the layout of a random header, and the header fields that it depends on.
+    """Return the layout of a random header, and the raw values of its fields by path.
 
-    The fields are given as raw values by path.
+    The fields are those that the layout depends on.
 
     Args:
-        drawn: field path -> function that draws its value.
+        drawn: functions that draw the raw values of certain fields, by path.
 
     Raises:
-        SpecError: if hundreds of headers give no frame.
+        SpecError: if hundreds of random headers lead to no layout.
     """
     keys = sorted(switch_keys(engine.frame.tree))
     for _ in range(HEADERS):
@@ -169,7 +171,7 @@ def _draw_header(
 
 
 def switch_keys(root: Node) -> Iterator[int]:
-    """Yield the keys of switches that are not named values of their field."""
+    """Yield the integer keys of switches, except for labels of the field."""
     for node in nodes(root):
         if isinstance(node, Select):
             labels = node.key.info.labels if isinstance(node.key, Ref) else ()
@@ -197,16 +199,16 @@ def _draw_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     return value
 
 
-#: the characters of texts in examples.
+#: The characters of texts in examples.
 LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 
 
 def _make_random_rows(
     engine: Codec, layout: Layout, number: int, source: random.Random
 ) -> NDArray[np.uint8]:
-    """Return `number` rows of random bytes with allowed values.
+    """Return structs of random bytes with allowed values, (number, size).
 
-    The wire form can write every value.
+    All values can be encoded by the wire form.
     """
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
@@ -232,10 +234,12 @@ def make_of_values(
     drawn: Drawn,
     tries: int = LARGEST_BATCH * TRIES,
 ) -> bytes:
-    """Return a frame with parts, or without layouts: its values are drawn one by one.
+    """Return a valid frame after drawing its values one by one.
+
+    This is used for frames with parts, and for frames without layouts.
 
     Raises:
-        SpecError: if none of `tries` attempts gives a valid frame.
+        SpecError: if all attempts, whose number is `tries`, result in invalid frames.
     """
     engine = get_codec(sensor.frames[frame])
     for _ in range(tries):
@@ -256,10 +260,7 @@ def make_of_values(
 
 
 def _remove_lengths(values: Any, root: Node) -> Any:
-    """Return the values of a frame without the counts and lengths of parts.
-
-    `build` fills them in.
-    """
+    """Return the values of a frame without the counts and lengths that `build` fills in."""
     for node in make_schema(root).parts.values():
         rules = (node.count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
@@ -276,7 +277,7 @@ def _remove_lengths(values: Any, root: Node) -> Any:
 
 
 def _remove_field(values: Any, path: str) -> None:
-    """Remove a field from nested mappings, if it is there."""
+    """Remove a field from nested mappings, if they have it."""
     *parents, name = path.split(".")
     if parents:
         values = get_member(values, ".".join(parents), {})
@@ -286,7 +287,7 @@ def _remove_field(values: Any, path: str) -> None:
 def _fill_headers(
     rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]
 ) -> NDArray[np.uint8]:
-    """Return frames with header values, constants and checksums set."""
+    """Write header values, constants and checksums into frames, and return the frames."""
     for path, value in chosen.items():
         leaf = layout.column(path)
         assert isinstance(leaf, Leaf)
@@ -298,7 +299,7 @@ def _fill_headers(
 def valid_mask(
     sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
-    """Return whether the values of each struct are allowed, (n,).
+    """Return whether each struct has only allowed and plausible values, (n,).
 
     Args:
         rows: structs with constants and checksums set, (n, size).
@@ -329,7 +330,7 @@ def valid_mask(
 def _first_encodable(
     sensor: SensorDescription, frame: str, rows: NDArray[np.uint8]
 ) -> NDArray[np.uint8] | None:
-    """Return the first struct that the form of its type can encode, or None."""
+    """Return the first struct that the wire form can encode; None if it can encode none."""
     encode = frame_coder(sensor.frames[frame]).encode
     return next((row for row in rows if encode(row.tobytes()) is not None), None)
 
@@ -342,9 +343,9 @@ def _make_along_sweep(
     drawn: Drawn,
     tries: int,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Return a layout and a struct with the values that the sensor's `sweep` declares.
+    """Return a layout and a struct with the values of the sensor's `sweep`.
 
-    It is used if random values are never plausible.
+    This is used if random values are never plausible.
     """
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
@@ -379,9 +380,9 @@ def _make_along_sweep(
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a row if its shape matches.
+    """Write a value of a sweep into a struct, if it has as many elements as the field.
 
-    A row with room for more elements keeps its own values.
+    Otherwise the struct keeps its random values.
     """
     raw = leaf.raw([value])[(slice(None), *map(slice, leaf.shape))]
     if all(length in (1, room) for length, room in zip(raw.shape[1:], leaf.shape, strict=False)):
@@ -395,7 +396,7 @@ def _store_drawn(
     drawn: Drawn,
     source: random.Random,
 ) -> None:
-    """Write drawn values into rows, except for fields that determine the layout."""
+    """Write drawn values into structs, except for fields that determine the layout."""
     for path, draw in drawn.items():
         if path in layout.leaves and path not in chosen:
             leaf = layout.leaves[path]
@@ -406,7 +407,7 @@ def _store_drawn(
 
 
 def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return functions that return a sweep's raw values for header fields, by path."""
+    """Return functions that return the raw values of a sweep for header fields, by path."""
     fields = engine.schema.fields
     draws: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
@@ -416,5 +417,5 @@ def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
 
 
 def return_raw(raw: int, _: random.Random) -> int:
-    """Return the same raw value each time, instead of a random one."""
+    """Return a given raw value, in place of a function that draws a random one."""
     return raw

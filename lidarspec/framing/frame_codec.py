@@ -1,8 +1,8 @@
-"""The interface of the engines of frame types: judge candidates, and make columns of frames.
+"""`Codec`: the interface for checking candidates and making columns of one frame type.
 
-`lidarspec.framing.frame_engine` has the engine of binary frames, `lidarspec.framing.text_frames`
-the engine of frames with a wire form, and `lidarspec.framing.plain_frames` the engine of frames
-without layouts.
+It is implemented for binary frames with layouts (`lidarspec.framing.frame_engine`), for frames with
+a wire form (`lidarspec.framing.text_frames`), and for frames without layouts
+(`lidarspec.framing.plain_frames`).
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from lidarspec.spec.syntax import fixed_size
 
 
 class Codec:
-    """The engine of one frame type.
+    """Checks candidates of one frame type, and makes tables of its frames.
 
     Attributes:
-        prefix: the constants at the start: offset -> (mask, value).
-        marks: the same constants, whole bytes first, which exclude the most candidates.
-        size: the size of all frames of the type, bytes; None if sizes differ.
+        prefix: the constants that all frames begin with, as (mask, value) by offset.
+        marks: the same constants as a list, whole bytes first because they exclude most candidates.
+        size: the size of all frames of the type in bytes; None if sizes differ.
         layout: the layout of all frames; None if layouts differ or construct parses the frames.
-        is_compiled: whether the layouts can be computed; else construct parses each frame.
+        is_compiled: whether the frames have layouts. Otherwise construct parses each frame.
     """
 
     layout: Layout | None = None
@@ -55,14 +55,14 @@ class Codec:
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        """Return the candidates at some offsets, each with its layout and its status.
+        """Check the candidates at some offsets, and return them with their layout and status.
 
         Args:
             buffer: the bytes.
-            offsets: offsets at which the prefix matches.
-            stops: the offset at which the bytes of each candidate end, if no more bytes follow
-                there; by default the end of the buffer.
-            kind: the index of this type.
+            offsets: the offsets, at which the prefix has to match.
+            stops: the offset at which the bytes of each candidate end, if no more bytes follow. By
+                default, candidates extend to the end of the buffer, and more bytes may follow.
+            kind: the index of this frame type.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
             sums: computes checksums; by default the declared algorithms.
         """
@@ -71,21 +71,23 @@ class Codec:
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """Return the common layout, the status and the plugin errors of candidates.
-
-        Returns None if the candidates do not have a common layout.
+        """Check candidates of one size that may have a common layout.
 
         Args:
-            rows: the candidates, all of one size, (n, size).
+            rows: the candidates, (n, size).
+
+        Returns:
+            The common layout, the status of each candidate, and the errors of the plugin. None if
+            the candidates do not have a common layout.
         """
         return None
 
     def table(self, frames: Iterable[bytes]) -> Table:
-        """Return frames that are known to be of this type as columns."""
+        """Return valid frames of this type as columns."""
         raise NotImplementedError
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        """Return frames of this type as columns, given the bytes of their structs."""
+        """Return valid frames of this type as columns, given the bytes of their structs."""
         return self.table(structs)
 
     def gather(self, frames: Frames) -> Table:
@@ -94,11 +96,11 @@ class Codec:
 
     @property
     def _checked_constants(self) -> Mapping[int, tuple[int, int]]:
-        """The constants that candidates are known to have before they are judged."""
+        """The constants that candidates were already checked for."""
         return self.prefix
 
     def make_checker(self, layout: Layout) -> CandidateChecker:
-        """Return the checker of candidates that have a layout and its first constants."""
+        """Return the checker for candidates of one layout that have the checked constants."""
         judge = layout.notes.get(CandidateChecker)
         if judge is None:
             self._conditions = self._conditions or StructConditions(

@@ -1,9 +1,9 @@
-"""The engine of binary frames: judge candidates by their layouts, and make columns of frames.
+"""The codec of binary frames with layouts.
 
-`CompiledCodec` works on whole batches: the header of a candidate is read once, when it is judged,
-and its layout is kept for the columns. Frames with a wire form have their own engine
-(`lidarspec.framing.text_frames`), and so do frames without layouts
-(`lidarspec.framing.plain_frames`). `get_codec` returns the engine of a frame type.
+`CompiledCodec` checks many candidates at once. The header of a candidate is read once, and its
+layout is kept for making columns. `get_codec` returns the codec of a frame type, which may also be
+the codec of frames with a wire form (`lidarspec.framing.text_frames`) or without layouts
+(`lidarspec.framing.plain_frames`).
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ from lidarspec.framing.text_frames import TextCodec
 from lidarspec.framing.variable_lengths import JointChecker, LayoutFamilies, LayoutGroup
 from lidarspec.spec.description import Frame
 
-#: how many bytes of candidates are judged together, so that memory stays small on any input.
+#: The number of bytes of candidates that are checked together, so that memory is limited for any
+#: input.
 BLOCK = 1 << 19
 
 
 class CompiledCodec(Codec):
-    """The engine of a frame type with compiled layouts.
+    """The codec of a frame type with layouts.
 
     Raises:
         NotCompilableError: if the offset of a part of the struct cannot be computed.
@@ -148,13 +149,14 @@ class CompiledCodec(Codec):
         sizes: NDArray[np.intp],
         sums: Sums | None,
     ) -> list[LayoutGroup]:
-        """Judge the candidates of similar layouts together.
-
-        Returns:
-            The groups that remain to be judged layout by layout.
+        """Check the candidates of similar layouts together.
 
         Args:
-            status, sizes: the status and the size of all candidates, changed here.
+            status: the status of all candidates, which is updated.
+            sizes: the size of all candidates, which is updated.
+
+        Returns:
+            The groups that have to be checked layout by layout.
         """
         which = together.which
         if stops is None:
@@ -194,12 +196,13 @@ class CompiledCodec(Codec):
         gathered: bool,
         sums: Sums | None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp], NDArray[np.uint8] | None]:
-        """Judge the candidates of one layout.
+        """Check the candidates of one layout.
 
         Returns:
             The status of each candidate; its size in bytes, or the number of bytes needed to
-            decide; and the bytes of complete candidates, (n, size), if `gathered`, and if these
-            candidates are the first ones and not too many. Otherwise None.
+            decide; and the bytes of complete candidates, (n, size), or None. The bytes are returned
+            only if `gathered` is set, no complete candidate follows an incomplete one, and there
+            are not too many.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))
@@ -279,13 +282,13 @@ def _judge_incomplete(
     layout: Layout,
     sizes: NDArray[np.intp],
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Return the status of incomplete candidates, and the bytes needed to decide.
+    """Return the status of incomplete candidates, and the number of bytes needed to decide.
 
-    A candidate is incomplete, or already excluded by a constant or a length.
+    The status is `SHORT`, unless a constant or a length is already wrong.
 
     Args:
         layout: the layout of the candidates.
-        sizes: the size of each candidate once complete.
+        sizes: the size of each candidate when it is complete, in bytes.
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()
@@ -302,10 +305,7 @@ def _judge_incomplete(
 
 @functools.lru_cache(maxsize=2048)
 def get_codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
-    """Return the engine of a frame type; repeated calls return the same object.
-
-    Frames without layouts are parsed by construct, one at a time.
-    """
+    """Return the codec of a frame type; repeated calls return the same object."""
     coder = frame_coder(frame)
     if isinstance(coder, FormCoder):
         return TextCodec(frame, coder)

@@ -1,11 +1,11 @@
-"""The engine of frames without layouts: construct parses one candidate at a time.
+"""The codec of frames without layouts: construct parses one candidate at a time.
 
-In such a struct the offset of a part does not follow from header fields. `lidarspec show` names the
-part and the reason.
+In the struct of such a frame, the offset of a part does not follow from header fields. `lidarspec
+show` prints the part and the reason.
 
-If this part is a text up to a terminator, the terminators of all candidates are found at once.
-Construct does not parse a candidate without a terminator in reach, or with a wrong constant after
-it.
+If the part follows a text up to a terminator, the terminators of all candidates are found at once.
+Candidates without a terminator, or with a wrong constant after it, are then rejected without
+parsing them.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class _Text:
     """The first text up to a terminator in a struct.
 
     Attributes:
-        begin: its offset in a frame.
-        terminator: the byte that ends it.
-        following: the constant bytes that are checked first after it, by their offset from the
-            terminator.
+        begin: the offset of the text in a frame.
+        terminator: the byte that ends the text.
+        following: the constant bytes after the text that are checked first, by their distance from
+            the terminator.
     """
 
     begin: int
@@ -58,9 +58,10 @@ class _Text:
     def judge(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], ends: NDArray[np.intp]
     ) -> NDArray[np.uint8]:
-        """Return the status of candidates by the terminator of the text, (n,).
+        """Check candidates by the terminator of the text, and return their status, (n,).
 
-        It is `SHORT` without a terminator, `CONSTANT` with a wrong constant after it, else `VALID`.
+        The status is `SHORT` without a terminator, `CONSTANT` for a wrong constant after it, else
+        `VALID`.
 
         Args:
             buffer: the bytes.
@@ -78,7 +79,7 @@ class _Text:
 
 
 def _find_text(root: tree.Node) -> _Text | None:
-    """Return the text that follows the part of a struct with known offsets.
+    """Return the text directly after the fields with known offsets.
 
     Returns None if there is no such text, or if another part is checked before its terminator.
     """
@@ -124,10 +125,10 @@ def _is_free(info: tree.FieldInfo) -> bool:
 
 
 class PlainCodec(Codec):
-    """The engine of a frame type that construct parses, one candidate at a time.
+    """The codec of a frame type that construct parses.
 
     Attributes:
-        reason: the reason why the type is not compiled.
+        reason: the reason why the frame type has no layouts.
     """
 
     is_compiled = False

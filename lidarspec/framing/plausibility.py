@@ -1,12 +1,13 @@
-"""Judge many candidates at a time by constants, checksums and plausibility.
+"""Check many candidates at once by constants, checksums and plausibility.
 
-The order is the order of the counters: a candidate with a wrong constant is not counted, a wrong
-checksum is counted as such, and only intact candidates are tested for plausibility.
+Each check is applied only to candidates that have passed the checks before it. A candidate with a
+wrong constant is not counted. A candidate with correct constants and a wrong checksum is counted in
+`bad_checksum`, and so on.
 
-A frame's `plausible` function is traced once. Operands of ``&`` become separate conditions.
-A condition on at most two adjacent bytes is evaluated for all values of these bytes. Frames are
-then judged by table lookups, with the same results, without making a column of every field.
-Conditions that cannot be traced are evaluated by calling the function.
+The `plausible` function of a frame type is traced once. Operands of ``&`` become separate
+conditions. A condition on at most two adjacent bytes is evaluated for all values of these bytes, so
+that frames can be checked by a table lookup, with the same result. If a function cannot be traced,
+it is called with the columns of the candidates.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, P
 from lidarspec.spec.description import Frame
 from lidarspec.spec.tree import FieldInfo
 
-#: the largest number of allowed values of a few bits that are compared one after another.
+#: If a few bits have at most this number of allowed values, they are compared with each value.
 ALLOWED = 2
 
-#: the status of a frame by the result for its parts: `parts.FOUND`, `CUT_OFF`, `LENGTH`,
+#: The status of a frame for each status of its parts: `parts.FOUND`, `CUT_OFF`, `LENGTH`,
 #: `CONSTANT`, `FAILED`.
 OF_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 
@@ -63,16 +64,16 @@ Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
 class CandidateChecker:
-    """The checks of candidates of one layout; their `prefix` is known to match.
+    """Checks candidates of one layout.
 
     Args:
+        prefix: the constants that the candidates were already checked for.
         met: the conditions of the struct on values.
-        checks: the conditions of the plausibility function; None if only the function itself can
-            decide.
+        checks: the conditions of the plausibility function; None if the function has to be called.
 
     Attributes:
         checks: all tests of values that do not call the plausibility function.
-        is_complete: whether these are all tests of values.
+        is_complete: whether no other tests of values are needed.
     """
 
     def __init__(
@@ -109,8 +110,8 @@ class CandidateChecker:
 
         Args:
             rows: the complete candidates, (n, size).
-            errors: errors of the plugin are added to it.
-            sums: computes checksums; by default the declared algorithms.
+            errors: the list to which errors of the plugin are added.
+            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         status = np.zeros(len(rows), np.uint8)
         self.check_constants(status, rows)
@@ -152,7 +153,11 @@ class CandidateChecker:
 def _check_valid(
     status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]
 ) -> None:
-    """Judge the candidates that are valid so far, and set their status."""
+    """Check the candidates that are valid so far, and set their status.
+
+    Args:
+        judge: a function that returns the status of candidates.
+    """
     if not np.count_nonzero(status):
         status[:] = judge(rows)
         return
@@ -168,9 +173,9 @@ def _check_valid_parts(
     errors: list[PluginError],
     sums: Sums | None,
 ) -> None:
-    """Judge the candidates that are valid so far by their parts.
+    """Check the parts of the candidates that are valid so far.
 
-    The parts have to fill their region, and their checksums have to match.
+    The parts have to fill their region, and their checksums have to be correct.
     """
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
@@ -180,7 +185,7 @@ def _check_valid_parts(
 def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """Return the status of each frame by its parts, (n,)."""
+    """Check the parts of each frame, and return its status, (n,)."""
     buffer, walked = region.in_rows(rows)
     status = OF_PARTS[walked.status]
     errors += walked.errors
@@ -200,7 +205,7 @@ def _check_parts(
 def check_seal(
     seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """Return `VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one checksum."""
+    """Check one checksum of each frame; return `VALID`, `CHECKSUM` or `PLUGIN`, (n,)."""
     try:
         wrong = ~seal.intact(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
@@ -210,11 +215,11 @@ def check_seal(
 
 
 def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
-    """Return `VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame, (n,), by `plausible`.
+    """Call `plausible` for frames; return `VALID`, `IMPLAUSIBLE` or `PLUGIN`, (n,).
 
     Args:
         table: frames of one layout, so that no array is padded.
-        errors: errors of the plugin are added to it.
+        errors: the list to which errors of the plugin are added.
     """
     assert frame.plausible is not None
     batch = Batch(table, np.zeros(len(table), np.bool_))
@@ -236,7 +241,7 @@ class StructConditions:
     """The conditions of a frame type, from its plausibility function and its struct.
 
     Args:
-        plausible: as in `Frame`.
+        plausible: the plausibility function, see `Frame`; None without one.
         schema: the schema of the frame.
         layout: any layout of the frame, used to trace the function.
     """
@@ -248,7 +253,7 @@ class StructConditions:
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def make_struct_conditions(self, layout: Layout) -> list[Check]:
-        """Return the conditions of the struct on frames of a layout, as checks."""
+        """Return the conditions of the struct as checks of frames of a layout."""
         every = (
             (
                 one,
@@ -261,7 +266,7 @@ class StructConditions:
     def checks(self, layout: Layout) -> list[Check] | None:
         """Return the checks on rows of bytes that frames of a layout have to pass.
 
-        Returns None if only the function itself can decide.
+        Returns None if the plausibility function has to be called.
         """
         if self._parts is None:
             return None
@@ -318,7 +323,7 @@ class StructConditions:
 
 @dataclass(frozen=True, eq=False)
 class ConditionGroup:
-    """Conditions on fields outside of arrays, which share common subexpressions."""
+    """Conditions on fields outside of arrays; common subexpressions are computed once."""
 
     parts: tuple[Expression, ...]
 
@@ -329,19 +334,19 @@ class ConditionGroup:
         return tuple(every.values())
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-        """Return whether all conditions hold, for each frame; see `Expression.values`."""
+        """Return whether all conditions are true for each frame; see `Expression.values`."""
         return functools.reduce(np.bitwise_and, evaluate_expressions(self.parts, raw))
 
 
 @dataclass(frozen=True, eq=False)
 class _LookupTable:
-    """The values of some bytes, read as one integer, for which a condition holds.
+    """The values of one or two bytes, read as an integer, for which a condition is true.
 
     Attributes:
         limits: the first and the last of these values; None if they are not consecutive.
-        bits: otherwise, the bits that the condition depends on and their allowed values; None if
-            there are more than two values.
-        listed: whether the condition holds, for each value.
+        bits: if `limits` is None, the bits that the condition depends on, and their allowed values;
+            None if these are more than two.
+        listed: whether the condition is true, for each value.
     """
 
     dtype: np.dtype[Any]
@@ -350,7 +355,7 @@ class _LookupTable:
     bits: tuple[int, tuple[int, ...]] | None = None
 
     def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return whether the condition holds for each of the values, of the same shape."""
+        """Return whether the condition is true for each of the values."""
         if self.limits is not None:
             low, high = map(values.dtype.type, self.limits)
             return np.asarray(
@@ -372,13 +377,14 @@ class _LookupTable:
 
 @dataclass(frozen=True, eq=False)
 class LookupCondition:
-    """A condition on one or two bytes, evaluated by a table.
+    """A condition on one or two bytes, which is evaluated by a table lookup.
 
-    It applies to each frame, or to each element of an array.
+    The bytes are in each frame, or in each element of an array.
 
     Attributes:
-        offset: the offset of the first of these bytes.
-        shape, strides: the shape and strides of their arrays.
+        offset: the offset of the first byte.
+        shape: the lengths of the arrays that contain the bytes.
+        strides: the strides of these arrays.
     """
 
     table: _LookupTable
@@ -387,7 +393,7 @@ class LookupCondition:
     strides: tuple[int, ...]
 
     def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Return whether the condition holds in each frame, (n,)."""
+        """Return whether the condition is true in each frame, (n,)."""
         if not len(rows):
             return np.empty(0, np.bool_)
         held = self._hold_each(rows)
@@ -398,11 +404,11 @@ class LookupCondition:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether the condition holds in each frame of its own length, (n,).
+        """Return whether the condition is true in each frame, (n,), for arrays of varying length.
 
         Args:
-            lengths: the length of the outermost array in each frame, (n,), at most its room in the
-                row.
+            rows: the frames, (n, size), padded to one size.
+            lengths: the length of the outermost array in each frame, (n,).
         """
         held = self._hold_each(rows)
         if not self.shape:
@@ -412,7 +418,7 @@ class LookupCondition:
         return np.asarray(held.all(axis=1))
 
     def _hold_each(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Return whether the condition holds for each element, (n, *shape)."""
+        """Return whether the condition is true for each element, (n, *shape)."""
         view = view_elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
         if view.itemsize == 1:
             values = view
@@ -422,7 +428,11 @@ class LookupCondition:
 
 
 def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
-    """Return the table of a condition on `size` bytes, at most two."""
+    """Return the table of a condition on one or two bytes.
+
+    Args:
+        size: the number of bytes.
+    """
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(
             np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16
@@ -442,7 +452,7 @@ def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _Look
 def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
     """Return the bits that a table depends on, and their allowed values.
 
-    Returns None unless there are one or two allowed values.
+    Returns None if more than two values are allowed.
     """
     values = np.arange(len(listed))
     mask = sum(
@@ -457,9 +467,9 @@ def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
 
 
 def _find_window(leaves: Iterable[Leaf]) -> tuple[int, int]:
-    """Return the first byte of some fields, and the byte after their last.
+    """Return the offset of the first byte of some fields, and the offset after the last.
 
-    In arrays only the first elements count.
+    For arrays, these are the offsets of the first elements.
     """
     spans = [leaf.byte_span for leaf in leaves]
     if spans:

@@ -1,11 +1,11 @@
-"""Judge frames at equal distances as the rows of an array, without a search.
+"""Check frames at equal distances as the rows of an array, without a search.
 
-In an undisturbed stream frames follow one another without a byte between; datagrams of one size
-are at equal distances in a capture, and back to back in an array. If all of them are frames of one
-layout, and no earlier type matches at their first bytes, the search would accept the same frames.
-So they are judged as rows, which takes a few calls. In a stream the rows end at the first invalid
-row, where the search continues; datagrams are judged as rows all or none. Rows of a weak type
-continue a run.
+In a stream without errors, each frame begins directly after the previous one. Datagrams of one size
+are at equal distances in a capture or an array. If all of them are frames of one layout, and no
+earlier type matches at their first bytes, the search would accept the same frames. They are
+therefore checked as rows, which takes a few calls of NumPy. In a stream, the search continues at
+the first invalid row. Datagrams are either all checked as rows, or none of them. Rows of a weak
+type continue a run.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from lidarspec.frames.layout import Bytes2D, Layout, Marks, are_contradictory, m
 from lidarspec.framing.candidates import Framing, PieceResult, SearchState
 from lidarspec.framing.results import Frames, Indices, Numbers
 
-#: number of rows whose constants are compared first, before those of all rows.
+#: The constants of this number of rows are compared before the constants of all rows.
 FIRST_ROWS = 64
-#: bytes of a piece that is judged as rows even after a piece with damaged frames.
+#: A piece of at most this number of bytes is checked as rows even after a piece with errors.
 SMALL_PIECE_BYTES = 1 << 16
-#: constants that distinguish the types of most datagrams.
+#: The first datagram is compared with this number of constants of each type.
 DISTINCTIVE_CONSTANTS = 4
 
 
@@ -33,8 +33,8 @@ def find_regular_frames(
 
     Args:
         buffer: the undecided bytes and the bytes after them.
-        mode: state between pieces; records whether rows were faster.
-        base: offset of the buffer in the stream.
+        mode: the state between pieces, which is updated.
+        base: the offset of the buffer in the stream.
     """
     if not mode.size or not (mode.steady or len(buffer) <= SMALL_PIECE_BYTES):
         return None
@@ -70,10 +70,10 @@ def find_regular_frames(
 def find_regular_datagrams(
     framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: SearchState
 ) -> Frames | None:
-    """Return datagrams at equal distances as frames of one type and layout, or None.
+    """Check datagrams at equal distances as frames of one type and layout.
 
-    None means that they must be judged otherwise: they differ in size, some lack the constants of
-    the type or have the constants of an earlier type, or they change the active types.
+    Returns None if this is not possible, because the datagrams differ in size, lack constants of
+    the type, have the constants of an earlier type, or change the active types.
     """
     rows = _rows(buffer, starts, sizes)
     if rows is None:
@@ -89,13 +89,13 @@ def find_regular_datagrams(
 def judge_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
-    """Return rows with the constants of a type as candidates of one layout.
+    """Check rows with the constants of a type as candidates of one layout.
 
-    Returns None if the type has no layout of their size.
+    Returns None if the type has no layout of this size.
 
     Args:
-        rows: of the buffer, at equal distances.
-        first: the offset of the first one.
+        rows: the rows, which are at equal distances in the buffer.
+        first: the offset of the first row.
     """
     survey = framing.codecs[kind].survey_rows(rows, sums=framing.sums)
     if survey is None:
@@ -117,9 +117,9 @@ def judge_rows(
 
 
 def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """Return how many leading rows have the constants of a type.
+    """Return how many rows from the first on have the constants of a type.
 
-    Constants are compared as far as the rows go. Returns None if no row has them.
+    Constants beyond the end of the rows are not compared. Returns None if no row has the constants.
     """
     constants = tuple(
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
@@ -134,7 +134,7 @@ def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | N
 
 
 def find_common_step(starts: Indices) -> int:
-    """Return the bytes from each start to the next; 0 if they differ."""
+    """Return the common distance from each start to the next; 0 if the distances differ."""
     steps = starts[1:] - starts[:-1]
     step = steps.item(0) if len(steps) else 0
     if step > 0 and np.count_nonzero(steps == step) == len(steps):
@@ -143,7 +143,7 @@ def find_common_step(starts: Indices) -> int:
 
 
 def _piece(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
-    """Return a piece that ends with some frames, and waits for a next one that has begun."""
+    """Return the result for a piece that ends with some frames and the begin of another."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
     need = 0
@@ -155,9 +155,9 @@ def _piece(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
 def _count_needed(
     framing: Framing, mode: SearchState, kind: int, layout: Layout, rest: bytes
 ) -> int:
-    """Return how many bytes are needed to judge an incomplete frame of a layout.
+    """Return how many bytes are needed to check an incomplete frame of a layout.
 
-    Returns 0 if the bytes may be another frame.
+    Returns 0 if the bytes may be a frame of another type or layout.
     """
     first = next(
         (other for other in framing.active_types(mode) if _begins_with(framing.marks[other], rest)),
@@ -175,14 +175,14 @@ def _count_needed(
 
 
 def _begins_with(marks: Marks, data: bytes) -> bool:
-    """Return whether the constants are right as far as the bytes go."""
+    """Return whether bytes have some constants; constants beyond their end are ignored."""
     return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
 
 def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
     """Return datagrams of one size at equal distances as rows of an array.
 
-    Returns None if they have other sizes or distances.
+    Returns None if sizes or distances differ.
     """
     count = len(sizes)
     size = sizes.item(0) if count else 0
@@ -200,7 +200,8 @@ def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D
 def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
     """Return the type with the constants of the first datagram.
 
-    Returns None if there is none, or if any datagram has the constants of an earlier type as well.
+    Returns None if there is no such type, or if a datagram also has the constants of an earlier
+    type.
     """
     first = rows[0].tobytes()
     before = list[int]()
@@ -217,7 +218,12 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
 
 
 def _has_both(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether any row with the constants of one type has those of another as well."""
+    """Return whether any row may have the constants of two types.
+
+    Args:
+        kind: the index of a type.
+        other: the index of the type whose constants the rows have.
+    """
     if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False
     marked = match_constants(framing.words[kind], rows)

@@ -1,9 +1,10 @@
-"""The results of framing: frames as one struct of arrays, single frames, and counters.
+"""The results of framing: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 
-`Frames` is passed from step to step: the engine of a frame type judges candidates and finds their
+`Frames` is passed from step to step. The codec of a frame type checks candidates and finds their
 layouts, the search accepts some of them, and the decoder adds their offsets in the input and their
-arrival times. Frames of one size at equal distances are described by a few numbers; the arrays that
-follow from these cost more than finding the frames, so they are made when they are first read.
+arrival times. Frames of one size at equal distances are described by a few numbers. Making arrays
+from these numbers takes longer than finding the frames, so each array is made when it is first
+read.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from lidarspec.frames.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
 Status = NDArray[np.integer[Any]]
-#: offsets as an array, or as a range that becomes an array when it is first read.
+#: Offsets as an array, or as a range, which is converted to an array when it is first read.
 Numbers = NDArray[np.int64] | range
 
-#: status of a candidate: valid, incomplete, or the reason why it is invalid.
+#: The status of a candidate: valid, incomplete, or the reason why it is invalid.
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
-#: up to this number of layouts, frames are found faster layout by layout than by sorting.
+#: Up to this number of layouts, searching for the frames of each layout is faster than sorting.
 MAX_UNSORTED_LAYOUTS = 16
-#: up to this number of layouts, no count of each layout is needed first.
+#: Up to this number of layouts, the frames of each layout need not be counted first.
 MAX_UNCOUNTED_LAYOUTS = 4
 
-#: number of bytes in the repr of a frame.
+#: The number of bytes in the repr of a frame.
 REPR_BYTES = 8
 
-#: status of a rejected candidate -> its counter.
+#: The counter for each status of a rejected candidate.
 COUNTED = {
     SHORT: "bad_length",
     LENGTH: "bad_length",
@@ -60,26 +61,30 @@ class Counters:
     ``bytes_in == bytes in frames + bytes_skipped + pending`` always holds.
 
     Attributes:
-        frames: number of frames by type.
-        bytes_filler: declared fillers among the skipped bytes.
-        pending: bytes held because a candidate needs more.
-        bad_checksum, bad_length, implausible: rejected candidates.
-        bad_constant: datagrams without the constants of any frame. In a stream such bytes are
-            skipped and are not candidates.
-        lost, duplicates, late: packets, by the sensor's counter and clock.
+        frames: the number of frames by type.
+        bytes_filler: the number of declared fillers among the skipped bytes.
+        pending: the number of bytes that wait because a candidate needs more bytes.
+        bad_checksum, bad_length, implausible: the numbers of rejected candidates, by the reason.
+        bad_constant: the number of datagrams without the constants of any frame. In a stream, such
+            bytes are not candidates and are skipped.
+        lost, duplicates, late: the numbers of lost, duplicate and late packets, found by the
+            sensor's counter or clock.
         incomplete_returns: groups of packets with the returns of the same firings of which some,
             but not all, packets were lost (`PacketCounter.returns`).
-        fragments_lost: datagrams that were missing when their message was abandoned.
-        fragments_late: datagrams that arrived twice, or after their message was joined or
-            abandoned.
-        kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
-        unread: bytes of a damaged file that could not be read.
-        plugin_errors: packets or candidates at which a function of the plugin raised; `failures`
-            has the first exceptions.
+        fragments_lost: the number of fragments that were missing when their message was dropped.
+        fragments_late: the number of fragments that arrived twice, or after their message was
+            joined or dropped.
+        kernel_drops: the number of datagrams that the operating system dropped.
+        queue_dropped: the number of chunks that were dropped because a queue was full.
+        foreign: the number of datagrams from other senders.
+        disconnects: how often the device has disappeared.
+        unread: the number of bytes of a damaged file that could not be read.
+        plugin_errors: the number of packets or candidates for which a function of the plugin raised
+            an error. `failures` has the first errors.
         nominal: whether a default calibration was used in any scan.
-        unended: the warning about scans without a detected end; "" if there is none.
-        undated: the warning about times without a date; "" if there is none.
-        masked: the remark on a masked sector; "" if there is none.
+        unended: the warning about scans without an end; "" without a warning.
+        undated: the warning about times without a date; "" without a warning.
+        masked: the warning about a masked sector; "" without a warning.
     """
 
     bytes_in: int = 0
@@ -114,9 +119,9 @@ class Counters:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, failure: PluginError, number: int) -> None:
-        """Count packets at which a function of the plugin raised.
+        """Count packets for which a function of the plugin raised an error.
 
-        The first few failures are kept.
+        The first few errors are kept.
         """
         self.plugin_errors += number
         if len(self.failures) < 5:
@@ -124,13 +129,13 @@ class Counters:
 
     @property
     def tracebacks(self) -> list[str]:
-        """The tracebacks of the first few failures, as text."""
+        """The tracebacks of the first few errors of the plugin, as text."""
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """Return the first failure of a sensor's plugin, with the number of packets.
+        """Return the first error of a sensor's plugin, with the number of packets.
 
-        Returns None if it did not fail.
+        Returns None if there was no error.
         """
         if not self.failures:
             return None
@@ -168,13 +173,12 @@ class Found:
     """One frame in the input.
 
     Attributes:
-        frame: the name of its type.
-        offset: of its first byte in everything fed so far (of its datagram's payload, joined, for
-            datagram links).
-        data: its bytes.
-        at: arrival time in ns of the piece of input that completed it; None if the caller gave
-            none.
-        gap: bytes (other than fillers) skipped since the frame before it.
+        frame: the name of the frame type.
+        offset: the offset of its first byte in the input. Datagrams count as if they were joined.
+        data: the bytes of the frame.
+        at: the arrival time of the bytes that completed the frame, ns; None if unknown.
+        gap: the number of bytes that were skipped between the previous frame and this one, without
+            fillers.
     """
 
     frame: str
@@ -192,18 +196,22 @@ class Frames:
     """Frames or candidates in a piece of input, in order, as arrays of length n.
 
     Attributes:
-        buffer: the bytes that contain them, from `starts`, `sizes` long. The size of an incomplete
-            candidate is the number of bytes required to decide about it (0: unknown).
-        names, kinds: the incoming frame types of a sensor, and the type of each frame as an index;
-            -1 for datagrams that are not frames.
-        layouts, forms: the layouts of compiled frames, and the layout of each frame as an index; -1
-            if unknown.
-        status: `VALID`, or why a candidate is not a frame.
-        offsets: the offset of each in the whole input; datagrams count as if they were joined.
-        places: these offsets, as a range if the frames have one size and follow one another.
-        rows: the bytes of each as one row, if all have one layout and the rows were gathered; for
-            candidates, of the first complete ones.
-        errors: failures of the plugin.
+        buffer: the bytes that contain the frames, at the offsets `starts`.
+        sizes: the size of each frame in bytes. For an incomplete candidate, it is the number of
+            bytes required to decide about it, 0 if unknown.
+        names: the names of the incoming frame types of the sensor.
+        kinds: the index in `names` of the type of each frame; -1 for a datagram that is not a
+            frame.
+        layouts: the layouts of the frames.
+        forms: the index in `layouts` of the layout of each frame; -1 if unknown.
+        status: the status of each frame, which is `VALID` or the reason why a candidate is not a
+            frame.
+        offsets: the offset of each frame in the whole input. Datagrams count as if they were
+            joined.
+        places: the same offsets, as a range if the frames have one size and follow one another.
+        rows: the bytes of each frame as a row, if all have one layout and the rows were gathered.
+            For candidates, only the first complete ones have rows.
+        errors: the errors of the plugin.
     """
 
     def __init__(
@@ -241,7 +249,7 @@ class Frames:
 
     @classmethod
     def join(cls, parts: Sequence[Frames]) -> Frames:
-        """Return candidates of several parts of one buffer, without their rows and errors."""
+        """Join candidates that have the same buffer; rows and errors are left out."""
         if len(parts) == 1:
             return parts[0]
         layouts = list[Layout]()
@@ -275,9 +283,9 @@ class Frames:
 
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
-        """The bytes skipped before each frame, (n,), without fillers.
+        """The number of bytes skipped before each frame, (n,), without fillers.
 
-        They are 0 until the decoder sets them.
+        The numbers are 0 until the decoder sets them.
         """
         return repeat(0, len(self))
 
@@ -296,7 +304,7 @@ class Frames:
 
     @property
     def total_bytes(self) -> int:
-        """The bytes of all frames together."""
+        """The total size of all frames in bytes."""
         size = broadcast_value(self.sizes)
         if size is None:
             return int(self.sizes.sum())
@@ -308,7 +316,7 @@ class Frames:
         return not np.count_nonzero(self.status)
 
     def select(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
-        """Return the frames that a mask, ascending indices or a slice choose."""
+        """Return the frames that a mask, ascending indices or a slice select."""
         if not (isinstance(which, slice) or which.dtype != np.bool_):
             which = np.flatnonzero(which)
         rows = self.rows
@@ -330,7 +338,10 @@ class Frames:
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
-        """Return each layout that is known, with the indices of its frames, (k,)."""
+        """Return pairs of a layout and the indices of its frames, (k,).
+
+        Frames without a known layout are left out.
+        """
         form = broadcast_value(self.forms)
         if form is not None:
             if form >= 0:
@@ -355,9 +366,9 @@ class Frames:
         gaps: NDArray[np.int64],
         at: NDArray[np.int64],
     ) -> Frames:
-        """Return these frames with their place in the input.
+        """Return these frames with their offsets in the input and their arrival times.
 
-        Gathered rows replace the buffer, so that the rest of it can be freed.
+        Gathered rows replace the buffer, so that the memory of the buffer can be freed.
         """
         if self.rows is None or isinstance(self._starts, range):
             return self._with(names=names, places=places, gaps=gaps, at=at)
@@ -373,7 +384,7 @@ class Frames:
         )
 
     def with_arrivals(self, at: NDArray[np.int64]) -> Frames:
-        """These frames with other times of arrival, (n,) ns."""
+        """Return these frames with other arrival times, (n,) ns."""
         return self._with(at=at)
 
     def _with(self, **changes: Any) -> Frames:

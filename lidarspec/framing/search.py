@@ -1,13 +1,14 @@
-"""Find frames in a byte stream by one rule, which is the same for every sensor.
+"""Find frames in a byte stream by a rule that is the same for every sensor.
 
-A stream decodes to the leftmost valid candidate, and continues after its last byte; an invalid
-candidate advances the search by one byte. At one offset the order of the frame types decides. A
-type with `after` is active only while the last frame that any `after` names is the frame that it
-names. A type with `confirm` counts only in unbroken runs (`lidarspec.framing.weak_frames`).
+The leftmost valid candidate is accepted, and the search continues after its last byte. After an
+invalid candidate, the search continues at the next byte. At one offset, the first type in order
+that matches is used. A type with `after` is active only if the last frame whose type is named in
+any `after` is of the type that it names. Frames of a type with `confirm` are accepted only in runs
+without gaps (`lidarspec.framing.weak_frames`).
 
-All candidates of a piece are judged in bulk, and accepted in bulk, with one step for each conflict
-and for each frame that changes the active types. The work is therefore linear in the input,
-however often headers or changes appear in it, and the result is that of the byte-by-byte rule.
+All candidates of a piece are checked together, and accepted together up to the next conflict or
+frame that changes the active types. The time is therefore linear in the size of the input for any
+input, and the result is the same as that of a search byte by byte.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from lidarspec.framing.candidates import (
 )
 from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 
-#: bytes between two changes of the active types from which on a piece ends at the second change, so
-#: that its other bytes are not judged for types that are no longer active.
+#: If at least this number of bytes is between two changes of the active types, the piece ends at
+#: the second change, so that its remaining bytes are not checked for types that are no longer
+#: active.
 MIN_STAY_BYTES = 1 << 12
 
 
@@ -39,9 +41,9 @@ def find_frames(
 
     Args:
         buffer: the undecided bytes and the bytes after them.
-        mode: state between pieces; changed here.
-        base: offset of the buffer in the stream.
-        final: reject candidates that need more bytes than there are.
+        mode: the state between pieces, which is updated.
+        base: the offset of the buffer in the stream.
+        final: whether no bytes follow, so that incomplete candidates are rejected.
     """
     candidates = Candidates(framing, buffer, mode, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
@@ -77,11 +79,12 @@ def find_frames(
 
 
 class _FrameWalk:
-    """A walk through a piece for one set of active types; it may be resumed several times.
+    """Accepts the candidates of a piece for one set of active types.
 
     Args:
-        live: the candidates that are valid or incomplete; an incomplete candidate extends to the
-        end. base: offset of the piece in the stream.
+        live: the candidates that are valid or incomplete. An incomplete candidate extends to the
+            end of the piece.
+        base: the offset of the piece in the stream.
     """
 
     def __init__(
@@ -123,7 +126,8 @@ class _FrameWalk:
 
         Args:
             position: the offset to start from.
-            piece: receives its end and the bytes it waits for, unless the active types change.
+            piece: the result for the piece. Its end and the bytes that it waits for are set, unless
+                the active types change.
 
         Returns:
             The end of the last accepted frame, or of the piece.
@@ -156,7 +160,7 @@ class _FrameWalk:
         return piece.end
 
     def frames(self) -> list[Frames]:
-        """Return all accepted frames, in parts that may overlap in order."""
+        """Return all accepted frames, in several parts."""
         if len(self._taken) == 1:
             first, last = self._taken[0]
             taken = self._frames.select(slice(first, last + 1))
@@ -206,7 +210,11 @@ class _FrameWalk:
 
 
 def _rows_of(runs: Offsets) -> Offsets:
-    """Return all numbers from each first to its last, (k,)."""
+    """Return all numbers from the first to the last of each run, (k,).
+
+    Args:
+        runs: the first and the last number of each run, (n, 2).
+    """
     firsts = runs[:, 0]
     counts = runs[:, 1] - firsts + 1
     begins = np.cumsum(counts) - counts
@@ -215,9 +223,9 @@ def _rows_of(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
-    """Store the regularity of the frames for the next piece.
+    """Store in `mode` whether the frames are at equal distances.
 
-    Only frames since the last change of the mode count.
+    Only frames since the last change of the active types count.
     """
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
@@ -236,7 +244,8 @@ def count_rejected(
     At the first byte of a frame, candidates of earlier types count as well.
 
     Args:
-        stays: (offset, `after` state) for each stretch with the same active types.
+        stays: for each stretch with the same active types, its offset and the value of
+            `SearchState.after`.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])

@@ -1,7 +1,7 @@
-"""The engine of frames with a wire form: text, or escaped bytes.
+"""The codec of frames with a wire form, such as text or escaped bytes.
 
-The form finds the end of each candidate and decodes it to the bytes of the struct, one candidate at
-a time. The structs are grouped by layout and judged together, like binary frames.
+The wire form finds the end of each candidate and decodes it to the bytes of the struct, one
+candidate at a time. The structs are grouped by layout and checked together, as for binary frames.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Fr
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import NO_END, find_ends
 
-#: the largest number of candidates of a piece that are remembered with their structs.
+#: The maximum number of candidates of a piece that are stored with their structs.
 MAX_REMEMBERED = 64
 
 
 class TextCodec(Codec):
-    """The engine of a frame type with a wire form.
+    """The codec of a frame type with a wire form.
 
     Raises:
         SpecError: if the offset of a field of the struct cannot be computed.
@@ -36,7 +36,7 @@ class TextCodec(Codec):
     def __init__(self, frame: Frame, coder: FormCoder) -> None:
         super().__init__(frame)
         self._coder = coder
-        #: the structs of the frames found last, by their bytes, since they become columns next.
+        #: The structs of the last frames, by the bytes of the frames, for making columns.
         self._found = dict[bytes, bytes]()
         self.size = None
         self.prefix = {offset: (0xFF, byte) for offset, byte in coder.prefix.items()}
@@ -74,12 +74,12 @@ class TextCodec(Codec):
     def _judge_whole(
         self, frames: Frames, which: Sequence[int], status: NDArray[np.uint8], sums: Sums | None
     ) -> None:
-        """Judge complete candidates; equal candidates are decoded once.
+        """Check complete candidates; equal candidates are decoded once.
 
         Args:
-            frames: all candidates; errors of the plugin are added to it.
-            which: the indices of the candidates to judge.
-            status: the status of all candidates, changed here.
+            frames: all candidates. Errors of the plugin are added to it.
+            which: the indices of the candidates to check.
+            status: the status of all candidates, which is updated.
         """
         errors = list[PluginError]()
         decode = functools.lru_cache(MAX_REMEMBERED)(functools.partial(self._decode, errors=errors))
@@ -107,7 +107,8 @@ class TextCodec(Codec):
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
         """Return the status and the struct of a complete candidate.
 
-        If the struct is not None, it still has to be judged, and its status replaces this one.
+        If the struct is not None, it still has to be checked, and its status replaces the returned
+        one.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -129,9 +130,10 @@ class TextCodec(Codec):
     def _group(
         self, structs: Sequence[bytes]
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
-        """Return structs by layout, and the indices of refused structs by refusal.
+        """Group structs by layout; return the groups and the refused structs.
 
-        Structs without a layout of their size are left out.
+        Refused structs are given as pairs of a refusal and the indices of the structs. Structs
+        without a layout of their size are left out.
         """
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes

@@ -1,15 +1,16 @@
-"""Judge candidates of many lengths together.
+"""Check candidates of many lengths together.
 
-A false header can contain any length, so noise with headers has candidates of hundreds of layouts,
-with one or two candidates each. Judging the candidates of a layout takes a few dozen NumPy calls,
-for one candidate or a thousand. Most of these layouts differ only in the length of an array at
-their end: they have the same constants, checksums over the same bytes up to the same distance from
-the end, and tests of the same fields. `LayoutFamilies` finds such layouts. Their candidates become
-rows of one array, and bytes after the end of a candidate are ignored: a checksum gets zeros
-instead, which do not change the checksums in `ZERO_EXTENDED`, and a test leaves out elements.
+If random bytes look like a header, they can contain any length. A noisy stream can therefore have
+candidates of hundreds of layouts, with one or two candidates each. Checking the candidates of a
+layout takes a few dozen NumPy calls, for one candidate as for a thousand. Most of these layouts
+differ only in the length of an array at their end: they have the same constants, checksums over the
+same bytes up to the same distance from the end, and tests of the same fields. `LayoutFamilies`
+finds such layouts. Their candidates become the rows of one array, and bytes after the end of a
+candidate are ignored. A checksum is computed over zeros in their place, which do not change the
+checksums in `ZERO_EXTENDED`. A test ignores elements after the end.
 
-The results are the same as from `plausibility.CandidateChecker`, which also does all tests that are
-more than a lookup of one or two bytes.
+The results are the same as those of `plausibility.CandidateChecker`, which is also used for all
+tests that are not a lookup of one or two bytes.
 """
 
 from __future__ import annotations
@@ -29,30 +30,30 @@ from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
 Status = NDArray[np.uint8]
-#: A layout, and the indices of its candidates.
+#: A layout and the indices of its candidates.
 LayoutGroup = tuple[Layout, Offsets]
-#: returns the checker of a layout.
+#: A function that returns the checker of a layout.
 MakeJudge = Callable[[Layout], CandidateChecker]
 
-#: layouts are judged together if there are at least `MANY_LAYOUTS` with fewer than
-#: `MANY_CANDIDATES` candidates each.
+#: Layouts are checked together if at least `MANY_LAYOUTS` layouts have fewer than `MANY_CANDIDATES`
+#: candidates each.
 MANY_LAYOUTS = 4
 MANY_CANDIDATES = 16
-#: checksums that do not change if zeros are appended to the data.
+#: The checksums that do not change if zeros are appended to the data.
 ZERO_EXTENDED: tuple[type[Checksum], ...] = (Sum, WordXor, Xor)
-#: the longest row of an array is at most `MAX_STRETCH` times as long as the shortest row, or has at
-#: most `SHORT_ROW_BYTES`.
+#: The longest candidate in an array of rows is at most `MAX_STRETCH` times as long as the shortest,
+#: or has at most `SHORT_ROW_BYTES`.
 MAX_STRETCH = 4
 SHORT_ROW_BYTES = 64
-#: the largest number of remembered keys, so that noise does not fill the memory.
+#: The maximum number of stored keys, so that random input does not fill the memory.
 MAX_KEYS = 1024
-#: the size of the rows that are judged at a time, bytes.
+#: The maximum size of the rows that are checked together, in bytes.
 BLOCK_BYTES = 1 << 19
 
 
 @dataclass(frozen=True)
 class LayoutFamily:
-    """The key by which layouts that differ only in the length of an array are grouped.
+    """The family of a layout; the layouts of a family differ only in the length of an array.
 
     Attributes:
         number: the number of the family.
@@ -74,7 +75,7 @@ class LayoutFamilies:
     def split(
         self, groups: list[LayoutGroup], make_judge: MakeJudge
     ) -> tuple[list[JointChecker], list[LayoutGroup]]:
-        """Return the groups to judge together, and those to judge layout by layout."""
+        """Split groups into those to check together, and those to check layout by layout."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()
@@ -100,7 +101,7 @@ class LayoutFamilies:
     def find_family(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
         """Return the family of a layout.
 
-        Returns None if its candidates cannot be judged together with others.
+        Returns None if its candidates cannot be checked together with candidates of other layouts.
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, judge)
@@ -137,9 +138,9 @@ def _seal_key(seal: Seal, size: int) -> Hashable:
 
 
 def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
-    """Return the position of a checksum, from the start or the end of the frame.
+    """Return the position of a checksum, counted from the start or the end of the frame.
 
-    It counts from the end if the checksum follows the last covered bytes.
+    It is counted from the end if the checksum is after the last covered byte.
     """
     if leaf.offset >= seal.spans[-1][1]:
         return ("end", size - leaf.offset)
@@ -153,7 +154,7 @@ def _test_key(check: Check) -> Hashable:
 
 
 class JointChecker:
-    """The checks of candidates of layouts of one family.
+    """Checks the candidates of the layouts of one family.
 
     Args:
         groups: the layouts with their candidates.
@@ -163,7 +164,7 @@ class JointChecker:
         layouts: the layouts of the groups.
         which: the indices of all candidates, (n,).
         forms: the index of each candidate's layout, (n,).
-        is_final: whether valid candidates are frames; otherwise some tests remain.
+        is_final: whether all tests are done. If not, valid candidates have to be checked further.
     """
 
     def __init__(
@@ -198,7 +199,7 @@ class JointChecker:
     def judge(
         self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None
     ) -> Status:
-        """Return the status of complete candidates, (k,).
+        """Check complete candidates, and return their status, (k,).
 
         Args:
             offsets: the offset of each candidate, (k,).
@@ -216,7 +217,7 @@ class JointChecker:
     def _judge_rows(
         self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None
     ) -> Status:
-        """Return the status of candidates in rows of the longest layout, (n,).
+        """Check candidates in rows of the longest layout, and return their status, (n,).
 
         Bytes after the end of a candidate are ignored.
         """
@@ -243,7 +244,8 @@ def _find_length(check: Check) -> int:
 def _iter_by_size(sizes: Offsets) -> Iterator[Offsets]:
     """Yield the indices of candidates in groups of similar size.
 
-    Each group is ascending by size, with rows of at most `BLOCK_BYTES` together.
+    The indices in a group are sorted by size. The rows of a group have at most `BLOCK_BYTES`
+    together.
     """
     order = np.argsort(sizes, kind="stable")
     ordered = sizes[order]
@@ -269,14 +271,15 @@ def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
 
 
 def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
-    """Return a mask of the candidates with the right checksum, (n,).
+    """Return whether each candidate has the right checksum, (n,).
 
-    In each row, the bytes after the covered bytes move to the end, as in the longest layout.
+    In each row, the bytes after the covered bytes are moved to the end of the row, where they are
+    in the longest layout.
 
     Args:
         seal: the checksum of the longest layout, which fills its row.
         sizes: the sizes of the candidates, (n,).
-        sums: computes checksums.
+        sums: a function that computes checksums.
     """
     size = rows.shape[1]
     tail = size - seal.spans[-1][1]

@@ -1,15 +1,16 @@
-"""Weak frames: accepted only in runs.
+"""Weak frame types, which are accepted only in runs of consecutive frames.
 
-A frame of five bytes without a checksum is valid at every sixth offset of noise. A type with
-`confirm=k` is therefore accepted only if k or more valid frames follow one another without a gap.
-Then the whole run is accepted.
+For example, a frame of five bytes without a checksum may be valid at every sixth offset of random
+bytes. Frames of a type with `confirm=k` are therefore accepted only if at least k valid frames
+follow one another without a gap. The whole run is then accepted.
 
-This is a filter over the results that every type gets. A candidate is followed by the candidate
-that begins directly after its last byte, unless an earlier type in the order has a frame there. The
-first candidate of a run of at least k is a head. If a run reaches the end of the bytes, its first
-candidate may become a head, and waits. The search handles a head like any other candidate, with
-the end of its whole run, so it skips the other frames of the run. A run that was accepted in
-the bytes before continues with any valid candidate.
+Weak candidates are checked like all others, and this module then selects the runs. The next frame
+of a run is the candidate that begins directly after the last byte of a candidate, unless a frame of
+an earlier type begins there. The first candidate of a run of at least k frames is called a head. If
+a run reaches the end of the bytes, its first candidate may become a head, and waits for more bytes.
+The search handles a head like any other candidate, with the end of the run as its end, so it skips
+the other frames of the run. If a run was accepted in the previous piece, any valid candidate
+directly after it continues the run.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ class WeakRuns:
     """The runs of one weak type in a piece of a stream.
 
     Attributes:
-        frames: the n candidates of the type that are valid or incomplete, by offset.
-        following: the row of the next candidate in the run of each, (n + 2,); n if the run ends
-            there, and n + 1 if that depends on bytes after the piece. The last two elements are n
-            and n + 1 themselves.
-        confirm: the shortest run that is accepted.
-        is_single: whether a frame of the type changes the active types, so that frames are accepted
-            one at a time.
+        frames: the n candidates of the type that are valid or incomplete, sorted by offset.
+        following: for each candidate, the row of the next candidate in its run, (n + 2,). It is n
+            if the run ends, and n + 1 if this depends on bytes after the piece. The last two
+            elements are n and n + 1.
+        confirm: the minimum length of a run that is accepted.
+        is_single: whether a frame of the type changes the active types, so that frames have to be
+            accepted one at a time.
     """
 
     frames: Frames
@@ -68,7 +69,7 @@ class WeakRuns:
         return heads
 
     def row_at(self, offset: int) -> int | None:
-        """Return the row of the valid candidate at an offset; None if there is none."""
+        """Return the row of the valid candidate at an offset; None without one."""
         row = int(self.frames.starts.searchsorted(offset))
         if row == len(self.frames) or self.frames.starts.item(row) != offset:
             return None
@@ -88,7 +89,8 @@ class WeakRuns:
     def _jumps(self) -> list[Indices]:
         """The rows that are 1, 2, 4, 8 ... frames further in a run, each (n,).
 
-        Past the end of a run they are its last row. In the last array, all runs have ended.
+        After the end of a run, the row is the last row of the run. In the last array, all runs have
+        ended.
         """
         count = len(self.frames)
         rows = np.arange(count)
@@ -116,11 +118,12 @@ def find_runs(
     """Return the runs of a weak type.
 
     Args:
-        candidates: the candidates of the type, by offset, with any status.
-        earlier: the valid and waiting candidates of types that are earlier in the order, by offset.
-        confirm: the shortest run that is accepted.
+        candidates: the candidates of the type with any status, sorted by offset.
+        earlier: the valid and incomplete candidates of types that are earlier in the order, sorted
+            by offset.
+        confirm: the minimum length of a run that is accepted.
         is_single: whether a frame of the type changes the active types.
-        final: whether no bytes follow: incomplete candidates are then invalid.
+        final: whether no bytes follow, so that incomplete candidates are invalid.
     """
     frames = candidates.select(candidates.status <= (VALID if final else SHORT))
     is_short = frames.status == SHORT
