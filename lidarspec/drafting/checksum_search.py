@@ -1,8 +1,8 @@
 """Find the checksum of sample frames: algorithm, place and covered bytes.
 
-All plain checksums are tried: XOR, sums of bytes and words, their complements, words in groups,
-folded sums, split nibbles. If no plain checksum is sure, CRCs are calculated from the frames
-(`crc_search`).
+All simple checksums are tried: XORs, sums of bytes and of words, their complements, XORs of words
+in groups, folded sums, and XORs that are stored in two nibbles. If none of them is certain, CRCs
+are calculated from the frames (`crc_search`).
 """
 
 from __future__ import annotations
@@ -42,14 +42,15 @@ from lidarspec.spec.checksums import (
 MAX_MATCHES = 8
 #: Number of frames on which a checksum is tried before all frames are used.
 SCREENING_FRAMES = 16
-#: Minimum share of frames with a valid checksum if a constant was fitted.
+#: Minimum share of frames with a valid checksum, for a checksum with a fitted constant.
 MIN_VALID_SHARE = 0.95
-#: Upper limit of the number of places and spans at which split nibbles are tried.
+#: Number of combinations of offset and covered bytes that are tried for a checksum in nibbles.
 NIBBLE_TRIALS = 8
 ANYWHERE_NOTE = (
-    "an XOR of a whole frame fits at several offsets: this is the one with the most varying bytes"
+    "an XOR of a whole frame fits at several offsets; this is the offset with the most varying"
+    " bytes"
 )
-#: Heads and groups of `WordXor` that are tried.
+#: Values of `WordXor.head` to try. The next constant is the values of `WordXor.groups`.
 WORD_XOR_HEADS = (0, 2, 4, 6, 8, 10, 12)
 WORD_XOR_GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
 _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
@@ -57,11 +58,13 @@ _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 @dataclass(frozen=True)
 class WordSum(Checksum):
-    """The sum of two-byte words modulo 2**16; an odd last byte is extended by a zero.
+    """The sum of two-byte words modulo 2**16.
+
+    If the number of bytes is odd, a zero byte is appended.
 
     Attributes:
         words: byte order of the words.
-        carry: whether carries are added back.
+        carry: whether the carry out of bit 15 is added to the sum.
     """
 
     words: ByteOrder = "little"
@@ -93,10 +96,15 @@ class WordSum(Checksum):
 
 @dataclass(frozen=True)
 class OffsetChecksum(Checksum):
-    """Another checksum, combined with a constant.
+    """Another checksum combined with a constant.
 
-    It is ``constant ^ value`` for XORs, ``constant - value`` if `negative`, and otherwise
-    ``constant + value``.
+    The result is ``constant ^ value`` for XORs, ``constant - value`` if `negative` is set, and
+    ``constant + value`` for other checksums.
+
+    Attributes:
+        base: the other checksum.
+        constant: the constant.
+        negative: whether the value is subtracted from the constant.
     """
 
     base: Checksum
@@ -144,13 +152,13 @@ def search(
     quick: bool = False,
     is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place,
 ) -> list[ChecksumMatch]:
-    """Return the checksums that match the frames, the simplest and surest first.
+    """Return the checksums that match the frames, the simplest and likeliest first.
 
     Args:
-        frames: whole frames, of any lengths; some may be damaged. The result is surer with more
-            frames, and if their content varies more.
+        frames: whole frames of any lengths; some may be damaged. The result is more certain if
+            there are more frames and if their content varies more.
         quick: whether to stop after about a second. CRCs are then searched only at the usual
-            places, and for long frames only in the catalogue.
+            offsets, and for long frames only known CRCs are tried.
         is_possible_place: returns whether a checksum may be at a place.
     """
     samples = SampleFrames(frames)
@@ -176,14 +184,17 @@ def format_algorithm(algorithm: Checksum) -> str:
 
 
 def needs_class(algorithm: Checksum) -> bool:
-    """Return whether a plugin needs a class, because `lidarspec.spec` has none."""
+    """Return whether `lidarspec.spec` has no class for an algorithm.
+
+    A plugin must then contain the class.
+    """
     return isinstance(algorithm, OffsetChecksum | WordSum)
 
 
 def iter_plain_matches(
     samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place
 ) -> Iterator[ChecksumMatch]:
-    """Yield the plain checksums that match, of decreasing size, until one is sure."""
+    """Yield the simple checksums that match, the widest first, until one is certain."""
     few = samples.take_spread(SCREENING_FRAMES)
     tried = 0
     has_sure = False
@@ -204,7 +215,7 @@ def iter_plain_matches(
                             match.is_sure and not isinstance(match.algorithm, Xor | WordXor)
                         )
                         yield match
-            # An XOR may fit at several places, so all of them are searched.
+            # An XOR may fit at several offsets, so all offsets are searched.
             if has_sure_sum:
                 return
         if has_sure:
@@ -220,13 +231,16 @@ def _iter_matches(
     span: CoveredSpan,
     tried: int,
 ) -> Iterator[ChecksumMatch]:
-    """Yield an algorithm, and its variants with a constant, if they match.
+    """Yield the match of an algorithm, and of its variants with a constant.
 
     A constant is fitted only if there are several frames that can confirm it.
 
     Args:
         samples: all frames.
-        few: some of them, on which the algorithm is tried first.
+        few: some of the frames, on which the algorithm is tried first.
+        algorithm: the algorithm.
+        place: offset and size of the checksum.
+        span: the covered bytes.
         tried: number of checksums that were tried so far.
     """
     computed = few.compute_checksums(algorithm, place, span)
@@ -296,7 +310,7 @@ def _add_constant(algorithm: Checksum, constant: int) -> Checksum:
 
 
 def _find_constant(values: NDArray[np.uint64]) -> list[int]:
-    """Return the value that enough elements have, as a list; empty if there is none."""
+    """Return [value] if enough elements have the same value, else []."""
     distinct, counts = np.unique(values, return_counts=True)
     most_frequent = int(counts.argmax())
     if are_enough(int(counts[most_frequent]), len(values)):
@@ -305,7 +319,7 @@ def _find_constant(values: NDArray[np.uint64]) -> list[int]:
 
 
 def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
-    """Yield an XOR that is stored in the low nibbles of two adjacent bytes."""
+    """Yield the match of an XOR that is stored in the low nibbles of two bytes."""
     for offset in range(min(3, samples.shortest - 4)):
         place = ChecksumPlace(offset, 2)
         stored = samples.fields(place, "little")
@@ -318,7 +332,7 @@ def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
             evidence_bits = weigh_evidence(8, halves, 0, NIBBLE_TRIALS)
             if are_enough(right, len(samples)) and evidence_bits > 0:
                 note = (
-                    "its halves are the low nibbles of two bytes, low half first:"
+                    "it is stored in the low nibbles of two bytes, low half first:"
                     " name both in Checksummed(field=(...))"
                 )
                 yield ChecksumMatch(
@@ -335,7 +349,7 @@ def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
                 )
 
 
-#: Checksums of two bytes that are tried. Without larger groups, a head makes no difference.
+#: Checksums of two bytes to try. With groups of one word, `WordXor.head` has no effect.
 _WIDE: tuple[Checksum, ...] = (
     Sum(16),
     *(WordSum(order, carry) for order in ("little", "big") for carry in (False, True)),

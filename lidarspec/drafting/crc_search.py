@@ -1,14 +1,14 @@
-"""Search for a CRC of 8, 16 or 32 bits by polynomial division instead of trial.
+"""Find a CRC of 8, 16 or 32 bits by polynomial division.
 
 Polynomials over GF(2) are integers: bit k is the coefficient of x**k. A CRC is the remainder of a
-message modulo its polynomial, so the polynomial divides the message followed by its CRC. For two
-frames of one length it divides their XOR, whatever the start value and the final XOR of the CRC
-are. The polynomial is therefore a divisor of the greatest common divisor of such XORs.
+message modulo its polynomial, so the polynomial divides the message followed by its CRC. It also
+divides the XOR of two frames of the same length, for any start value and final XOR of the CRC. The
+polynomial is therefore a divisor of the greatest common divisor of such XORs.
 
-Start value and final XOR follow from the polynomial. If the frames have several lengths, they are
-the solution of linear equations. If all frames have one length, many pairs of values are
-equivalent, and the most usual pair is returned. If too few frames share a length, the usual pairs
-are tried first: with the right pair, the polynomial divides each frame.
+The start value and the final XOR are calculated from the polynomial. If the frames have several
+lengths, they are the solution of linear equations. If all frames have the same length, many pairs
+of values are equivalent, and the most usual pair is returned. If few frames have the same length,
+usual pairs are tried first; with the right pair, the polynomial divides each frame.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from lidarspec.drafting.samples import (
 )
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
 
-#: Largest degree of the cofactors that are tried to find a divisor.
+#: Maximum degree of the cofactors to try in order to find a divisor.
 MAX_COFACTOR_DEGREE = 11
-#: Widths of CRCs in bits. The widest comes first, because the polynomial of a narrow CRC may divide
+#: Widths of CRCs in bits. The widest is first, because the polynomial of a narrow CRC may divide
 #: the polynomial of a wide CRC.
 WIDTHS = (32, 16, 8)
-#: If frames are longer than this, division is used only for a CRC at the end. At other places only
-#: the CRCs of the catalogue are tried.
+#: For longer frames, division is used only for a CRC at the end. At other offsets, only the CRCs of
+#: the catalogue are tried.
 MAX_DIVIDED_BYTES = 256
 #: Cost of the division of one byte, in bytes of CRC computation.
 DIVISION_WORK = 32
-#: Limit of a quick search, in bytes of CRC computation: about a second.
+#: Limit of a quick search, in bytes of CRC computation. It is about one second.
 QUICK_WORK = 1 << 23
-#: Number of frames of one length in a selection that is used to find a polynomial.
+#: Number of frames of the same length from which a polynomial is calculated.
 FRAMES_PER_PICK = 4
-#: Number of selections that are tried at the usual place, in case of damaged frames.
+#: Number of selections of frames to try at the usual offset, because some frames may be damaged.
 MAX_PICKS = 6
-#: Largest number of polynomials that are tested with all frames for one place and span.
+#: Maximum number of polynomials to test with all frames, for one offset and range of covered bytes.
 MAX_POLYNOMIALS = 64
-#: For each frame: number of covered bytes, and the polynomial of the message and its checksum.
+#: (number of covered bytes, polynomial of the message followed by its checksum) of each frame.
 Codewords = list[tuple[int, int]]
 
 
@@ -78,7 +78,7 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     """Return the greatest common divisor of polynomials; 0 if all are 0.
 
     Args:
-        floor: stop early if the degree of the divisor falls below this value.
+        floor: the calculation stops if the degree of the divisor is less than this.
     """
     divisor = 0
     for polynomial in polynomials:
@@ -91,10 +91,12 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a degree with constant term 1, like CRC polynomials.
+    """Return the divisors of a degree that have the constant term 1.
+
+    CRC polynomials have this term.
 
     Returns:
-        The divisors. The list is also empty if there are too many polynomials to try.
+        The divisors; an empty list if too many polynomials would have to be tried.
     """
     if polynomial == 0:
         return []
@@ -117,7 +119,7 @@ def divisors(polynomial: int, degree: int) -> list[int]:
 
 
 def _try_all(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a small degree; divide by all polynomials at once."""
+    """Return the divisors of a small degree, by dividing by all polynomials at once."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
     top = np.uint32(degree)
@@ -131,12 +133,13 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
     """Solve linear equations over GF(2).
 
     Args:
-        equations: pairs (mask, bit): the XOR of the unknown's bits that are set in the mask is bit.
+        equations: pairs (mask, bit). The XOR of the bits of the unknown that are set in the mask is
+            `bit`.
         width: number of bits of the unknown.
 
     Returns:
-        One solution and a basis of the null space; the XOR of the solution with any of the basis
-        vectors is another solution. None if there is no solution.
+        One solution, and a basis of the null space. The XOR of the solution with basis vectors is
+        another solution. None if there is no solution.
     """
     rows: dict[int, int] = {}
     for mask, bit in equations:
@@ -209,13 +212,13 @@ def crc_matches(
     quick: bool = False,
     is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place,
 ) -> Iterator[ChecksumMatch]:
-    """Yield the CRCs that match, up to the first place with a sure match.
+    """Yield the CRCs that match, until a match is certain.
 
     Args:
         samples: the frames.
         mixed: whether to search only for CRCs with different `refin` and `refout`, or only for CRCs
             with equal `refin` and `refout`.
-        quick: whether to stop after a fixed amount of work; the usual places come first.
+        quick: whether to stop after a fixed amount of work. The usual offsets are tried first.
         is_possible_place: returns whether a CRC may be at a place.
     """
     if mixed:
@@ -269,14 +272,20 @@ def crc_matches(
 
 
 def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
-    """Return the cost of one place, span and reading, in bytes of CRC computation."""
+    """Return the cost of a search, in bytes of CRC computation.
+
+    Args:
+        few: the frames from which candidates are calculated.
+        reading: the bit order.
+        by_catalogue: whether only the CRCs of the catalogue are tried.
+    """
     if by_catalogue:
         return few.shortest * len(reading.catalogue_crcs())
     return DIVISION_WORK * sum(map(len, few.frames))
 
 
 def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
-    """Return whether each byte of a place has enough distinct values for a CRC."""
+    """Return whether each byte at a place has enough distinct values for a CRC."""
     if len(samples) < 2:
         return True
     min_distinct = max(min(len(samples) // 2, 24), 2)
@@ -308,11 +317,11 @@ def _iter_matches(
     *,
     by_catalogue: bool,
 ) -> Iterator[ChecksumMatch]:
-    """Yield the CRCs that match for one place, span and bit order.
+    """Yield the CRCs that match for one place, one span and one bit order.
 
     Args:
-        samples: all frames, which test the candidates.
-        few: the frames that are used to find candidates.
+        samples: all frames, on which candidates are tested.
+        few: the frames from which candidates are calculated.
         tried: number of combinations that were tried so far.
         by_catalogue: whether to try only the CRCs of the catalogue.
     """
@@ -324,7 +333,8 @@ def _iter_matches(
     for crc, fitted, notes in candidates:
         right = samples.count_valid(crc, place, span, reading.order)
         is_known = crc.poly in KNOWN[crc.width]
-        # An unknown polynomial is one more fitted parameter; a known one is one of many trials.
+        # An unknown polynomial is an additional fitted parameter. A known polynomial is one of many
+        # that were tried.
         evidence_bits = weigh_evidence(
             crc.width, stored, fitted + (not is_known), tried * (len(CRCS) if is_known else 1)
         )
@@ -350,8 +360,7 @@ def _iter_candidates(
     """Yield candidate CRCs.
 
     Yields:
-        The CRC, the number of frames that were needed to determine init and xorout, and notes
-        about ambiguous parameters.
+        (CRC, number of frames that determined init and xorout, notes about ambiguous parameters).
     """
     ones = (1 << reading.width) - 1
     lengths = {size for size, _ in words}
@@ -384,7 +393,7 @@ def _iter_catalogue(
 
 
 def _find_differences(words: Codewords) -> list[int]:
-    """Return the XOR of each frame and the first frame of its length, if they differ."""
+    """Return the XOR of each frame with the first frame of the same length, if not 0."""
     first: dict[int, int] = {}
     return [word ^ first[size] for size, word in words if first.setdefault(size, word) != word]
 
@@ -404,10 +413,14 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
 def _iter_crcs(
     words: Codewords, poly: int, reading: _BitOrder, *, has_one_length: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield a CRC with start value and final XOR for a polynomial, if they exist.
+    """Yield a CRC for a polynomial, with its start value and final XOR, if they exist.
 
     Args:
-        has_one_length: whether all frames have one length, so that the two values are ambiguous.
+        words: the codewords of the frames.
+        poly: the polynomial.
+        reading: the bit order.
+        has_one_length: whether all frames have the same length, so that the two values are
+            ambiguous.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}
@@ -436,7 +449,7 @@ def _iter_crcs(
             1,
             (
                 (
-                    "frames of a single length do not determine init and xorout: other pairs"
+                    "frames of equal length do not determine init and xorout; other pairs"
                     " give the same results"
                 ),
             ),
@@ -450,7 +463,7 @@ def _iter_crcs(
 def _solve_registers(
     remainders: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield a CRC with start value and final XOR from linear equations.
+    """Yield a CRC; linear equations determine its start value and final XOR.
 
     Args:
         remainders: frame length -> remainder of a frame of this length.

@@ -1,10 +1,10 @@
 """Make the files of a new sensor's Python distribution.
 
-`make_draft_files` uses a `Draft` of unknown frames in a capture. `make_example_files` makes an
-example sensor with all features.
+`make_draft_files` makes a sensor from a `Draft` of unknown frames in a capture.
+`make_example_files` makes an example sensor with all features.
 
 The files are made from templates in the package. A template line that ends in ``#if serial`` or
-``#if udp`` is used only for sensors with that link.
+``#if udp`` is used only for sensors with this link.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from lidarspec.drafting.draft_code import make_template_values
 from lidarspec.errors import UsageError, system_errors
 
 Link = Literal["serial", "udp"]
-#: Names that the modules of the templates use otherwise.
+#: Names that the templates of modules define.
 RESERVED_NAMES = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
-#: Maximum number of frames of a capture that are written as vectors.
+#: Maximum number of frames of a capture to write to vectors.json.
 MAX_VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
@@ -43,8 +43,8 @@ class DistributionNames:
         model: the model's display name; "" to derive it from the id.
 
     Raises:
-        UsageError: for an invalid id or distribution name, and for a vendor or model that a Python
-            string cannot contain without escapes.
+        UsageError: for an invalid id or distribution name, or for a vendor or model with characters
+            that must be escaped in a Python string.
     """
 
     id: str
@@ -96,7 +96,7 @@ class DistributionNames:
 
 
 def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
-    """Return the files of a distribution with an example sensor: path -> text."""
+    """Return {path: text} of the files of a distribution with an example sensor."""
     values = {**names.values(), "speed_remark": ", if code is 3" if link == "serial" else ""}
     return _make_files(
         names,
@@ -110,7 +110,7 @@ def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
 def make_draft_files(
     names: DistributionNames, link: Link, draft: Draft, *, origin: str, port: int | None
 ) -> dict[str, str]:
-    """Return the files of a distribution with a sensor drafted from a capture: path -> text.
+    """Return {path: text} of the files of a distribution with a drafted sensor.
 
     Args:
         names: the names in the distribution.
@@ -154,7 +154,7 @@ def _make_files(
     vectors: str,
     templates: tuple[str, str, str],
 ) -> dict[str, str]:
-    """Return the files of a distribution: path -> text.
+    """Return {path: text} of the files of a distribution.
 
     Args:
         vectors: the content of vectors.json.
@@ -222,7 +222,7 @@ def add_to_distribution(
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: nothing was written")
     entry = f'{names.id} = "{names.module}.{module}:{names.constant}"\n'
-    # Append the new vectors to the JSON array of the existing vectors, without formatting it anew.
+    # Append the new vectors to the JSON array of the existing vectors, which keeps its format.
     existing_vectors = vectors.rstrip().removesuffix("]").rstrip()
     new_vectors = texts[vectors_path].strip().removeprefix("[")
     comma = "" if existing_vectors == "[" else ","

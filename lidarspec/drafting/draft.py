@@ -1,8 +1,8 @@
 """Analyse unknown frames, and describe them in a `Draft`.
 
-`make_draft` searches the beginning of a stream for a structure, and then applies this structure to
-all bytes. Constant bytes at the start of frames are the sync bytes. Fields that rise steadily are
-not accepted as checksums, because an XOR often fits there by coincidence.
+`make_draft` finds the structure of the frames at the beginning of a stream, and then splits all
+bytes into frames. Constant bytes at the start of frames are the sync bytes. Fields with steadily
+rising values are not accepted as checksums, because an XOR often matches them by coincidence.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from lidarspec.drafting.periods import (
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import WireError
 
-#: Maximum number of frames that are searched for a checksum.
+#: Maximum number of frames to use in the search for a checksum.
 MAX_CHECKSUM_FRAMES = 256
 #: Maximum number of sync bytes.
 MAX_SYNC_BYTES = 4
-#: Maximum number of sync bytes with few frames: further constant bytes may be coincidence.
+#: Maximum number of sync bytes if there are fewer than `MANY_FRAMES` frames, because further
+#: constant bytes may be coincidence.
 MAX_SHORT_SYNC_BYTES = 2
-#: With fewer frames than this, `MAX_SHORT_SYNC_BYTES` applies.
+#: Number of frames from which on constant bytes are probably not coincidence.
 MANY_FRAMES = 12
 #: Smallest number of blocks in a frame.
 MIN_BLOCKS = 3
 #: Smallest share of a frame that its blocks fill.
 MIN_BLOCKS_SHARE = 0.5
-#: An element count has to be before this offset.
+#: Maximum offset after a field with the number of elements.
 MAX_COUNT_OFFSET = 8
 #: Smallest and largest size of a counted element, in bytes.
 MIN_ELEMENT_BYTES = 2
@@ -60,7 +61,7 @@ class RepeatedBlocks:
         size: size of a block, in bytes.
         count: number of blocks.
         flag: constant first bytes of each block; may be empty.
-        candidates: rising fields in a block.
+        candidates: fields in a block with rising values.
     """
 
     start: int
@@ -86,12 +87,12 @@ class Draft:
         length: the length field; None if all frames have one length.
         frames: (offset, bytes) of the frames with all known properties, in order.
         bytes_in: number of input bytes.
-        candidates: rising fields outside the blocks.
+        candidates: fields outside the blocks with rising values.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: other checksums that match.
-        common_bytes: number of leading bytes that are searched for fields, if the length field
-            counts bytes; nearly all frames have them. Otherwise 0.
+        common_bytes: number of leading bytes that nearly all frames have, if the length field
+            counts bytes; else 0. These bytes are searched for fields.
     """
 
     datagrams: bool
@@ -172,10 +173,10 @@ def make_draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
 def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
     """Return the draft with its sync bytes; None if none are found.
 
-    Sync bytes are only searched if all frames have one length.
+    Sync bytes are searched only if all frames have the same length.
 
     Args:
-        first: the draft.
+        first: the draft without sync bytes.
         parts: the datagrams, or the whole stream.
         start: offset of the first frame in a stream.
     """
@@ -205,9 +206,9 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
 
 
 def _iter_frames(draft: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield offset and bytes of the frames with all known properties, in order.
+    """Yield (offset, bytes) of the frames with all known properties, in order.
 
-    If no valid frame begins at some sync bytes, the search continues at the next byte.
+    If no valid frame begins at sync bytes, the search continues at the next byte.
     """
     base = 0
     for part in parts:
@@ -252,13 +253,14 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 
 
 def _find_count(draft: Draft, data: bytes) -> Draft:
-    """Return the draft with a length field if an incomplete last frame shows a count.
+    """Return the draft with a length field, if an incomplete last frame shows one.
 
-    If all whole frames have one length, a constant byte may be a count of elements. An incomplete
-    frame at the end of the data with another count shows this. In all other cases the draft is
-    returned unchanged.
+    If all whole frames have the same length, a constant byte may be the number of elements. This is
+    found if an incomplete frame at the end of the data has another value there. Otherwise, the
+    draft is returned unchanged.
 
     Args:
+        draft: the draft.
         data: the last datagram, or the whole stream.
     """
     if draft.size is None or draft.datagrams or not draft.frames:
@@ -278,7 +280,7 @@ def _find_count(draft: Draft, data: bytes) -> Draft:
             LengthField(offset, 1, "little", unit, draft.size - unit * last[offset])
             for unit in range(MIN_ELEMENT_BYTES, MAX_ELEMENT_BYTES + 1)
         ]
-        # The last frame is incomplete, so its length has to exceed the rest of the data.
+        # The last frame is incomplete, so its length must be more than the rest of the data.
         fitting = [
             length for length in lengths if length.rest > offset and length.read(rest) > len(rest)
         ]
@@ -290,7 +292,7 @@ def _find_count(draft: Draft, data: bytes) -> Draft:
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
     """Return the draft with `common_bytes`, if the length field counts bytes.
 
-    Frames that are too short are then dropped, because they are probably of another type.
+    Frames that have fewer bytes are removed, because they are probably of another type.
     """
     if draft.length is None or draft.length.unit > 1 or not draft.frames:
         return draft
@@ -337,7 +339,8 @@ def _overlaps(place: ChecksumPlace, field: RisingField, length: int) -> bool:
 def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
     """Return whether a struct can declare the checksum.
 
-    It must not be in the part of varying length or split into nibbles, and has to cover one range.
+    The checksum must cover one range. It must not be in the part of varying length, or stored in
+    nibbles.
     """
     if match.is_in_nibbles:
         return False
@@ -353,7 +356,10 @@ def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
 
 
 def _find_blocks(draft: Draft) -> Draft:
-    """Return the draft with blocks, and without rising fields in blocks or checksum."""
+    """Return the draft with blocks.
+
+    Rising fields in the blocks, or in the checksum, are removed from the draft's candidates.
+    """
     if not draft.frames:
         return draft
     rows = draft.rows
@@ -386,7 +392,7 @@ def _find_blocks(draft: Draft) -> Draft:
 def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
     """Return blocks that begin with the same two bytes and fill much of the frame.
 
-    None if no blocks are found.
+    Returns None if no blocks are found.
     """
     first = rows[0]
     is_constant = (rows == rows[0]).mean(axis=0) >= MIN_CONSTANT_SHARE
@@ -411,9 +417,9 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
 
 
 def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
-    """Return the largest blocks that begin with a rising field of one kind.
+    """Return the largest blocks that begin with a rising field of the same kind.
 
-    None if no blocks are found.
+    Returns None if no blocks are found.
     """
     found_blocks = []
     for field in fields:

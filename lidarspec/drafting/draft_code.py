@@ -29,22 +29,22 @@ from lidarspec.spec.checksums import ByteOrder
 
 #: Maximum number of characters in a line of the written files.
 MAX_LINE_CHARS = 100
-#: Maximum number of bytes of a constant that a comment shows.
+#: Maximum number of bytes of a constant to show in a comment.
 MAX_SHOWN_BYTES = 8
-#: Smallest number of adjacent constant bytes that become a field.
+#: Minimum number of adjacent constant bytes to declare as a field.
 MIN_CONSTANT_RUN = 2
-#: Longest range of unknown bytes that is searched for constant bytes. In longer ranges, which are
-#: mostly measurements, bytes may be constant because the scene does not change.
+#: Maximum length of a range of unknown bytes that is searched for constant bytes. Longer ranges are
+#: mostly measurements, which may be constant because the scene does not change.
 MAX_CONSTANT_SEARCH_BYTES = 64
-#: A checksum with less evidence may be coincidence.
+#: A checksum with fewer bits of evidence may be coincidence.
 WEAK_EVIDENCE_BITS = 12
-#: Maximum number of alternatives that a comment lists.
+#: Maximum number of alternatives to list in a comment.
 MAX_ALTERNATIVES = 3
-#: With at most this number of bits of constants and checksum, noise may pass as a frame. The draft
-#: then requires two consecutive frames.
+#: If constants and checksum have at most this number of bits, random bytes may look like a frame.
+#: The draft then requires two consecutive frames.
 WEAK_FRAME_BITS = 24
-#: Smallest share of frames in which a field lies between two values of another field, so that it is
-#: probably the end of an interval.
+#: Minimum share of frames in which a field is between this and the next value of another field. The
+#: field is then probably the end of an interval.
 MIN_BETWEEN_SHARE = 0.875
 
 
@@ -80,7 +80,7 @@ class DraftField:
 
 
 def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
-    """Return the values for the template of a module: imports, struct, functions and arguments.
+    """Return {name: text} of the values for the template of a module.
 
     Args:
         draft: the analysed frames.
@@ -123,7 +123,7 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
         for field in draft.candidates
         if field.kind == "counter" and field.offset < draft.head_size
     ]
-    # The most regular counter comes first.
+    # The most regular counter is used; the others are alternatives.
     counters.sort(key=lambda field: (-field.right / field.total, -field.size))
     sensor_arguments = _iter_sensor_arguments(angles, counters)
     text = {
@@ -172,7 +172,7 @@ def _iter_fields(draft: Draft) -> Iterator[DraftField]:
 
 
 def _find_known_fields(draft: Draft) -> list[DraftField]:
-    """Return the fields with evidence, without overlaps, by offset."""
+    """Return the fields with evidence by offset, without overlaps."""
     fields = list(_iter_sync_fields(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
@@ -235,8 +235,8 @@ def _iter_unknown_fields(
         rows: the frames or blocks, (n, size).
         start: offset of the first unknown byte.
         end: offset after the last unknown byte.
-        cuts: offsets at which fields are split. They are also split at the borders of constant
-            bytes.
+        cuts: offsets at which fields must be split. Fields are also split where constant bytes
+            begin and end.
     """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}
     if len(rows) >= FEW_FRAMES and end - start <= MAX_CONSTANT_SEARCH_BYTES:
@@ -259,7 +259,7 @@ def _find_constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[i
 
 
 def _describe_constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
-    """Return a comment with the value of constant bytes; () for other bytes."""
+    """Return a comment with the value of constant bytes; () if they are not constant."""
     if not columns.size or not (columns == columns[0]).all():
         return ()
     is_long = columns.shape[1] > MAX_SHOWN_BYTES
@@ -286,14 +286,17 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
         start_field = _find_start_field(draft, rising)
         if start_field is not None:
             evidence.append(
-                f"lies between this frame's {start_field.name} and the next one's:"
+                f"is between {start_field.name} of this frame and of the next frame:"
                 " the angle of the last sample?"
             )
     return DraftField(rising.offset, rising.size, rising.name, code, tuple(evidence))
 
 
 def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | None:
-    """Return an earlier field if `end_field` is always between its value and its next one."""
+    """Return an earlier field that probably has the start value of `end_field`.
+
+    The value of `end_field` must nearly always be between this and the next start value.
+    """
     if end_field.kind == "counter":
         return None
     for field in draft.candidates:
@@ -338,7 +341,7 @@ def _make_block_field(draft: Draft, blocks: RepeatedBlocks) -> DraftField:
 
 
 def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield the part of varying length, and the checksum after it."""
+    """Yield a field for the part of varying length, and the checksum after this part."""
     assert draft.length is not None
     rest = draft.head_size + draft.tail_size - draft.length.rest
     name = _length_field_name(draft)
@@ -372,7 +375,7 @@ def _length_field_name(draft: Draft) -> str:
 
 def _make_checksum_field(draft: Draft, checksum: ChecksumMatch, start: int) -> DraftField:
     if checksum.evidence_bits < WEAK_EVIDENCE_BITS:
-        chance = "may be coincidence: compare with more frames"
+        chance = "may be coincidence: check with more frames"
     else:
         chance = f"1 in {checksum.odds} by chance"
     evidence = [
@@ -417,7 +420,10 @@ def _format_checksum_arguments(
 
 
 def _span_cuts(draft: Draft) -> list[int]:
-    """Return the borders of the checksum's span, without the part of varying length."""
+    """Return the offsets at which the covered bytes begin and end.
+
+    Offsets in the part of varying length are omitted.
+    """
     if draft.checksum is None or not draft.frames:
         return []
     shortest = min(len(frame) for _, frame in draft.frames)
@@ -471,8 +477,8 @@ def _format_alternatives(begin: str, names: Sequence[str]) -> str:
 def _format_max_length(draft: Draft) -> str:
     """Return the value of `max_length`, in bytes.
 
-    A length field of one byte limits the length. Otherwise the limit is twice the longest frame in
-    the capture, since longer frames may occur.
+    If the length field has one byte, it limits the length. Otherwise the limit is twice the length
+    of the longest frame in the capture, because longer frames may occur.
     """
     if draft.size is not None or draft.length is None:
         return str(draft.size)

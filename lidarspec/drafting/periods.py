@@ -1,14 +1,14 @@
-"""Find frames and steadily changing fields in unknown bytes.
+"""Find frames in unknown bytes, and fields with steadily rising values.
 
-`find_structure` finds the frames. If all frames have one length, many bytes are equal at this
+`find_structure` finds the frames. If all frames have the same length, many bytes are equal at this
 distance, and the sync bytes are the longest run of constant bytes. If frames have several lengths,
 their sync bytes are a frequent pair of bytes, and a length field after the pair gives the distance
 to the next pair.
 
 `find_rising_fields` finds counters, angles that wrap at a full circle, and clocks. Their values
-rise from frame to frame by about the same step. Read with the wrong byte order or offset, the
-values jump. The value at which an angle wraps gives its unit: an angle in hundredths of a degree
-never reaches 36 000.
+rise from frame to frame by about the same step. If the byte order or offset is wrong, the values
+jump. The value at which an angle wraps gives its unit: an angle in hundredths of a degree wraps at
+36,000.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
 
-#: full circle in raw units -> one raw unit in degrees, and in words.
+#: full circle in raw units -> (raw unit in degrees, description of the raw unit).
 CIRCLES = {
     360: (1.0, "whole degrees"),
     3_600: (0.1, "tenths of a degree"),
@@ -39,53 +39,55 @@ CIRCLES = {
     360_000: (0.001, "thousandths of a degree"),
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
-#: With fewer frames than this, only the first and last bytes of a frame are searched for fields,
-#: and constant bytes may be coincidence.
+#: Number of frames below which constant bytes may be coincidence. Only the first and the last bytes
+#: of a frame are then searched for fields.
 FEW_FRAMES = 8
-#: Number of first bytes that are searched if there are few frames.
+#: Number of first bytes to search if there are few frames.
 HEAD_SEARCH_BYTES = 16
-#: Number of last offsets that are searched if there are few frames.
+#: Number of last offsets to search if there are few frames.
 TAIL_SEARCH_BYTES = 8
-#: Smallest share of regular steps.
+#: Minimum share of regular steps of a rising field.
 MIN_REGULAR_SHARE = 0.9
 #: Largest relative difference between regular steps.
 STEP_TOLERANCE = 0.05
-#: Absolute difference that is always regular, in raw units.
+#: Absolute difference between steps that is regular at any step size, in raw units.
 STEP_SLACK_UNITS = 4
-#: Without the lowest byte of a field, the steps have to vary more by this factor.
+#: Minimum factor by which the steps must vary more without the lowest byte of a field.
 MIN_COARSENING = 1.5
-#: Largest ratio of a step to the usual step. Also the smallest ratio of a field's range of values
-#: to the usual step.
+#: Maximum ratio of a step to the usual step. It is also the minimum ratio of a field's range of
+#: values to the usual step.
 MAX_STEP_RATIO = 4
-#: Largest share of frames in which the value may stay the same, as for two returns of one firing.
+#: Maximum share of frames with the same value as the frame before, for example with two returns per
+#: firing.
 MAX_UNCHANGED_SHARE = 0.75
-#: Number of bytes of a stream that are searched.
+#: Maximum number of bytes of a stream to search.
 MAX_SEARCHED_BYTES = 1 << 15
-#: Shortest and longest frame length that is searched.
+#: Minimum frame length to search for. The next constant is the maximum.
 MIN_FRAME_BYTES = 4
 MAX_FRAME_BYTES = 4096
-#: Maximum number of distances that are tried as frame length.
+#: Maximum number of distances to try as frame length.
 MAX_DISTANCES = 48
-#: A byte is constant if it has its usual value in this share of frames; the others may be damaged.
+#: A byte is constant if it has its usual value in at least this share of frames. The other frames
+#: may be damaged.
 MIN_CONSTANT_SHARE = 0.9
-#: Smallest share of the bytes that have to be in frames.
+#: Minimum share of the bytes that must be in frames.
 MIN_FRAMED_SHARE = 0.5
-#: Shares that differ by less than this count as equal.
+#: Shares that differ by less than this are treated as equal.
 SHARE_TOLERANCE = 0.03
-#: If there are fewer frames of one length than this, but not fewer frames of several lengths, the
-#: frames of several lengths are preferred.
+#: A structure with frames of several lengths is preferred if it has at least this number of frames,
+#: and the structure with frames of equal length has fewer.
 MANY_FRAMES = 12
-#: Among the periods with at least this ratio of weight to the best weight, the shortest is used.
+#: The shortest period is used whose weight is at least this share of the best weight.
 MIN_RELATIVE_WEIGHT = 0.75
-#: Maximum number of byte pairs that are tried as sync bytes.
+#: Maximum number of byte pairs to try as sync bytes.
 MAX_SYNC_PAIRS = 32
 #: Smallest number of frames of a structure.
 MIN_FRAMES = 3
-#: If random bytes have the same structure with a higher probability, the structure is rejected.
+#: A structure is rejected if random bytes have it with a higher probability.
 MAX_CHANCE = 1e-3
-#: The length field has to begin before this offset.
+#: The length field must begin before this offset.
 MAX_LENGTH_FIELD_OFFSET = 8
-#: Largest size of the elements that a length field counts, in bytes.
+#: Maximum size of the elements that a length field counts, in bytes.
 MAX_UNIT_BYTES = 16
 
 
@@ -102,7 +104,7 @@ class RisingField:
         circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
         right: number of regular steps.
-        total: number of all steps.
+        total: number of steps.
         wraps: number of wraps.
         first: the value of a counter after a wrap.
     """
@@ -176,7 +178,7 @@ def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
 
 
 def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """Return the share of frames with `last` between this and the next `first`.
+    """Return the share of frames in which `last` is between this and the next `first`.
 
     Args:
         first: a field of each frame, (n,).
@@ -206,7 +208,7 @@ def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[RisingField]:
 
 
 def _select_offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
-    """Return the offsets at which a field of this size is searched."""
+    """Return the offsets at which to search for a field of this size."""
     last = rows.shape[1] - size
     if len(rows) >= FEW_FRAMES:
         return range(last + 1)
@@ -221,7 +223,7 @@ def _select_offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
 def _iter_counters(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[RisingField]:
-    """Yield the field if it rises by one each time, and wraps to its smallest value."""
+    """Yield the field if it is a counter: it rises by one, and wraps to its minimum."""
     counts = values(rows, offset, size, order)
     steps = np.diff(counts)
     first = int(counts.min())
@@ -288,7 +290,10 @@ def _iter_rising(
 
 
 def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte belongs to the field: steps vary less with it."""
+    """Return whether the lowest byte belongs to the field.
+
+    If it belongs to the field, the steps vary less with it than without it.
+    """
     steps = np.diff(field_values)
     moved = steps != 0
     coarse_steps = 256 * np.diff(field_values >> 8)
@@ -304,8 +309,8 @@ def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
 def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
-    This is a full circle in a usual unit if the highest value and the decrease fit, else the
-    decrease.
+    If the highest value and the decrease at a wrap match a full circle in a usual unit, returns the
+    full circle; else the decrease.
 
     Args:
         highest: the highest value.
@@ -377,7 +382,10 @@ class FrameStructure:
 
     @cached_property
     def checksums(self) -> tuple[ChecksumMatch, ...]:
-        """The checksums that match, likeliest first; the search takes about a second."""
+        """The checksums that match, the likeliest first.
+
+        The search takes about a second.
+        """
         return tuple(search(self.frames, quick=True))
 
 
@@ -399,7 +407,7 @@ def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return start and stop of each run of True."""
+    """Return the (start, stop) indices of each run of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
@@ -410,7 +418,10 @@ def split_frames(data: bytes, period: int, start: int = 0) -> list[bytes]:
 
 
 def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
-    """Return the structure of datagrams of one length, the one with the most bytes."""
+    """Return the structure of datagrams of the same length.
+
+    The length with the most bytes is selected.
+    """
     if len(chunks) < MIN_FRAMES:
         return None
     lengths, counts = np.unique([len(chunk) for chunk in chunks], return_counts=True)
@@ -427,7 +438,11 @@ def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
 
 
 def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return the structure with more bytes in frames; prefer frames of one length."""
+    """Return the structure of a stream, with frames of one or of several lengths.
+
+    The structure with the larger share of bytes in frames is returned. If the shares are equal, it
+    is the structure with frames of the same length.
+    """
     periodic = _find_fixed_length(data)
     varying = _find_varying_length(data)
     if periodic is None or varying is None:
@@ -439,10 +454,10 @@ def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return the structure of frames of one length; None if none is found.
+    """Return the structure of frames of the same length; None if none is found.
 
-    Among the distances at which most bytes are equal, select the distance with the largest share of
-    constant bytes, or a shorter distance that is almost as good.
+    Distances at which most bytes are equal are tried. The result has the distance with the largest
+    share of constant bytes, or a shorter distance that is almost as good.
     """
     lags = np.arange(MIN_FRAME_BYTES, min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
@@ -467,8 +482,9 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
     """Split frames that are groups of shorter frames; return other frames unchanged.
 
-    A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. The parts
-    of a group are frames if their sync bytes are not all equal, or if they have a counter.
+    Groups repeat if, for example, an index in the frames counts from 0 to 5, or the data is
+    simulated. The parts of a group are frames if their sync bytes are not all equal, or if they
+    have a counter.
     """
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
@@ -490,7 +506,7 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield the weight and the structure of frames of a length, if they are found.
+    """Yield (weight, structure) of frames of a length, if they are found.
 
     The frames begin with the longest run of constant bytes. The weight is the share of constant
     bytes, multiplied by the share of bytes in frames.
@@ -543,10 +559,10 @@ def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period:
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return start and length of the run with the most nonzero constant bytes.
+    """Return (start, length) of the run with the most nonzero constant bytes.
 
     A run may continue from the end of the period to its start. Zeros at the start of a run are
-    omitted, because they are frequent in any data.
+    omitted, because zeros are frequent in all data.
     """
     # Rotate so that the first byte is not constant. No run is then split.
     rotation = int(np.argmin(steady))
@@ -588,10 +604,10 @@ def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 def _find_length_field(
     data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
 ) -> FrameStructure | None:
-    """Return the structure of frames with certain sync bytes; None if none is found.
+    """Return the structure of frames with given sync bytes; None if none is found.
 
-    The length field is the byte or word after the sync bytes that gives the distance to the next
-    sync bytes most often.
+    The length field is the byte or word after the sync bytes that most often matches the distance
+    to the next sync bytes.
 
     Args:
         data: the data.

@@ -1,4 +1,4 @@
-"""Sample frames of an unknown format, and the possible places of a checksum in them."""
+"""Sample frames of an unknown format, and the possible places of their checksum."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from lidarspec.spec.checksums import ByteOrder, Checksum
 
 Part = Literal["all", "before", "behind"]
 
-#: Frames up to this length are searched at every offset.
+#: Maximum length of frames that are searched at every offset.
 MAX_FULLY_SEARCHED_BYTES = 64
-#: Longer frames are searched up to this distance from both ends.
+#: Maximum distance from both ends at which longer frames are searched.
 MAX_END_DISTANCE_BYTES = 12
 #: Maximum number of first bytes that a checksum at the end may omit.
 MAX_OMITTED_HEAD_BYTES = 6
-#: A checksum with at most this many bytes after it counts as a checksum at the end.
+#: Maximum number of bytes after a checksum that is considered to be at the end.
 MAX_TAIL_BYTES = 4
-#: Range of values from which a byte counts as widely varying.
+#: Minimum range of values of a byte that varies widely.
 MIN_WIDE_RANGE = 96
-#: Weight of the usual place of a checksum, at the end.
+#: Factor that prefers the usual place of a checksum, the end of the frame.
 USUAL_PLACE_WEIGHT = 1.1
 #: Minimum share of frames with a valid checksum, because some may be damaged.
 MIN_VALID_SHARE = 0.6
-#: Bits of evidence at which a match ends the search: one in a million wrong guesses reaches it.
+#: Bits of evidence at which the search ends. One in a million wrong checksums has as much evidence.
 SURE_EVIDENCE_BITS = 20
 
 
@@ -104,20 +104,20 @@ class ChecksumMatch:
 
     Attributes:
         algorithm: the algorithm.
-        place: its place in the frames.
+        place: offset and size of the checksum in the frames.
         span: the covered bytes.
         order: the byte order of the stored checksum.
         right: number of frames with a valid checksum.
         total: number of all frames.
-        evidence_bits: bits of evidence; high values are sure. One of 2**evidence_bits wrong
-            checksums would match as well by chance.
+        evidence_bits: bits of evidence; a high value means that the match is certain. One of
+            2**evidence_bits wrong checksums would match as well by coincidence.
         source: the Python source of the algorithm.
         notes: further remarks for the user.
         name: the name of a CRC in the catalogue; "" if it has none.
         is_ambiguous: whether other parameters match these frames as well.
         has_constant: whether a constant was fitted to the frames.
         is_in_nibbles: whether the checksum is stored in the low nibbles of two bytes.
-        variation: the variation of its place, from `SampleFrames.measure_variation`.
+        variation: the result of `SampleFrames.measure_variation` for `place`.
     """
 
     algorithm: Checksum
@@ -139,21 +139,24 @@ class ChecksumMatch:
     def remarks(self) -> tuple[str, ...]:
         """All remarks for the user."""
         if self.has_constant:
-            constant = "it contains a constant: fields outside the covered bytes, or a start value"
+            constant = (
+                "it contains a constant, which may be a start value or depend on bytes that are"
+                " not covered"
+            )
             return (constant, *self.notes)
         return self.notes
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums for each match by chance, as a power of ten."""
+        """The number of wrong checksums of which one would match, as a power of ten."""
         return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property
     def is_sure(self) -> bool:
         """Whether the search can end with this match.
 
-        It has enough evidence, its parameters are unique, and the checksum is at the end, or covers
-        all other bytes except a header.
+        The match must have enough evidence and unique parameters. The checksum must be at the end
+        of the frame, or cover all other bytes except a header.
         """
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
         return (
@@ -199,7 +202,7 @@ class SampleFrames:
         self.groups: list[NDArray[np.uint8]] = [
             np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups
         ]
-        # The same fields are read for each algorithm that is tried.
+        # The stored values are the same for each algorithm that is tried.
         self._fields: dict[tuple[ChecksumPlace, ByteOrder], NDArray[np.uint64]] = {}
 
     def __len__(self) -> int:
@@ -222,7 +225,7 @@ class SampleFrames:
 
         Args:
             number: number of frames, and maximum number of other lengths.
-            pick: index of the selection: other indices return other frames.
+            pick: index of the selection. Different indices select different frames.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
@@ -246,7 +249,7 @@ class SampleFrames:
         return self._fields[place, order]
 
     def cut_span(self, place: ChecksumPlace, span: CoveredSpan) -> list[NDArray[np.uint8]]:
-        """Return the bytes that a span covers, group by group: (frames, bytes) each."""
+        """Return the bytes that a span covers, an array (frames, bytes) for each group."""
         return [
             np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
             for group in self.groups
@@ -272,7 +275,7 @@ class SampleFrames:
         )
 
     def places(self, size: int) -> Iterator[ChecksumPlace]:
-        """Yield the possible places of a checksum, the places next to the ends first.
+        """Yield the possible places of a checksum, from both ends of the frame inwards.
 
         Places with nearly constant values are omitted.
         """
@@ -304,14 +307,14 @@ class SampleFrames:
 
     @property
     def is_single(self) -> bool:
-        """Whether there is only one frame. Then only the end is searched."""
+        """Whether there is only one frame. If so, only its end is searched."""
         return len(self) == 1
 
     def measure_variation(self, place: ChecksumPlace) -> float:
-        """Return a measure of how much the least varying byte of a place varies.
+        """Return a measure of how much the bytes at a place vary.
 
-        It depends on the range and on the number of distinct values, and is larger for the usual
-        place, at the end.
+        It is calculated for the byte that varies least, from its range and its number of distinct
+        values. It is larger for the usual place, the end of the frame.
         """
         columns = [
             self.fields(ChecksumPlace(place.offset + index, 1), "little")
@@ -327,14 +330,14 @@ class SampleFrames:
 
 
 def accept_any_place(_: ChecksumPlace) -> bool:
-    """Return True, because a checksum is possible at every place."""
+    """Return True: a checksum is possible at every place."""
     return True
 
 
 def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredSpan]:
-    """Yield the possible spans of a checksum at a place, the most usual first.
+    """Yield the possible ranges of covered bytes, the most usual first.
 
-    Spans that cover the same bytes of the shortest frame as an earlier span are omitted.
+    A span that covers the same bytes of the shortest frame as an earlier span is omitted.
     """
     start = place.start(samples.shortest)
     before = start
@@ -363,7 +366,7 @@ def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredS
 def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
     """Return the bits of evidence of a match.
 
-    One of 2**bits wrong checksums would match as well by chance.
+    One of 2**bits wrong checksums would match as well by coincidence.
 
     Args:
         width: width of the checksum, in bits.
@@ -375,19 +378,19 @@ def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: i
 
 
 def are_enough(right: int, total: int) -> bool:
-    """Return whether enough frames are valid, so that the others may be damaged."""
+    """Return whether enough frames are valid to assume that the others are damaged."""
     return right >= max(1, MIN_VALID_SHARE * total)
 
 
 def sort_matches(matches: Sequence[ChecksumMatch]) -> list[ChecksumMatch]:
-    """Return the matches, the simplest and surest first, without duplicates."""
+    """Return the matches, the simplest and likeliest first, without duplicates."""
 
     def key(match: ChecksumMatch) -> tuple[object, ...]:
         span = match.span
         return (
             -round(match.right / match.total, 2),
             match.evidence_bits < match.algorithm.width,
-            -match.place.size,  # a divisor of a wide CRC's polynomial fits at its end
+            -match.place.size,  # a divisor of a wide CRC's polynomial fits too
             match.is_ambiguous,
             -match.variation,
             not match.is_sure,
