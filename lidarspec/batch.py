@@ -172,6 +172,7 @@ class FilePiece:
                 yield replace(wanted, number=number)
             if sieve.ended:
                 break
+        scans.add_warnings(sieve.warnings)
         if sieve.is_empty:
             raise sieve.missing()
 
@@ -605,7 +606,7 @@ def _iter_results(
 
 def _is_large(piece: FilePiece) -> bool:
     """Return whether a file is larger than a piece; False if its size is unknown."""
-    if piece.select.is_counted:
+    if piece.select.needs_all_scans:
         return False
     with contextlib.suppress(LidarSpecError):
         return bool(read_stamp(piece.source)["size"] > piece.size)

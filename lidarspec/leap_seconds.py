@@ -25,9 +25,8 @@ CURRENT_TAI_OFFSET_S = 37
 FIRST_TAI_OFFSET_S = 10
 #: TAI minus GPS time, s.
 TAI_MINUS_GPS_S = 19
-#: Seconds from 1900, where NTP counts from, to 1970; and to 1980-01-06, where GPS time begins.
+#: Seconds from 1900, where NTP counts from, to 1970.
 NTP_EPOCH_S = 2_208_988_800
-GPS_EPOCH_S = 315_964_800
 FILES = ("leapseconds", "leap-seconds.list")
 
 

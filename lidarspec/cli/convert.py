@@ -42,7 +42,14 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.remote_files import find_files
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Times, TimeSlice, iter_received
+from lidarspec.scans.selection import (
+    EVERYTHING,
+    PacketTimes,
+    Selection,
+    Times,
+    TimeSlice,
+    iter_received,
+)
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
@@ -172,7 +179,7 @@ def convert(
     command is repeated, it converts only the missing pieces. If a file fails, the others are still
     converted.
     """
-    chooses_scans = replace(selection, times=(None, None), time="device") != EVERYTHING
+    chooses_scans = replace(selection, times=(None, None), time="sensor") != EVERYTHING
     properties = {
         "beams": selection.beams,
         "frame-id": selection.frame_id,
@@ -232,6 +239,8 @@ def convert(
             frames = _choose_frames(device, target, frame)
             summary = _write_frames(device, target, frames, selection, count)
         elif is_imu:
+            if selection.time != "sensor":
+                raise UsageError("--imu writes the times of the sensor: omit --time")
             summary = _write_imu(device, target, count)
         else:
             summary = _write_points(
@@ -306,20 +315,23 @@ def _select_frames(
 ) -> Iterator[dict[str, Packets]]:
     """Yield batches with the selected frames, without empty batches."""
     slices = {frame: TimeSlice(selection.times) for frame in frames}
+    clocks = {frame: PacketTimes(selection.time, device.source) for frame in frames}
     left = math.inf if count is None else count
     for arrived in device.packets_by_frame(frames):
         selected = dict[str, Packets]()
         for frame, packets in arrived.items():
-            times = packets.host_ns if selection.time == "host" else packets.time_ns
+            times = clocks[frame].read(packets)
             which = np.flatnonzero(slices[frame].holds(times))
             which = which[: int(min(left, len(which)))]
             left -= len(which)
             if len(which):
-                selected[frame] = packets.take(which)
+                selected[frame] = packets.with_times(times).take(which)
         if selected:
             yield selected
         if left <= 0 or all(wanted.ended for wanted in slices.values()):
-            return
+            break
+    for warning in dict.fromkeys(text for clock in clocks.values() for text in clock.warnings):
+        note(warning)
 
 
 def _write_packets(

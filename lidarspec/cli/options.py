@@ -317,8 +317,8 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
     ),
     "time": click.option(
         "--time",
-        type=click.Choice(["device", "host"]),
-        help="Clock for the stamps and for --slice.  [default: device]",
+        type=click.Choice(["sensor", "utc", "host"]),
+        help="Clock for the stamps and for --slice.  [default: sensor]",
     ),
     "beams": click.option(
         "--beams",

@@ -37,7 +37,7 @@ from lidarspec.explaining.clock_text import describe_clock
 from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Selection, TimeSlice
+from lidarspec.scans.selection import PacketTimes, Selection, TimeSlice
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.live_frames import LiveFrames, open_live
 from lidarspec.view.live_scans import LOOK_S, LiveScans
@@ -172,15 +172,15 @@ def _iter_packets(
     selection: Selection,
 ) -> Iterator[tuple[Units, Row]]:
     """Yield (units, row) for each packet; the row has its fields in units."""
-    if replace(selection, times=(None, None), time="device") != Selection():
+    if replace(selection, times=(None, None), time="sensor") != Selection():
         raise UsageError("packets can be selected only by --slice and --time")
     wanted = TimeSlice(selection.times)
+    clock = PacketTimes(selection.time, device.source)
     number = 0
     for batch in device.packets(frame, wait=LOOK_S):
         patience.check()
-        packets = batch.take(
-            wanted.holds(batch.host_ns if selection.time == "host" else batch.time_ns)
-        )
+        times = clock.read(batch)
+        packets = batch.with_times(times).take(wanted.holds(times))
         number += len(packets)
         fields = {
             path: info for path, info in packets.table.schema.fields.items() if info.const is None
@@ -188,13 +188,15 @@ def _iter_packets(
         units = {path: info.unit for path, info in fields.items()}
         columns = {path: packets[path] for path in fields}
         for index in range(len(packets)):
-            times = {"offset": int(packets.offset[index]), "time_ns": int(packets.time_ns[index])}
+            place = {"offset": int(packets.offset[index]), "time_ns": int(packets.time_ns[index])}
             yield (
                 units,
-                {**times, **{path: _scalar(column[index]) for path, column in columns.items()}},
+                {**place, **{path: _scalar(column[index]) for path, column in columns.items()}},
             )
         if time.monotonic() >= until or wanted.ended:
             break
+    for warning in clock.warnings:
+        note(warning)
     if wanted.first is not None and not number:
         raise wanted.missed_error(device.source)
 

@@ -24,7 +24,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
+from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.sensor_operations import Sensor
 
 T = TypeVar("T")
@@ -90,7 +90,7 @@ class AsyncDevice:
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
         """Yield scans; see `Device.scans`. The source is read from its start."""
-        sieve = ScanSelector(select, self.device.source)
+        sieve = self.device.make_selector(select)
         async for scan in self._fetch(self._get_iterator("scans")):
             wanted = sieve.select(scan)
             if wanted is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 import weakref
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -82,6 +82,7 @@ class Device(ClosingContext):
         self._unseen_scans: deque[Scan] = deque()
         # The batch in which `latest` found its last scan of a file.
         self._ahead: FrameBatch | None = None
+        self._selector: ScanSelector | None = None
         self._first_frames: list[Found] = []
         self._is_checked = False
         self._contradiction = ""
@@ -125,7 +126,7 @@ class Device(ClosingContext):
 
         Examples are a truncated file, silence, a baud rate that is probably wrong, a small receive
         buffer, frames of another sensor, unknown codes, scans without an end, times without a date,
-        a nominal calibration, and errors of the plugin.
+        a nominal calibration, changes of the source of UTC, and errors of the plugin.
         """
         stats = self.stats
         warnings = [*self._input.warnings, *self._check_first_frames()]
@@ -134,6 +135,8 @@ class Device(ClosingContext):
                 warnings.append(f"{self.source}: {text}")
         if stats.nominal:
             warnings.append(_describe_nominal(self.sensor))
+        if self._selector is not None:
+            warnings += self._selector.warnings
         failure = stats.failure(self.sensor.id)
         if failure is not None:
             warnings.append(str(failure))
@@ -276,7 +279,7 @@ class Device(ClosingContext):
         scans = self._iter_scans(wait)
         if select is None:
             return scans
-        return ScanSelector(select, self.source, self.skip_until).iter_selected(scans)
+        return self.make_selector(select, self.skip_until).iter_selected(scans)
 
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
         """Yield the samples of the sensor's IMU in batches, until the input ends.
@@ -367,6 +370,17 @@ class Device(ClosingContext):
             f"{self.source}: no scan within the timeout; the source is {self.state}"
         )
         return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
+
+    def make_selector(
+        self, select: Selection, skip: Callable[[int], bool] | None = None
+    ) -> ScanSelector:
+        """Return a selector for the scans of this device; `warnings` includes its warnings.
+
+        Args:
+            skip: as for `ScanSelector`.
+        """
+        self._selector = ScanSelector(select, self.source, skip)
+        return self._selector
 
     def skip_until(self, time_ns: int) -> bool:
         """Skip input that arrived before a time, if the source can seek.

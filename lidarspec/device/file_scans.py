@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import pickle
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,7 @@ class FileScans(ClosingContext):
             opened.close()
             raise UsageError(f"{source} is not a file")
         self._sensor = sensor
+        self._added_warnings: list[str] = []
         self._transport = opened
         try:
             self._input = FileInput(source, sensor, opened, backend="auto")
@@ -87,7 +88,11 @@ class FileScans(ClosingContext):
     @property
     def warnings(self) -> list[str]:
         """The current warnings about the file."""
-        return self._input.warnings
+        return [*self._input.warnings, *self._added_warnings]
+
+    def add_warnings(self, warnings: Iterable[str]) -> None:
+        """Add warnings about the scans that were read."""
+        self._added_warnings += warnings
 
     def __iter__(self) -> Iterator[Scan]:
         while (scans := self._next()) is not None:

@@ -20,4 +20,5 @@ that the packets need are kept with them. Modules in reading order:
 * `clock_estimate`: offset and drift between the sensor's clock and the host's.
 * `clock_findings`: the faults of a clock as codes, and their words.
 * `clock_monitor`: what a clock counts, how it runs, and its faults.
+* `utc_times`: the times of packets in UTC.
 """

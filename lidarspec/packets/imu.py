@@ -62,6 +62,10 @@ class ImuSamples:
         values = np.concatenate([self.angular_velocity, self.linear_acceleration], axis=1).T
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 
+    def shift(self, ns: int) -> ImuSamples:
+        """Return the samples with times that are later by some nanoseconds."""
+        return ImuSamples(self.time_ns + ns, self.angular_velocity, self.linear_acceleration)
+
     def turn(self, rotation: NDArray[np.float64]) -> ImuSamples:
         """Return the samples in other axes.
 

@@ -238,6 +238,12 @@ class Packets:
             backend=self.backend,
         )
 
+    def with_times(self, time_ns: NDArray[np.int64]) -> Packets:
+        """Return the packets with other times, (n,) ns."""
+        packets = self.take(slice(None))
+        packets.time_ns = time_ns
+        return packets
+
     def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
         """Return the arguments of `Packets` that have one value for each packet.
 

@@ -395,10 +395,12 @@ class CloudColumns(ColumnSource):
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         self._cloud.load(*names)
-        columns = {
-            name: self._cloud.extra[name] if name in self.extra else getattr(self._cloud, name)
-            for name in names
-        }
+        columns = dict[str, NDArray[Any] | None]()
+        for name in names:
+            if name in self.extra:
+                columns[name] = self._cloud.extra[name]
+            else:
+                columns[name] = getattr(self._cloud, name, None)
         return {name: column[start:stop] for name, column in columns.items() if column is not None}
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:

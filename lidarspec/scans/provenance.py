@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,6 +93,15 @@ class Provenance:
             first += run.stop - run.start
             run = next(runs)
         return _find_origin(run, run.start + point - first)
+
+    def iter_packets(self) -> Iterator[Packets]:
+        """Yield the packets that the points came from, in stream order.
+
+        A packet in which a scan ends belongs to both scans. After unpickling there are no packets.
+        """
+        for run in self._runs:
+            first, last = first_points(run.points).searchsorted([run.start, run.stop - 1], "right")
+            yield run.packets.take(slice(int(first) - 1, int(last)))
 
     def __reduce__(self) -> Any:
         return Provenance, ()  # a pickled scan does not contain its packets

@@ -22,6 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
+from lidarspec.packets.clock_status import read_clock_status
+from lidarspec.packets.packet_type import find_clock
+from lidarspec.packets.packets import Packets
+from lidarspec.packets.utc_times import UtcTimes
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud
 from lidarspec.points.firings import RETURNS, Returns, choose_returns, take_returns
 from lidarspec.scans.scan import Scan
@@ -30,6 +34,8 @@ from lidarspec.transports.protocol import Chunk, Transport
 #: A time, as seconds from the first scan or as a date.
 Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
+#: The clocks of `Selection.time`.
+CLOCKS = ("sensor", "utc", "host")
 #: Reading starts this time before the first selected time.
 LEAD_S = 5.0
 #: The maximum drift between the clocks of sensor and host, as a share of the elapsed time.
@@ -58,8 +64,9 @@ class Selection:
         returns: the return of each firing to keep: "first", "last", "strongest", or "all" for all
             returns. It is chosen among the returns inside `ranges`.
         columns: the names of the columns of the points, in this order; () for all columns.
-        time: the clock of the stamps and of `times`: "device" for the sensor's clock, or "host" for
-            the arrival time of the first packet of a scan.
+        time: the clock of the stamps and of `times`: "sensor"; "utc", which follows from the
+            sensor's clock if it has a date, otherwise from the arrival times (`UtcTimes`); or
+            "host" for the arrival time of the first packet of a scan.
         beams: the default number of beams, see `Scan`.
         frame_id: the name of the frame of reference, see `Scan`.
 
@@ -73,7 +80,7 @@ class Selection:
     ranges: tuple[float, float] = (0.0, math.inf)
     columns: tuple[str, ...] = ()
     returns: Returns = "all"
-    time: Literal["device", "host"] = "device"
+    time: Literal["sensor", "utc", "host"] = "sensor"
     beams: int | None = None
     frame_id: str = ""
 
@@ -90,6 +97,8 @@ class Selection:
                 _check_order(low, high)
         if self.every < 1:
             raise UsageError(f"every must be at least 1, not {self.every}")
+        if self.time not in CLOCKS:
+            raise UsageError(f"time must be one of {', '.join(CLOCKS)}, not {self.time!r}")
         if self.returns not in RETURNS:
             raise UsageError(f"returns must be one of {', '.join(RETURNS)}, not {self.returns!r}")
 
@@ -105,6 +114,14 @@ class Selection:
         This is required if scans are selected by index, by time or by step.
         """
         return self.is_timed or self.scans != (0, None) or self.every != 1
+
+    @property
+    def needs_all_scans(self) -> bool:
+        """Whether the result depends on the scans before; a file is then not cut into pieces.
+
+        Scans are counted, or the times of packets in UTC depend on earlier arrival times.
+        """
+        return self.is_counted or self.time == "utc"
 
 
 def _add_zone(moment: Moment | None) -> Moment | None:
@@ -208,6 +225,40 @@ def format_date(ns: int) -> str:
     return f"{datetime.fromtimestamp(ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}.{ns // 10**6 % 1000:03}Z"
 
 
+class PacketTimes:
+    """The times of packets of one type, by the clock that a selection names.
+
+    Args:
+        time: the clock, as in `Selection`.
+        source: the name of the source, for messages.
+    """
+
+    def __init__(self, time: str, source: object) -> None:
+        self._time = time
+        self._source = source
+        self._utc: UtcTimes | None = None  # made with the first packets
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences about the source of UTC, if the clock is UTC."""
+        return self._utc.warnings if self._utc is not None else []
+
+    def read(self, packets: Packets) -> NDArray[np.int64]:
+        """Return the times of the next packets, (n,) ns.
+
+        Raises:
+            UsageError: if their UTC is unknown.
+        """
+        if self._time == "host":
+            return packets.host_ns
+        if self._time == "sensor":
+            return packets.time_ns
+        if self._utc is None:
+            clock = find_clock(packets.sensor, packets.frame)
+            self._utc = UtcTimes(packets.sensor.id, clock, self._source)
+        return self._utc.convert(packets)
+
+
 def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
     """Yield the chunks of a source that arrived in a time slice.
 
@@ -266,6 +317,12 @@ class ScanSelector:
         self._has_skipped = False
         self.ended = False
         self.slice = TimeSlice(selection.times)
+        self._utc: UtcTimes | None = None  # made with the first scan
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences about the source of UTC, if times are selected in UTC."""
+        return self._utc.warnings if self._utc is not None else []
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
         """Yield the selected parts of selected scans.
@@ -300,8 +357,11 @@ class ScanSelector:
         self._seen += 1
         is_selected = start <= number and (stop is None or number < stop)
         self.ended = stop is not None and self._seen >= stop
+        stamp_ns = scan.stamp_ns
+        if selection.is_timed or selection.time != "sensor":
+            stamp_ns = self._find_time(scan)
         if selection.is_timed:
-            is_in_slice = bool(self.slice.holds(np.array([self._time(scan)]))[0])
+            is_in_slice = bool(self.slice.holds(np.array([stamp_ns]))[0])
             is_selected = is_selected and is_in_slice
             self.ended = self.ended or self.slice.ended
             if not number:
@@ -311,7 +371,7 @@ class ScanSelector:
         self._selected += 1
         if (self._selected - 1) % selection.every:
             return None
-        return self._select_parts(scan)
+        return self._select_parts(scan, stamp_ns)
 
     @property
     def is_empty(self) -> bool:
@@ -336,7 +396,14 @@ class ScanSelector:
             " this range"
         )
 
-    def _time(self, scan: Scan) -> int:
+    def _find_time(self, scan: Scan) -> int:
+        """Return the time of a scan by the selected clock, ns.
+
+        Raises:
+            UsageError: if it is unknown.
+        """
+        if self._selection.time == "utc":
+            return self._find_utc(scan)
         by_host = self._selection.time == "host"
         if not scan.host_ns and (by_host or scan.sensor.clock is None):
             raise suggest(
@@ -346,6 +413,17 @@ class ScanSelector:
         if by_host:
             return scan.host_ns
         return scan.stamp_ns
+
+    def _find_utc(self, scan: Scan) -> int:
+        """Return the UTC of the first point of a scan, ns."""
+        if self._utc is None:
+            self._utc = UtcTimes(scan.sensor.id, scan.sensor.clock, self._source)
+        status = math.nan
+        for number, packets in enumerate(scan.provenance.iter_packets()):
+            self._utc.observe(packets.time_ns, packets.host_ns)
+            if not number:
+                status = read_clock_status(packets).item(0)
+        return self._utc.to_utc(scan.stamp_ns, scan.host_ns, status)
 
     def _skip_to_slice(self, scan: Scan) -> None:
         """Skip the data of the source up to shortly before the slice, if possible."""
@@ -359,14 +437,17 @@ class ScanSelector:
         if skipped_s > MIN_SKIP_S:
             self._has_skipped = self._skip(scan.host_ns + round(skipped_s * 1e9))
 
-    def _select_parts(self, scan: Scan) -> Scan:
-        """Return the selected parts of a scan."""
+    def _select_parts(self, scan: Scan, stamp_ns: int) -> Scan:
+        """Return the selected parts of a scan.
+
+        Args:
+            stamp_ns: the time of its first point by the selected clock, ns.
+        """
         selection = self._selection
         cloud = scan.points
-        if selection.time == "host":
-            stamp_ns = self._time(scan)
-        else:
-            stamp_ns = cloud.stamp_ns
+        imu = scan.imu
+        if imu is not None and stamp_ns != cloud.stamp_ns:
+            imu = imu.shift(stamp_ns - cloud.stamp_ns)
         if selection.ranges != (0.0, math.inf):
             cloud = LazyCloud.of(_LimitedRanges(cloud, *selection.ranges), stamp_ns)
         elif stamp_ns != cloud.stamp_ns:
@@ -381,6 +462,7 @@ class ScanSelector:
         return replace(
             scan,
             points=cloud,
+            imu=imu,
             provenance=provenance,
             beams=selection.beams or scan.beams,
             frame_id=selection.frame_id or scan.frame_id,

@@ -18,7 +18,7 @@ from lidarspec.device.device_input import BATCH_BYTES
 from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import ScanSelector, Selection, TimeSlice
+from lidarspec.scans.selection import PacketTimes, Selection, TimeSlice
 from lidarspec.scans.stream import ScanStream
 from lidarspec.view.rate_meter import RateMeter
 
@@ -81,7 +81,8 @@ class LiveScans:
         self.meter = self._make_meter()
         self.clock = ClockMonitor(device.sensor)
         self._select = select or Selection()
-        self._sieve = ScanSelector(self._select, device.source, device.skip_until)
+        self._sieve = device.make_selector(self._select, device.skip_until)
+        self._clock = PacketTimes(self._select.time, device.source)
         self._times = TimeSlice(self._select.times)
         self._batches = device.packets(wait=LOOK_S)
         self._stream = ScanStream(device.sensor, device.mount)
@@ -212,11 +213,7 @@ class LiveScans:
         """Return the packets with selected times."""
         if not self._select.is_timed:
             return packets
-        if self._select.time == "host":
-            times = packets.host_ns
-        else:
-            times = packets.time_ns
-        is_selected = self._times.holds(times)
+        is_selected = self._times.holds(self._clock.read(packets))
         if is_selected.all():
             return packets
         return packets.take(is_selected)

@@ -14,7 +14,12 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan, Selection, UsageError, simulate
+from lidarspec.simulation.clock_faults import parse_clock_faults
+from lidarspec.simulation.device import SimulatedDevice
+from lidarspec.simulation.faults import Faults
+from lidarspec.transports.simulated_files import write_file
 from tests.cli.running import ran
+from tests.shapes import SHAPES
 
 ID = "ldrobot-stl27l"
 #: the length of the recordings, and the scans in them.
@@ -237,3 +242,70 @@ def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
 def test_a_selection_of_nothing_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         Selection(**wrong)
+
+
+def record(path: Path, sensor: ls.Sensor, clock: str, seconds: float = 2.0) -> Path:
+    """Write a recording of a simulated sensor with faults of its clock."""
+    faults = Faults(clock=parse_clock_faults(clock))
+    write_file(SimulatedDevice(sensor, faults=faults), path, seconds)
+    return path
+
+
+def test_stamps_in_utc_follow_from_the_clock_and_changes_are_reported(tmp_path: Path) -> None:
+    synced = SHAPES["shape-synced"]
+    path = record(tmp_path / "drive.lsr", synced, "tai,unlock=0.5s@1s")
+    stamps = dict[str, list[int]]()
+    for time in ("sensor", "utc"):
+        with ls.open(path, synced) as device:
+            selection = Selection(time=time)  # type: ignore[arg-type]
+            stamps[time] = [scan.stamp_ns for scan in device.scans(select=selection)]
+            warnings = device.warnings
+    assert len(stamps["utc"]) > 10
+    offsets = {sensor - utc for sensor, utc in zip(*stamps.values(), strict=True)}
+    assert offsets == {37_000_000_000}
+    changes = [text for text in warnings if "UTC comes from" in text]
+    assert len(changes) == 2
+    assert "holdover" in changes[0]
+
+
+def test_stamps_of_a_free_clock_are_mapped_to_utc_by_arrival(recordings: dict[str, Path]) -> None:
+    """The simulated packets arrive up to 10 ms late."""
+    errors = [
+        (scan.stamp_ns - scan.host_ns) * 1e-9
+        for scan in scans(recordings["pcap"], Selection(time="utc"))
+    ]
+    assert min(errors) > -0.011
+    assert max(errors) < 1e-3
+
+
+def test_a_slice_in_utc_selects_by_date(tmp_path: Path) -> None:
+    synced = SHAPES["shape-synced"]
+    path = record(tmp_path / "drive.lsr", synced, "tai")
+    with ls.open(path, synced) as device:
+        first, *_ = device.scans(select=Selection(time="utc"))
+    begin = datetime.fromtimestamp(first.stamp_ns / 1e9 + 1, UTC)
+    with ls.open(path, synced) as device:
+        found = list(device.scans(select=Selection(time="utc", times=(begin, None))))
+    assert 8 <= len(found) <= 11
+    assert min(scan.stamp_ns for scan in found) >= first.stamp_ns + 999_999_000
+
+
+@pytest.mark.parametrize("time", ["utc", "host"])
+def test_imu_samples_have_the_clock_of_the_stamps(tmp_path: Path, time: Any) -> None:
+    sensor = SHAPES["shape-inertia"]
+    path = record(tmp_path / "drive.lsr", sensor, "step=1s")
+    differences = []
+    for selection in (Selection(), Selection(time=time)):
+        with ls.open(path, sensor) as device:
+            chosen = list(device.scans(select=selection))
+        assert all(scan.imu is not None for scan in chosen)
+        differences.append(
+            [scan.imu.time_ns - scan.stamp_ns for scan in chosen if scan.imu is not None]
+        )
+    for before, after in zip(*differences, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_another_clock_is_refused() -> None:
+    with pytest.raises(UsageError, match="sensor, utc, host"):
+        Selection(time="device")  # type: ignore[arg-type]

@@ -1,0 +1,248 @@
+"""Convert the times of one sensor to UTC.
+
+The time of a packet has one of three sources. If the sensor's clock has a date, UTC follows from
+what it counts (`Clock.epoch`) and from the leap seconds. A clock that counts from the full hour is
+completed by the arrival time. Every other clock, which counts from power-up or was never set, is
+mapped to the clock of the host by the line of the fastest packets (`clock_estimate`).
+
+The source can change: a lock is gained or lost, a frame reports the date late, the sensor restarts.
+Each change is kept with its time, and described in `warnings`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError, suggest
+from lidarspec.leap_seconds import TAI_MINUS_GPS_S, read_leap_seconds
+from lidarspec.packets.clock_estimate import DeviceClock
+from lidarspec.packets.clock_status import read_clock_status
+from lidarspec.packets.packets import Packets
+from lidarspec.spec.timing import EPOCHS, HOUR_S, Clock
+
+Times = NDArray[np.int64]
+SECOND_NS = 1_000_000_000
+HOUR_NS = HOUR_S * SECOND_NS
+#: The first date that a clock can have, s: 2001. A clock that was never set shows an earlier one.
+FIRST_DATE_S = 1e9
+#: How many changes are described one by one.
+MAX_DESCRIBED_CHANGES = 10
+#: The epochs of clocks that have a date.
+DATED_EPOCHS = ("utc", "tai", "gps")
+
+
+@dataclass(frozen=True)
+class UtcSource:
+    """Where UTC comes from.
+
+    Attributes:
+        kind: "clock": the sensor's clock has a date. "hour": it counts from the full hour, and the
+            arrival time completes it. "arrival": the arrival times determine it.
+        epoch: what the clock counts, a key of `spec.timing.EPOCHS`.
+        locked: whether the clock is locked; None if unknown.
+        state: the meaning of the clock's status; "" if unknown.
+    """
+
+    kind: str
+    epoch: str
+    locked: bool | None = None
+    state: str = ""
+
+    @property
+    def is_notable(self) -> bool:
+        """Whether a user should know of this source, even if it never changes."""
+        return self.kind == "arrival" or self.locked is False
+
+    def __str__(self) -> str:
+        if self.kind == "arrival" and self.epoch in DATED_EPOCHS:
+            text = "the arrival times, because the sensor's clock was not set"
+        elif self.kind == "arrival" and not self.epoch:
+            text = "the arrival times, because it is not declared what the sensor's clock counts"
+        elif self.kind == "arrival":
+            text = "the arrival times, because the sensor's clock counts time since power-up"
+        elif self.kind == "hour":
+            text = "the sensor's clock, with the hour of the arrival time"
+        elif self.epoch == "utc":
+            text = "the sensor's clock"
+        else:
+            text = f"the sensor's clock, which counts {EPOCHS[self.epoch]}"
+        if self.state:
+            text += f" ({self.state})"
+        return text
+
+
+@dataclass(frozen=True)
+class UtcChange:
+    """A change of the source of UTC.
+
+    Attributes:
+        utc_ns: the UTC from which on the source applies, ns since 1970.
+        source: the new source.
+        is_first: whether it is the source of the first time.
+    """
+
+    utc_ns: int
+    source: UtcSource
+    is_first: bool = False
+
+    def __str__(self) -> str:
+        date = datetime.fromtimestamp(self.utc_ns // SECOND_NS, UTC)
+        moment = f"{date:%Y-%m-%dT%H:%M:%S}.{self.utc_ns // 1_000_000 % 1000:03}Z"
+        if self.is_first:
+            return f"UTC comes from {self.source}"
+        return f"from {moment} on, UTC comes from {self.source}"
+
+
+class UtcTimes:
+    """Converts the times of one sensor to UTC, in the order of arrival.
+
+    Args:
+        sensor: the id of the sensor, for messages.
+        clock: the clock of the times; None if they are arrival times.
+        name: the name of the source, for messages.
+
+    Attributes:
+        changes: the sources of UTC, each with the time from which on it applies.
+    """
+
+    def __init__(self, sensor: str, clock: Clock | None, name: object = "the source") -> None:
+        self._sensor = sensor
+        self._clock = clock
+        self._name = name
+        self._estimate = DeviceClock()
+        self._source: UtcSource | None = None
+        self._status = math.nan  # the last known status
+        self._expired_path = ""
+        self.changes: list[UtcChange] = []
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences about the source of UTC, its changes, and the table of leap seconds."""
+        notable = [
+            change for change in self.changes if not change.is_first or change.source.is_notable
+        ]
+        texts = [f"{self._name}: {change}" for change in notable[:MAX_DESCRIBED_CHANGES]]
+        if len(notable) > MAX_DESCRIBED_CHANGES:
+            count = len(notable) - MAX_DESCRIBED_CHANGES
+            texts.append(f"{self._name}: the source of UTC changed {count} more times")
+        if self._expired_path:
+            texts.append(
+                f"the table of leap seconds {self._expired_path} has expired; later leap seconds"
+                " are missing: update the time zone data (tzdata)"
+            )
+        return texts
+
+    def observe(self, times: Times, host: Times) -> None:
+        """Update the relation of the clocks with packets.
+
+        Args:
+            times, host: times by the sensor's clock and arrival times, (n,) ns; 0 if unknown.
+        """
+        is_known = host > 0
+        if is_known.any():
+            self._estimate.observe(times[is_known], host[is_known])
+
+    def to_utc(self, time_ns: int, host_ns: int, status: float = math.nan) -> int:
+        """Return the UTC of a time by the sensor's clock, ns since 1970.
+
+        Args:
+            time_ns: the time by the sensor's clock.
+            host_ns: the arrival time, ns since 1970; 0 if unknown.
+            status: the status of the clock (`read_clock_status`); nan if it was not sent.
+
+        Raises:
+            UsageError: if neither the sensor's clock nor the arrival times determine UTC.
+        """
+        if not math.isnan(status):
+            self._status = status
+        source = self._find_source(time_ns)
+        if source.kind != "clock" and not host_ns:
+            raise self._explain_unknown(source)
+        # The estimate of the arrival has to know all times, also those that do not need it.
+        arrival_ns = self._estimate.stamp(time_ns, host_ns) if host_ns else 0
+        if source.kind == "clock":
+            utc_ns = self._subtract_scale(time_ns, source.epoch)
+        elif source.kind == "hour":
+            utc_ns = time_ns + round((host_ns - time_ns) / HOUR_NS) * HOUR_NS
+        else:
+            utc_ns = arrival_ns
+        if source != self._source:
+            self.changes.append(UtcChange(utc_ns, source, is_first=self._source is None))
+            self._source = source
+        return utc_ns
+
+    def convert(self, packets: Packets) -> Times:
+        """Return the UTC of packets, (n,) ns.
+
+        Raises:
+            UsageError: as for `to_utc`.
+        """
+        rows = zip(
+            packets.time_ns.tolist(),
+            packets.host_ns.tolist(),
+            read_clock_status(packets).tolist(),
+            strict=True,
+        )
+        return np.array([self.to_utc(*row) for row in rows], np.int64)
+
+    def _find_source(self, time_ns: int) -> UtcSource:
+        """Return the source of UTC at a time by the sensor's clock."""
+        clock = self._clock
+        if clock is None:
+            raise self._explain_no_clock()
+        epoch = clock.epoch
+        locked: bool | None = None
+        meaning = ""
+        if clock.status is not None and not math.isnan(self._status):
+            state = clock.status.state_of(self._status)
+            epoch = clock.epoch_in(state)
+            locked = state.locked
+            meaning = state.meaning
+        has_date = time_ns >= FIRST_DATE_S * SECOND_NS
+        if epoch == "hour" and has_date:
+            epoch = "utc"  # another frame has completed the hour
+        if epoch in DATED_EPOCHS and has_date:
+            kind = "clock"
+        elif epoch == "hour":
+            kind = "hour"
+        else:
+            kind = "arrival"
+        return UtcSource(kind, epoch, locked, meaning)
+
+    def _subtract_scale(self, time_ns: int, epoch: str) -> int:
+        """Return the UTC of a time in another time scale, ns."""
+        if epoch == "utc":
+            return time_ns
+        table = read_leap_seconds()
+        seconds, fraction_ns = divmod(time_ns, SECOND_NS)
+        if epoch == "gps":
+            seconds += TAI_MINUS_GPS_S
+        utc_s = int(table.utc_from_tai(seconds))
+        if table.has_expired(utc_s):
+            self._expired_path = table.path
+        return utc_s * SECOND_NS + fraction_ns
+
+    def _explain_no_clock(self) -> UsageError:
+        error = UsageError(f"{self._sensor} has no clock, so that UTC is known by arrival only")
+        return suggest(error, "repeat with --time host")
+
+    def _explain_unknown(self, source: UtcSource) -> UsageError:
+        """Return the error for times that cannot be converted."""
+        if source.epoch == "hour":
+            reason = "counts from the full hour"
+        elif source.epoch in DATED_EPOCHS:
+            reason = "was not set"
+        elif source.epoch:
+            reason = "counts time since power-up"
+        else:
+            reason = "is not declared to count UTC, TAI or GPS time"
+        error = UsageError(
+            f"{self._name} has no arrival times, and the clock of {self._sensor} {reason}, so"
+            f" that UTC is unknown; record with arrival times (lidarspec record -o drive.lsr)"
+        )
+        return suggest(error, "repeat with --time sensor")

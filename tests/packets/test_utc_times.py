@@ -1,0 +1,139 @@
+"""Tests of the conversion of times to UTC, and of reports about its source."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarspec import UsageError, simulate
+from lidarspec.leap_seconds import LeapSeconds
+from lidarspec.packets import utc_times
+from lidarspec.packets.utc_times import UtcTimes
+from lidarspec.simulation.clock_faults import parse_clock_faults
+from lidarspec.spec import Clock
+from tests.shapes import SHAPES
+from tests.shapes.synced import FREE, HOLDOVER, LOCKED
+
+SYNCED = SHAPES["shape-synced"]
+SECOND = 1_000_000_000
+NOW = 1_785_283_200 * SECOND  # 2026-07-29
+LEAP_SECONDS = LeapSeconds((0, 1_483_228_800), (36, 37), 1_800_000_000, "/zoneinfo/leapseconds")
+
+
+@pytest.fixture(autouse=True)
+def leap_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The leap seconds until 2026, whatever this computer has."""
+    monkeypatch.setattr(utc_times, "read_leap_seconds", lambda: LEAP_SECONDS)
+
+
+def make(epoch: str) -> UtcTimes:
+    clock = Clock("time", epoch=epoch, wraps_at=3600 if epoch == "hour" else None)
+    return UtcTimes("shape-synced", clock, "drive.lsr")
+
+
+@pytest.mark.parametrize(("epoch", "ahead_s"), [("utc", 0), ("tai", 37), ("gps", 18)])
+def test_a_clock_with_a_date_needs_no_arrival_times(epoch: str, ahead_s: int) -> None:
+    times = make(epoch)
+    assert times.to_utc(NOW + ahead_s * SECOND + 123_456_789, 0) == NOW + 123_456_789
+    assert [change.source.kind for change in times.changes] == ["clock"]
+    assert times.warnings == []
+
+
+def test_leap_seconds_of_the_past_are_those_of_that_time() -> None:
+    in_2016 = 1_483_228_799 * SECOND
+    assert make("tai").to_utc(in_2016 + 36 * SECOND, 0) == in_2016
+    assert make("gps").to_utc(in_2016 + 17 * SECOND, 0) == in_2016
+
+
+def test_an_hour_is_completed_by_the_arrival_time() -> None:
+    times = make("hour")
+    # NOW is a full hour. The packet of 3599.9 s arrives after it.
+    assert times.to_utc(3_599_900_000_000, NOW + 5_000_000) == NOW - SECOND // 10
+    assert times.to_utc(100_000_000, NOW + SECOND // 10) == NOW + SECOND // 10
+    assert times.changes[0].source.kind == "hour"
+    assert times.warnings == []
+    # Another frame dates the clock.
+    assert times.to_utc(NOW + SECOND, NOW + SECOND) == NOW + SECOND
+    assert [change.source.kind for change in times.changes] == ["hour", "clock"]
+
+
+@pytest.mark.parametrize("epoch", ["boot", "", "tai"])
+def test_a_clock_without_a_date_is_mapped_by_arrival(epoch: str) -> None:
+    """At 50 ppm, and with delays of up to 5 ms, the error is below a millisecond."""
+    times = make(epoch)
+    random = np.random.default_rng(0)
+    true_s = np.arange(0, 40, 0.01)
+    readings = np.rint(true_s * (1 + 50e-6) * 1e9).astype(np.int64)
+    arrivals = NOW + np.rint((true_s + random.uniform(0, 0.005, len(true_s))) * 1e9).astype(int)
+    errors = []
+    for index in range(0, len(true_s), 10):
+        piece = slice(index, index + 10)
+        times.observe(readings[piece], arrivals[piece])
+        utc_ns = times.to_utc(readings.item(index), arrivals.item(index))
+        errors.append((utc_ns - NOW) * 1e-9 - true_s[index])
+    assert np.abs(errors[100:]).max() < 1e-3
+    assert [change.source.kind for change in times.changes] == ["arrival"]
+    assert len(times.warnings) == 1
+
+
+@pytest.mark.parametrize("epoch", ["boot", "", "tai", "hour"])
+def test_without_arrival_times_utc_is_unknown(epoch: str) -> None:
+    with pytest.raises(UsageError, match="no arrival times"):
+        make(epoch).to_utc(5 * SECOND, 0)
+    with pytest.raises(UsageError, match="has no clock"):
+        UtcTimes("shape-synced", None).to_utc(NOW, NOW)
+
+
+def test_each_change_of_the_source_is_reported_once_with_its_time() -> None:
+    times = UtcTimes("shape-synced", SYNCED.clock, "drive.lsr")
+    statuses = [FREE] * 5 + [LOCKED] * 5 + [HOLDOVER] * 5 + [np.nan] * 5
+    for second, status in enumerate(statuses):
+        reading = second if status == FREE else second + 37 + NOW // SECOND
+        utc_ns = times.to_utc(reading * SECOND, NOW + second * SECOND, status)
+        assert utc_ns == NOW + second * SECOND
+    assert [change.utc_ns - NOW for change in times.changes] == [0, 5 * SECOND, 10 * SECOND]
+    assert [change.source.kind for change in times.changes] == ["arrival", "clock", "clock"]
+    assert [change.source.locked for change in times.changes] == [False, True, False]
+    assert "2026-07-29T00:00:05.000Z" in times.warnings[1]
+    assert len(times.warnings) == 3
+
+
+def test_many_changes_are_counted() -> None:
+    times = UtcTimes("shape-synced", SYNCED.clock, "drive.lsr")
+    for second in range(40):
+        status = (LOCKED, HOLDOVER)[second % 2]
+        times.to_utc(NOW + second * SECOND, 0, status)
+    # The first source is locked, and not worth a warning.
+    assert len(times.changes) == 40
+    assert len(times.warnings) == utc_times.MAX_DESCRIBED_CHANGES + 1
+    assert "29 more" in times.warnings[-1]
+
+
+def test_an_expired_table_is_reported_once() -> None:
+    times = make("tai")
+    times.to_utc(NOW, 0)
+    assert times.warnings == []
+    for second in range(3):
+        times.to_utc((1_800_000_100 + second) * SECOND, 0)
+    (warning,) = times.warnings
+    assert LEAP_SECONDS.path in warning
+
+
+def test_packets_are_converted_with_their_status() -> None:
+    faults = parse_clock_faults("restart@0.5s")
+    dated = replace(SYNCED, simulation=replace(SYNCED.simulation, sweep=sweep_now))
+    packets = dated.decode(simulate(dated, 500, clock=faults))
+    packets.host_ns = NOW + np.arange(500) * 2_000_000
+    times = UtcTimes("shape-synced", SYNCED.clock)
+    utc_ns = times.convert(packets)
+    # The sweep gives floats, which are exact to 128 ns at such a date.
+    np.testing.assert_allclose(utc_ns[:250] - NOW, np.arange(250) * 2_000_000, atol=128)
+    assert [change.source.kind for change in times.changes] == ["clock", "arrival"]
+    assert times.changes[1].utc_ns == utc_ns[250]
+
+
+def sweep_now(i: int) -> dict[str, object]:
+    assert SYNCED.simulation.sweep is not None
+    return {**SYNCED.simulation.sweep(i), "time": NOW + 37 * SECOND + i * 2_000_000}
