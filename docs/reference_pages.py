@@ -11,6 +11,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from manual_coverage import make_coverage_page, read_coverages
+
 import lidarspec as ls
 from lidarspec.exports import export, select_frame
 from lidarspec.exports.reference import make_page
@@ -34,6 +36,16 @@ def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
     return files
 
 
+def make_coverage_files(sensors: list[ls.Sensor]) -> dict[str, str]:
+    """Return the pages that compare manuals with lidarspec, by file name."""
+    titles = {sensor.id: f"{sensor.vendor} {sensor.model}" for sensor in sensors}
+    return {
+        f"{coverage.sensor}-manual.md": make_coverage_page(coverage, titles[coverage.sensor])
+        for coverage in read_coverages()
+        if coverage.sensor in titles
+    }
+
+
 def make_index(sensors: list[ls.Sensor]) -> str:
     """Return a page with a link to the page of each sensor."""
     lines = ["# Sensors", "", INTRODUCTION, "", "| sensor | id | verified |", "|---|---|---|"]
@@ -45,7 +57,7 @@ def make_index(sensors: list[ls.Sensor]) -> str:
 
 def main() -> None:
     sensors = list(ls.sensors().values())
-    files = {"index.md": make_index(sensors)}
+    files = {"index.md": make_index(sensors), **make_coverage_files(sensors)}
     for sensor in sensors:
         files |= make_sensor_files(sensor)
     shutil.rmtree(FOLDER, ignore_errors=True)

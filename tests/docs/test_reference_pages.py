@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -22,7 +23,12 @@ def load_script(name: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    sys.modules[name] = module
+    sys.path.insert(0, str(DOCS))  # as if it were run; scripts import each other
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(DOCS))
     return module
 
 
@@ -53,6 +59,8 @@ def test_the_navigation_lists_the_pages_of_each_vendor() -> None:
     entries = load_script("sensor_navigation").make_entries(sensors)
     assert [list(entry) for entry in entries] == [["All sensors"], ["LDROBOT"], ["Velodyne"]]
     assert {"STL-27L": "reference/sensors/ldrobot-stl27l.md"} in entries[1]["LDROBOT"]
+    manual = {"STL-27L: its manual": "reference/sensors/ldrobot-stl27l-manual.md"}
+    assert manual in entries[1]["LDROBOT"]
 
 
 def test_files_of_removed_sensors_are_deleted(
@@ -66,7 +74,8 @@ def test_files_of_removed_sensors_are_deleted(
     (tmp_path / "sensors" / "acme-x1.md").touch()
     script.main()
     written = {path.name for path in (tmp_path / "sensors").iterdir()}
-    assert written == {"index.md", "ldrobot-stl27l.md", "ldrobot-stl27l.svg"}
+    pages = {"index.md", "ldrobot-stl27l.md", "ldrobot-stl27l-manual.md"}
+    assert written == {*pages, "ldrobot-stl27l.svg"}
 
 
 def test_the_generated_parts_of_the_reference_are_up_to_date() -> None:
