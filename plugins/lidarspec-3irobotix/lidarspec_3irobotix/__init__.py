@@ -4,9 +4,9 @@ Lidars of vacuum cleaners, which send without a request. The host drives the mot
 
 Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
 packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
-angle of its first sample; its span follows from the packets per revolution, 16, or 15 for a 2G.
-Known errors of drivers: one takes the sum modulo FFFF instead of 10000. The zero offset is
-reported, but not applied, as in the drivers.
+angle of its first sample. Its span is 360 degrees divided by the packets per revolution, which are
+16, or 15 for a 2G. One driver computes the sum modulo FFFF instead of 10000, which is an error. The
+zero offset in the packets is not added to the angles, as in the drivers.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ SPEED_STRUCT = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether both lengths agree, there are samples, and angle and version fit."""
+    """Return whether both lengths agree, samples exist, and angle and version are valid."""
     return (
         (f.length == f.size + 8)
         & (f.size > 5)
@@ -88,7 +88,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, packets: int) -> Polar:
-    """Return points at even steps, clockwise, through the span of a packet.
+    """Return points at even steps, clockwise, over the span of a packet.
 
     `packets` is the number of packets per revolution.
     """
@@ -134,7 +134,7 @@ FRAMES = {
     "data": Frame(DATA, data=True, max_length=15 + 3 * MAX_SAMPLES_PER_PACKET, plausible=plausible),
     "speed": Frame(SPEED_STRUCT),
 }
-#: Id -> model, packets per revolution, samples of a simulated packet, baud rates.
+#: The models by id: name, packets per revolution, samples of a simulated packet, baud rates.
 MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
     # the samples of the captured Delta-2A packet need more than 115 200 baud
     "3irobotix-delta2a": ("Delta-2A", 16, 47, (230_400, 115_200)),

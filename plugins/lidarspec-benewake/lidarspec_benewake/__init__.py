@@ -2,12 +2,12 @@
 
 Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections,
 and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The first TFmini sends
-the same frames with other data in place of the temperature, and has other commands. Frames do not
-contain their unit, centimetres (the default) or millimetres: use ``configure(unit="mm")`` after
-`set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores the sum of
-commands, and its manual prints commands with the sum 00; the other models check it. The replies to
-reset, factory settings and save printed in the TFmini-S manual have the sums of their commands;
-here each reply has the sum of its own bytes.
+the same frames with other data in place of the temperature, and has other commands. Distances are
+in centimetres by default. Frames do not contain the unit, so use ``configure(unit="mm")`` after the
+command `set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores the
+sum of commands, and its manual prints commands with the sum 00; the other models check the sum. In
+the TFmini-S manual, the replies to reset, factory settings and save have the sums of their
+commands. In this module each reply has the sum of its own bytes.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def configure(sensor: Sensor, *, unit: Literal["cm", "mm"] = "cm") -> Sensor:
     return dataclasses.replace(sensor, frames={**sensor.frames, "data": make_data_frame(unit)})
 
 
-#: Id -> model, range limits in m, highest frame rate in Hz, source.
+#: The models by id: name, range limits in m, highest frame rate in Hz, source.
 MODELS: dict[str, tuple[str, tuple[float, float], int, str]] = {
     "benewake-tfmini": (
         "TFmini-S",

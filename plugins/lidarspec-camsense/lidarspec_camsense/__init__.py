@@ -4,9 +4,9 @@ They rotate and send without a request.
 
 There is no public manual. Source: packets of both (thijses/camsense-X1, "a few data packets";
 kaiaai/LDS, issue 17), all with valid checksums, and the drivers kaiaai/LDS (LDS_CAMSENSE_X1,
-LDS_LDS08RR_CAMSENSE) and lds2d. Known errors of drivers: the checksum, which they call an unknown
-CRC-16, is a folded sum over all bytes before it. There are two LDS08RR: the other one sends
-3iRobotix' packets, which begin with AA.
+LDS_LDS08RR_CAMSENSE) and lds2d. The drivers call the checksum an unknown CRC-16, but it is a folded
+sum over all bytes before it. Two different sensors are called LDS08RR. The other one sends packets
+of 3iRobotix, which begin with AA.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def plausible(f: Fields) -> Any:
 def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
     """Return points at even steps from the start angle to the end angle, clockwise.
 
-    The direction is that of the drivers, which draw rooms with it.
+    The direction is the same as in the drivers, which draw correct maps.
 
     Args:
         f: the fields of n packets.

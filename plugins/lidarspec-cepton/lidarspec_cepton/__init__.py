@@ -2,10 +2,10 @@
 
 Source: the first part of Cepton's Sensor Communication Specifications
 (developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither states
-whether the wire has the letters STDV in this order, or a number with the low byte first: both are
-accepted. Assumed are the maximum range, the simulated pattern, and that the time of a point counts
-from the point before it (144 points take longer than its byte can hold). Information and fault
-packets are not public and are skipped. No captured packet was available.
+whether the letters STDV are sent in this order, or as a number with the low byte first, so both are
+accepted. The maximum range and the simulated pattern are assumed. It is also assumed that the time
+of a point counts from the previous point, because 144 points take longer than a byte can represent.
+Information and fault packets are not public and are skipped. No captured packet was available.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the points, with axes converted from right, ahead, up to ahead, left, up."""
+    """Return the points; the axes right, ahead, up are converted to ahead, left, up."""
     members = f.points
     return Cartesian(
         members.y,

@@ -1,11 +1,11 @@
 """Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth.
 
 A packet has 1086 bytes, 1118 with a signature. A mirror with three faces sweeps the beams over 120
-degrees to the front; a scan is the sweep of one face. The azimuth of a block is the mirror's, and
-the beam turns by twice as much. So the azimuth of a point is twice the mirror's angle from the
-start of the face, plus that of the channel, plus a correction from the unit's file for the channel
-in steps of two degrees of the mirror. Between faces the sensor sends nothing, and the azimuth jumps
-by about 60 degrees.
+degrees to the front, and a scan is the sweep of one face. The azimuth of a block is the angle of
+the mirror, and the beam turns by twice as much. The azimuth of a point is therefore twice the
+mirror's angle from the start of the face, plus the azimuth of the channel, plus a correction for
+the channel from the unit's file, which has steps of two degrees of the mirror. Between faces the
+sensor sends nothing, and the azimuth jumps by about 60 degrees.
 
 The CRCs are probably those of a QT128. No captured packet was available, so they are not verified.
 
@@ -96,9 +96,9 @@ class Mirror(Calibration):
     """A unit's mirror and channels.
 
     Attributes:
-        faces: (faces,) azimuths at which they begin, degrees of the mirror.
-        azimuth_adjust, elevation_adjust: (181, channels) degrees to add, in steps of 2 degrees of
-            the mirror; None for no correction.
+        faces: (faces,) the mirror angles at which the faces begin, degrees.
+        azimuth_adjust, elevation_adjust: (181, channels) the degrees to add, in steps of 2 degrees
+            of the mirror; None for no correction.
     """
 
     faces: Table = dataclasses.field(default_factory=lambda: np.array([23.075, 143.44, 263.133]))
@@ -106,7 +106,7 @@ class Mirror(Calibration):
     elevation_adjust: Table | None = None
 
     def with_file(self, path: str | Path | Learned) -> Mirror:
-        """Return the table with one unit's angles, from its file (.dat) or its reply.
+        """Return a copy with the angles of one unit, from its file (.dat) or its reply.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model.
@@ -154,7 +154,7 @@ class Mirror(Calibration):
         return data + hashlib.sha256(data).digest()
 
     def interpolate_adjustment(self, table: Table | None, azimuth: Any) -> Any:
-        """Return the degrees to add for each channel at azimuths of the mirror.
+        """Return the degrees to add for each channel at some angles of the mirror.
 
         Values between two steps are interpolated linearly.
         """
@@ -182,7 +182,7 @@ TAIL = (
     "shutdown" / Int8ul * "bit 0: overheated, about to shut down",
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
@@ -190,9 +190,9 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Return the points of a packet, with shots up to its time (tier4/nebula).
+    """Return the points of a packet; the last shot is at the packet's time (tier4/nebula).
 
-    Azimuths count from the last face, clockwise from the left.
+    Azimuths are measured from the start of the last face, clockwise from the left.
     """
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]

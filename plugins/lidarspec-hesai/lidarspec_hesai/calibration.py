@@ -26,8 +26,8 @@ MAX_FILE_BYTES = 1_000_000
 MAX_QUOTED_CHARACTERS = 60  # of a file in a message
 MARK = "EEFF"  # above the headings of some files
 HASH = re.compile(r"[0-9a-fA-F]{8,}")  # below the table of some files
-#: The spread of a unit's values may differ from the model's by this factor; radians instead of
-#: degrees differ by 57.
+#: The spread of a unit's values may differ from that of the model by this factor. Radians in place
+#: of degrees would differ by a factor of 57.
 MAX_SPREAD_RATIO = 10
 
 
@@ -37,9 +37,10 @@ class Column:
 
     Attributes:
         name: the name of the column in messages.
-        headings: possible headings: letters in lower case, without parentheses.
-        low, high: the limits of its values.
-        units: spellings of its unit, which may follow the heading in parentheses.
+        headings: the accepted headings, in lower case and without parentheses.
+        low: the lowest accepted value.
+        high: the highest accepted value.
+        units: the accepted spellings of the unit, which may follow the heading in parentheses.
     """
 
     name: str
@@ -62,7 +63,8 @@ class Calibration:
     """The corrections of each channel.
 
     Attributes:
-        elevation, azimuth: (channels,) degrees; azimuth clockwise, as the vendor counts it.
+        elevation: (channels,) degrees.
+        azimuth: (channels,) degrees, clockwise as in the vendor's files.
         firing: (channels,) seconds after the time of the block.
         nominal: whether the angles are the model's, not the unit's.
     """
@@ -76,11 +78,11 @@ class Calibration:
         return len(self.elevation)
 
     def with_file(self, path: str | Path | Learned) -> Calibration:
-        """Return the table with one unit's angles, from a correction file or its reply.
+        """Return a copy with the angles of one unit, from a correction file or its reply.
 
         Raises:
-            UsageError: if the file cannot be read, or belongs to another model; with line and
-                column.
+            UsageError: if the file cannot be read, or belongs to another model. The error has the
+                line and column.
         """
         elevation, azimuth = read_columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
@@ -99,7 +101,7 @@ class Calibration:
 def make_nominal_table(
     elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]
 ) -> Calibration:
-    """Return the table of a model; firing times in microseconds."""
+    """Return the table of a model, given firing times in microseconds."""
     return Calibration(
         np.array(list(elevation)), np.array(list(azimuth)), np.array(list(firing_us)) * 1e-6
     )
@@ -122,12 +124,13 @@ def configure(
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
-        calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees,
-            in any order, or the binary file of a model that has one; or the unit's reply.
-        firing_times: CSV with the headings Channel and Fire time, in microseconds.
+        calibration: a CSV file with the columns Channel (or Laser id), Elevation and Azimuth, in
+            degrees, in any order; the binary file of a model that has one; or the unit's reply.
+        firing_times: a CSV file with the columns Channel and Fire time, in microseconds.
 
     Raises:
-        UsageError: if a file cannot be read, or belongs to another model; with line and column.
+        UsageError: if a file cannot be read, or belongs to another model. The error has the line
+            and column.
     """
     angles = calibration or sensor.options.get("calibration")
     times = firing_times or sensor.options.get("firing_times")
@@ -148,11 +151,12 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
     table are ignored, as in the vendor's reader.
 
     Args:
-        wanted: the columns, with the model's values; the unit's must have a similar spread.
+        wanted: the columns, with the values of the model. The values of the unit must have a
+            similar spread.
 
     Raises:
-        UsageError: if the file cannot be read, or does not have these columns for every channel of
-            the model once; with line and column.
+        UsageError: if the file cannot be read, or does not have one value in these columns for
+            every channel of the model. The error has the line and column.
     """
     (line, headings), *rows = read_rows(path)
     indexes = [find_column(path, line, headings, column) for column in (CHANNEL, *wanted)]
@@ -280,9 +284,9 @@ def check_spread(
     table: Table,
     nominal_values: Table,
 ) -> None:
-    """Raise a UsageError if the spread of values is unlike the model's.
+    """Raise UsageError if the spread of values differs greatly from that of the model.
 
-    Values of a model with a spread of at most 1 are not checked.
+    Values are not checked if the spread of the model is at most 1.
     """
     spread = float(np.ptp(table))
     nominal_spread = float(np.ptp(nominal_values))

@@ -95,9 +95,10 @@ def make_packet(
         tail: the fields between functional safety and sequence.
         block: the type of the finer azimuth, between azimuth and channels; None if absent.
         blocks: the type of the number of blocks.
-        imu, safety: whether the packet can have this part.
-        verify_crc: whether CRCs are verified; otherwise they are plain fields, for models without a
-            known coverage.
+        imu: whether the packet can have an IMU part.
+        safety: whether the packet can have a functional safety part.
+        verify_crc: whether CRCs are verified. Otherwise they are plain fields, for models for which
+            the covered bytes are not known.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
     fine_azimuth = [] if block is None else ["fine_azimuth" / block]
@@ -143,11 +144,11 @@ def make_packet(
 
 
 def max_packet_bytes(blocks: int, block: int) -> int:
-    """Return the bytes of a packet with all parts.
+    """Return the size of a packet with all parts, in bytes.
 
     Args:
         blocks: the number of blocks.
-        block: bytes per block.
+        block: the size of a block in bytes.
     """
     return 12 + blocks * block + 4 + 17 + 32 + 4 + 22 + 4 + 32
 
@@ -182,8 +183,8 @@ def packet_values(values: dict[str, Any], **more: int) -> dict[str, Any]:
     """Return the values of a simulated packet with single return and a sequence.
 
     Args:
-        values: values of the packet; azimuths are moved into the body.
-        more: flags, and fields of the header.
+        values: the values of the packet; azimuths are moved into the body.
+        more: further flags and fields of the header.
     """
     flags = {
         "flags.sequence": 1,

@@ -1,4 +1,4 @@
-"""Construction of sensors: links, commands, clock and files that all spinning models share."""
+"""Make sensors with the links, commands, clock and files that all spinning models share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def make_spinning_sensor(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a rotating sensor; opening it requests its angles.
+    """Return a rotating sensor, whose angles are requested when it is opened.
 
     Args:
         id: the id of the sensor.

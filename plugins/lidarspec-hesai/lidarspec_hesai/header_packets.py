@@ -57,7 +57,7 @@ def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) 
 
 
 def max_packet_bytes(lasers: int, blocks: int) -> int:
-    """Return the bytes of a packet: header, blocks, tail and sequence."""
+    """Return the size of a packet in bytes, with header, blocks, tail and sequence."""
     return 12 + blocks * (2 + 4 * lasers) + 24 + 4
 
 

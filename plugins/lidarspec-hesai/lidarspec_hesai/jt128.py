@@ -74,7 +74,7 @@ FIRING_US = (
 def points(f: Fields, channels: Calibration) -> Polar:
     """Return the points of a packet.
 
-    Shots end 1.888 ms before the packet's time (HesaiLidar_SDK_2.0).
+    The last shot is 1.888 ms before the packet's time (HesaiLidar_SDK_2.0).
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

@@ -1,16 +1,16 @@
 """Hesai JT16: 16 channels over a serial line.
 
-An azimuth is a packet of 80 bytes, an IMU sample a packet of 34:
+The points of one azimuth are a packet of 80 bytes, and an IMU sample is a packet of 34 bytes:
 
     EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity),
     dirt, state, sequence | CRC EE FF 01 08  time_version  01 | date, microseconds | acceleration,
     rate, sequence | CRC
 
-No captured packet was available. The azimuths per revolution and the rotation speed are not public:
-600 at 5 Hz are simulated, the grid of the vendor's code and the limit of the baud rate. The axes of
-the IMU are not documented, so its samples are available as fields only.
+No captured packet was available. The azimuths per revolution and the rotation speed are not public.
+The simulation has 600 azimuths, as the vendor's code does, at 5 Hz, which is the limit of the baud
+rate. The axes of the IMU are not documented, so its samples are available as fields only.
 
-Not supported: commands, which use a second line (RS232, 9600 baud) and contain random numbers. They
+Commands are not supported. They use a second line (RS232, 9600 baud), contain random numbers, and
 could read a unit's angles.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
@@ -63,7 +63,7 @@ def make_packet(data_type: int, *body: Any) -> Struct:
         "time_version" / Int8ul,
         "data_type" / Const(data_type, Int8ul),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
         *body,
         "crc" / Int32ul,
     )

@@ -8,8 +8,8 @@ A packet has 861 bytes, 893 with a signature:
 
 The status distinguishes the models. The CRCs are probably those of a QT128. No captured packet was
 available, so they are not verified. The operational state and the azimuth state of the block
-determine which channels fire and when: sixteen groups of eight channels share their times. Below
-2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in these tables.
+determine which channels fire and when; each of sixteen groups of eight channels has common firing
+times. Below 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in these tables.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
@@ -164,7 +164,7 @@ def make_tail(speed: float) -> Any:
         "return_mode" / RETURN_MODE,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
         "factory" / Int8ul * FACTORY,
     )
 
@@ -186,8 +186,8 @@ def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
     earlier shots are counted back from it. Delays of channels depend on the state of the block.
 
     Args:
-        last: seconds from the packet's time to the last shot.
-        times: seconds of each channel, a row for each state, (states, channels).
+        last: the time from the packet's time to the last shot, seconds.
+        times: the firing times of the channels in each state, (states, channels) s.
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
@@ -212,12 +212,12 @@ def sweep(i: int, status: int) -> dict[str, Any]:
 
 
 def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
-    """Return the seconds of each channel, (states, channels)."""
+    """Return the firing times of the channels in each state, (states, channels) s."""
     return np.array([times_us[group] for group in groups]).T * 1e-6
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return the other models with these packets, recognized by their status."""
+    """Return the other models with these packets; they have another status."""
     others = {
         "hesai-pandar128": Relative(
             "a status below 128", lambda f: f.status_version < MIN_OT128_STATUS

@@ -75,9 +75,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the points of a packet, with shots before its time (HesaiLidar_SDK_2.0).
+    """Return the points of a packet.
 
-    With dual return, a pair of blocks is one shot.
+    The shots are before the packet's time (HesaiLidar_SDK_2.0). With dual return, a pair of blocks
+    is one shot.
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
@@ -93,7 +94,7 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 
 def pace(f: Fields, blocks: int) -> Any:
-    """Return the seconds of the shots of a packet (HesaiLidar_SDK_2.0)."""
+    """Return the time that the shots of a packet take, seconds (HesaiLidar_SDK_2.0)."""
     return SHOT_PERIOD_S * blocks / count_returns(f.return_mode)
 
 

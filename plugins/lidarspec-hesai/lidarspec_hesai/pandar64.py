@@ -81,9 +81,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the points of a packet, with shots before its time (HesaiLidar_SDK_2.0).
+    """Return the points of a packet.
 
-    With dual return, a pair of blocks is one shot.
+    The shots are before the packet's time (HesaiLidar_SDK_2.0). With dual return, a pair of blocks
+    is one shot.
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)

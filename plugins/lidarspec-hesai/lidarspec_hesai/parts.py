@@ -1,4 +1,4 @@
-"""Parts of all packets of the family: the date, the return modes, and the points of a shot.
+"""The parts that all packets of the family share: date, return modes, points of a shot.
 
 Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which
 reproduces its published clouds).
@@ -55,7 +55,7 @@ TAIL_40P = (
     "shutdown" / Int8ul * "1: overheated, about to shut down",
     "tail_reserved" / Bytes(2),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
@@ -63,7 +63,7 @@ TAIL_40P = (
 
 
 def count_returns(mode: Any) -> Any:
-    """Return the number of consecutive blocks with returns of one shot."""
+    """Return the number of consecutive blocks with the returns of one shot."""
     dual = (mode == 0x39) | (mode == 0x3B) | (mode == 0x3C)
     return np.where(mode == 0x3D, 3, np.where(dual, 2, 1))
 
@@ -90,10 +90,10 @@ def make_points(
     Args:
         blocks: the blocks of the frame.
         channels: the corrections of each channel.
-        distance: metres, (n, blocks, channels).
+        distance: the distances in metres, (n, blocks, channels).
         block: the number of each block, (blocks, 1) or (n, blocks, 1).
-        returns: the number of consecutive blocks with returns of one shot.
-        fired: seconds from the packet's time to the shot of each block.
+        returns: the number of consecutive blocks with the returns of one shot.
+        fired: the time from the packet's time to the shot of each block, seconds.
     """
     return Polar(
         range=distance,

@@ -1,4 +1,4 @@
-"""PTC, the commands of the family, over TCP port 9347, big-endian.
+"""PTC, the big-endian commands of the family over TCP port 9347.
 
     47 74  code  result | length(4) | payload
 
@@ -105,7 +105,7 @@ def make_command(code: str, **more: Any) -> Command:
 
 
 def make_commands(rates: tuple[int, int]) -> Mapping[str, Command]:
-    """Return the commands of a unit; `rates` are its lowest and highest speed in rpm."""
+    """Return the commands of a unit; `rates` has its lowest and its highest speed in rpm."""
     return {
         "get_calibration": make_command(
             "get_calibration", learns=lambda reply: {"calibration": bytes(reply.payload)}

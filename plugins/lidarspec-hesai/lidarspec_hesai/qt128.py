@@ -72,7 +72,7 @@ AZIMUTH = (
     -7.61231176, -7.74288787, -7.8848012, -8.03961095, -8.20921068, -8.3959205, -8.60260573, -8.83289966, -9.09143333, -9.38426583,
     -9.71950367, -10.108306,
 )
-#: Firing times of the channels in the two alternating loops; 0: the channel does not fire.
+#: The firing times of the channels in the two alternating loops; 0 if the channel does not fire.
 LOOP_1_US = (
     0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 27.656, 53, 2.312, 78.344, 81.512,
     5.48, 56.168, 30.824, 33.992, 59.336, 8.648, 84.68, 87.848, 11.816, 62.504, 37.16, 40.328, 65.672, 14.984, 91.016, 94.184, 18.152,
@@ -106,15 +106,16 @@ TAIL = (
     "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
     "factory" / Int8ul * FACTORY,
 )
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the points of a packet, with shots after its time (HesaiLidar_SDK_2.0).
+    """Return the points of a packet.
 
-    Firing times depend on the loop, which changes with each shot.
+    The shots are after the packet's time (HesaiLidar_SDK_2.0). Firing times depend on the loop,
+    which changes with each shot.
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
@@ -133,7 +134,7 @@ def sweep(i: int) -> dict[str, Any]:
 
 
 TABLE = make_nominal_table(ELEVATION, AZIMUTH, LOOP_1_US)
-#: Seconds from the firing of each channel in the first loop to that in the second.
+#: The seconds from the firing of each channel in the first loop to its firing in the second.
 LOOP_DELAY_S = (np.array(LOOP_2_US) - np.array(LOOP_1_US)) * 1e-6
 
 QT128 = make_spinning_sensor(

@@ -62,7 +62,7 @@ FIRING_US = (
 TAIL = (
     "reserved" / Bytes(10),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,
@@ -70,9 +70,10 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the points of a packet, with shots after its time (HesaiLidar_SDK_2.0).
+    """Return the points of a packet.
 
-    A packet has four shots, or two with dual return.
+    The shots are after the packet's time (HesaiLidar_SDK_2.0). A packet has four shots, or two with
+    dual return.
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

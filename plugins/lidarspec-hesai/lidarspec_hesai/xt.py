@@ -1,6 +1,7 @@
 """Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks.
 
-Packets have 1080 and 568 bytes with 8 blocks; those of an XT32M2X have 820 with 6 blocks.
+A packet of 8 blocks has 1080 bytes, or 568 bytes for an XT-16. A packet of an XT32M2X has 6 blocks
+and 820 bytes.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models, which give whole
 degrees and no offsets).
@@ -43,15 +44,16 @@ TAIL = (
     "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
     "factory" / Int8ul * FACTORY,
 )
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the points of a packet, with shots up to its time (HesaiLidar_SDK_2.0).
+    """Return the points of a packet.
 
-    The header has the maximum number of returns, not the actual number.
+    The last shot is at the packet's time (HesaiLidar_SDK_2.0). The number of returns in the header
+    is the maximum, so the number is taken from the return mode.
     """
     block = block_numbers(f)
     returns = count_returns(f.return_mode)

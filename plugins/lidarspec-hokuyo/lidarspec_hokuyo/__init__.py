@@ -1,16 +1,17 @@
 """Hokuyo scanners with SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
 
-A reply is one revolution. It contains its steps, but neither the steps of a full revolution nor the
-model. MD requests continuous scans with distances, ME with intensities as well, MS with distances
-of two characters, ND and NE with all echoes; GD, GE, GS, HD and HE request one scan and need
-`laser_on` before. Scans of any steps are read; ``configure(content=, first=, last=, cluster=)``
-selects the requested steps.
+The reply to a scan command is one revolution. It contains the requested steps, but neither the
+number of steps of a full revolution nor the model. MD requests continuous scans with distances, ME
+with distances and intensities, MS with distances of two characters, and ND and NE with all echoes.
+GD, GE, GS, HD and HE request one scan; the laser has to be switched on with `laser_on` before.
+Scans with any steps are decoded. ``configure(content=, first=, last=, cluster=)`` selects the steps
+that are requested.
 
 Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the reply of a URG-04LX to PP);
-UST-10LX/20LX, C-42-04076 (port); replies of a UST-10LX and a UTM-30LX-EW to PP, as printed by
-users, for their ranges and speed. Assumed: a UST-20LX and a UTM-30LX reply as a UTM-30LX-EW does,
-except for the shortest range of the UST-20LX; only a URG-04LX accepts SS, CR and HS, and it accepts
-neither ME nor GE. Several echoes are documented for the UTM-30LX-EW only.
+UST-10LX/20LX, C-42-04076 (port); replies of a UST-10LX and a UTM-30LX-EW to PP, published by users,
+for their ranges and speed. It is assumed that a UST-20LX and a UTM-30LX reply in the same way as a
+UTM-30LX-EW, except for the shortest range of the UST-20LX, that only a URG-04LX accepts SS, CR and
+HS, and that it accepts neither ME nor GE. Several echoes are documented for the UTM-30LX-EW only.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ UST = Geometry(1440, 0, 1080, 540, end=1080, rate=40.0, kinds=("distances", "int
 UTM = dataclasses.replace(UST, kinds=tuple(SCAN_COMMANDS))
 MAX_SHORT_RANGE_M = 4.095  # the highest distance of two characters
 ETHERNET = Tcp(10_940)
-#: Id -> model, geometry, range limits in m, link, status.
+#: The models by id: name, geometry, range limits in m, link, status.
 MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
     "hokuyo-urg04lx": ("URG-04LX", URG, (0.02, 5.6), Serial(19_200, 115_200), "manual"),
     "hokuyo-ust10lx": ("UST-10LX", UST, (0.02, 30.0), ETHERNET, "manual"),
@@ -71,7 +72,7 @@ def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
 
 @cache
 def make_frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
-    """Return all frames of a scanner, first the scans of this kind."""
+    """Return all frames of a scanner; the scans of the given kind come first."""
     kinds = sorted(geometry.kinds, key=lambda other: other != kind)
     scans = {
         f"{prefix}{content}": make_scan_frame(command, geometry)
@@ -89,8 +90,9 @@ def configure(
     Args:
         content: "distances", "intensities" (with distances), or "short" distances; for a
             UTM-30LX-EW also "echoes", up to three per step, and "echo_intensities".
-        first, last: the requested steps; -1 for the first and last that the scanner measures.
-        cluster: steps that are merged to one distance, 1 to 99.
+        first: the first requested step; -1 for the first step that the scanner measures.
+        last: the last requested step; -1 for the last step that the scanner measures.
+        cluster: the number of steps that are merged to one distance, 1 to 99.
 
     Raises:
         UsageError: if the scanner does not support these values.

@@ -1,8 +1,10 @@
-"""Commands and replies: an echo, a status and optional lines with a name and a value.
+"""Commands and their replies.
 
-Source: SCIP 2.0, C-42-03320B, section 8: BM, QT, RS, TM, SS, CR, HS, VV, PP, II. In the lines of
-VV, PP and II the check character covers the text before the semicolon. Commands end with a line
-feed. Commands are sent without the optional text that a scanner would repeat.
+A reply has an echo of the command, a status and optional lines with a name and a value. In the
+lines of VV, PP and II the check character covers the text before the semicolon. Commands end with a
+line feed. They are sent without the optional text that a scanner would repeat.
+
+Source: SCIP 2.0, C-42-03320B, section 8 (BM, QT, RS, TM, SS, CR, HS, VV, PP, II).
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ STATUS = (
     / Bytes(2)
     * "00: success; reply to BM, 02: the laser is already on; else an error code"
 )
-#: Values that a scanner reports: reply -> command, and the first four letters of each line by name.
+#: The values that a scanner reports, by reply: the command, and the first four letters of each line
+#: by name.
 REPORTED_VALUES: dict[str, tuple[bytes, dict[str, str]]] = {
     "version": (
         b"VV",
@@ -66,7 +69,7 @@ VALUE_REPLIES = {f"get_{name}": name for name in REPORTED_VALUES}
 
 @dataclass(frozen=True)
 class LineCheck(Checksum):
-    """Six bits of the sum of a line's characters, plus 30 (hexadecimal).
+    """The lowest six bits of the sum of a line's characters, plus 30 (hexadecimal).
 
     The semicolon at the end of the line is not part of the sum.
     """
@@ -123,8 +126,8 @@ def make_status_reply(
     Args:
         command: the letters of the command.
         fields: the fields of further lines.
-        size: characters of the command's argument.
-        line_sizes: characters of each further line.
+        size: the number of characters of the command's argument.
+        line_sizes: the number of characters of each further line.
     """
     value = ("value" / Bytes(size),) if size else ()
     wire = Lines(64, head=(len(command) + size, 2, *line_sizes), bare=1, check=Scip()) | SixBits()
@@ -188,8 +191,8 @@ def make_commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command
 
     Args:
         kind: a key of `SCAN_COMMANDS`.
-        steps: the requested steps: first, last and cluster size.
-        is_urg: whether it is a URG-04LX.
+        steps: the first step, the last step and the cluster size, as in a command.
+        is_urg: whether the scanner is a URG-04LX.
     """
     values = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
     commands = dict[str, Command]()

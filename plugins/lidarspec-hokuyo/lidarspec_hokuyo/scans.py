@@ -1,11 +1,13 @@
-"""Scans: distances of two or three characters, or distances with intensities; 1 or 3 echoes.
+"""Scans with distances of two or three characters, or with distances and intensities.
 
-Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors
-(8.1), GD and GS (8.2). ME and GE send a distance and an intensity of three characters each
-(UTM-30LX-EW, C-42-03886). ND, NE, HD and HE send the same for each echo of a step, with "&" between
-them (C-42-03886). A cluster of steps is sent as one distance, its shortest. Assumed: a last cluster
-of fewer steps is sent too, the direction of a cluster is that of its middle, and a step has at most
-three echoes (Hokuyo's urg_library has room for three).
+ME and GE request a distance and an intensity of three characters each. ND, NE, HD and HE request
+the same for each echo of a step, with "&" between echoes. A cluster of steps is sent as one
+distance, the shortest. It is assumed that a last cluster of fewer steps is sent as well, that the
+direction of a cluster is that of its middle, and that a step has at most three echoes, as in
+Hokuyo's urg_library.
+
+Source: SCIP 2.0, C-42-03320B, sections 5 (steps), 6 (characters), 8.1 (MD and MS, time, errors) and
+8.2 (GD and GS); UTM-30LX-EW, C-42-03886 (intensities and echoes).
 """
 
 from __future__ import annotations
@@ -47,12 +49,13 @@ class Geometry:
     """The steps and the rotation of a scanner.
 
     Attributes:
-        division: steps of a full revolution.
-        first, last: the first and the last step that it measures.
+        division: the number of steps of a full revolution.
+        first: the first step that the scanner measures.
+        last: the last step that the scanner measures.
         ahead: the step straight ahead.
-        end: the highest step of a request.
-        rate: revolutions per second.
-        kinds: the kinds of scans that it sends.
+        end: the highest step that can be requested.
+        rate: the revolutions per second.
+        kinds: the kinds of scans that the scanner sends.
     """
 
     division: int
@@ -74,14 +77,17 @@ class RequestedSteps:
 
     @property
     def text(self) -> bytes:
-        """The steps as in a command."""
+        """The steps in the form of a command."""
         return f"{self.first:04}{self.last:04}{self.cluster:02}".encode()
 
 
 def make_decimal(name: str, places: int, most: int = 9999) -> Any:
     """Return the struct of a decimal number with `places` digits, each a field.
 
-    The first digit is at most that of `most`, the largest number.
+    Args:
+        name: the name of the field.
+        places: the number of digits.
+        most: the largest number; the first digit is at most the first digit of this number.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
@@ -110,7 +116,7 @@ def split_digits(name: str, value: int, places: int) -> dict[str, int]:
 
 
 def cluster_size(f: Any) -> Any:
-    """Return the steps of a cluster; 00 means one."""
+    """Return the number of steps of a cluster; 00 means one step."""
     return two_digit_value(f.cluster) + (two_digit_value(f.cluster) == 0)
 
 
@@ -127,7 +133,7 @@ def plausible(f: Fields, end: int) -> Any:
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
     """Return points from the first step on, counter-clockwise.
 
-    A distance below the shortest is an error code or a missing echo, and invalid.
+    A value below the shortest distance is an error code or a missing echo; its point is invalid.
     """
     step = decimal_value(f.first) + f.points.index * cluster_size(f) + (cluster_size(f) - 1) / 2
     returns = f.points if echoes == 1 else f.points.echoes
@@ -143,7 +149,7 @@ def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
 
 @cache
 def make_scan_frame(command: str, geometry: Geometry) -> Frame:
-    """Return the frame of a scan, the reply to this command."""
+    """Return the frame of a scan, which is the reply to a command."""
     is_continuous = command[0] in "MN"
     echoes = MAX_ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]
@@ -182,7 +188,7 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
 def pace(f: Fields, rate: float) -> Any:
     """Return the seconds from a scan to the next, nan for single scans.
 
-    A command may leave out revolutions between scans (SCIP 2.0, 8.1).
+    A command may request that revolutions between scans are left out (SCIP 2.0, 8.1).
 
     Args:
         rate: revolutions per second.

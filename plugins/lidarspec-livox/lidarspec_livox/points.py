@@ -13,7 +13,8 @@ from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Int32sl,
 
 from lidarspec.spec import Cartesian, Fields, Imu, Polar, Scaled
 
-#: The field of view: azimuth of its right and left edge, elevation of its lower and upper, degrees.
+#: The field of view: the azimuths of its right and left edge, and the elevations of its lower and
+#: upper edge, degrees.
 View = tuple[float, float, float, float]
 SOF = "sof" / Const(b"\xaa")
 GRAVITY = 9.80665  # m/s2
@@ -39,18 +40,18 @@ INERTIAL = (
 
 
 def make_returns(count: int, *members: Any) -> Any:
-    """Return the array field that holds the `count` returns of one shot."""
+    """Return the array field with the `count` returns of one shot."""
     return "returns" / Array(count, Struct(*members, REFLECTIVITY, TAG))
 
 
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
-    """Return points from x, y and z on the wire, which are in REP-103 axes.
+    """Return points from the sent x, y and z, which are in REP-103 axes.
 
-    Three zeros mean no return.
+    A point without a return has three zeros.
 
     Args:
         f: the fields of n packets.
-        time: seconds of each shot after the packet's clock.
+        time: the time of each shot, in seconds after the packet's clock.
         returns: returns per shot.
         tagged: whether points have a tag.
     """
@@ -90,12 +91,12 @@ def imu(f: Fields) -> Imu:
 def simulated_angles(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
     """Return azimuth and elevation in degrees of simulated shots.
 
-    The real pattern never repeats and is not published: here a wave goes up and down 610 times a
-    second, and across 7.3 times.
+    The real pattern never repeats and is not published. The simulated pattern is a wave that moves
+    up and down 610 times a second, and across 7.3 times a second.
 
     Args:
-        shots: numbers of the shots since the start.
-        rate: shots per second.
+        shots: the numbers of the shots since the start.
+        rate: the number of shots per second.
         view: the field of view.
     """
     right, left, low, high = view

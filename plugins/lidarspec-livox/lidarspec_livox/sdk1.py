@@ -1,16 +1,16 @@
 """Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: generation 1 of the protocol (Livox-SDK).
 
-A Lidar broadcasts its identity once a second (`broadcast`, to port 55000). The host sends it the
-address for its data (`handshake`), and a `heartbeat` each second to keep the data coming. Point
-packets have neither checksum nor counter, so their length and header have to identify them. They do
-not contain the time from point to point either, which depends on the model.
+A Lidar broadcasts its identity once a second (`broadcast`, to port 55000). The host sends the
+address for the data (`handshake`), and a `heartbeat` each second, without which the Lidar stops
+sending data. Point packets have neither checksum nor counter, so they are identified by their
+length and header. The time from point to point depends on the model, and packets do not contain it.
 
 Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h)
 and livox_ros_driver (lds.h: packet sizes, points a second; it prints 9 bytes for a point of type 3,
-which has 10). Ranges and fields of view are assumed from memory of the user manuals. The documents
-do not state which model sends which type of data: each model accepts all types. Packet version 5 is
-assumed, because test vectors have it and drivers ignore it. Hubs are not supported, nor are the
-parameters of commands 0B to 0D.
+which has 10). Ranges and fields of view are assumed. The documents do not state which model sends
+which type of data, so all types are accepted for each model. Packet version 5 is assumed, because
+test vectors have it and drivers ignore it. Hubs and the parameters of commands 0B to 0D are not
+supported.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ CRC16 = Crc(16, 0x1021, init=0x9232, refin=True, refout=True)
 CRC32 = Crc(32, 0x04C11DB7, init=0xAFE50D95, refin=True, refout=True, xorout=0xFFFFFFFF)
 MAX_POSITION_M = 1000.0  # of the extrinsics: twice the range of the Tele-15
 GPS = 3  # the timestamp type of dates
-#: Livox SDK communication protocol 1.3.0, timestamp type.
+#: The types of timestamps (Livox SDK communication protocol 1.3.0).
 TIMESTAMP_TYPES = {
     0: ClockState("not synchronized", False, epoch="boot"),
     1: ClockState("synchronized by PTP", True),
@@ -78,7 +78,8 @@ COMMAND_PORT = 55_501
 DATA_PORT = 56_001
 IMU_PORT = 56_002  # of the host
 
-#: Parts that keep 64 bits of nanoseconds exact in float64, and can hold a date.
+#: The 64 bits of nanoseconds are split into parts that are exact in float64. They can also contain
+#: a date.
 TIMESTAMP = Struct(
     "low"
     / Int32ul
@@ -107,10 +108,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Return the time in seconds as four terms, from a date or from nanoseconds.
-
-    Each term is exact.
-    """
+    """Return four exact terms of the time in seconds, from a date or from nanoseconds."""
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high
@@ -128,7 +126,7 @@ def clock(f: Fields) -> tuple[Any, ...]:
 def has_known_header(f: Fields) -> Any:
     """Return whether timestamp type, slot and Lidar number are in their ranges.
 
-    Slot and number count the Lidars of a hub; a Lidar without a hub sends them too.
+    Slot and number identify a Lidar on a hub. A Lidar without a hub sends them as well.
     """
     return (f.timestamp_type <= 4) & (f.timestamp_type != 2) & (f.slot <= 15) & (f.lidar_id <= 15)
 
@@ -147,10 +145,7 @@ DATA_TYPES: dict[str, tuple[int, int, int, tuple[Any, ...]]] = {
 
 
 def pace(f: Fields, rate: float) -> Any:
-    """Return the seconds from a packet to the next.
-
-    `rate` is in shots per second.
-    """
+    """Return the seconds from each packet to the next, given the shots per second."""
     shots = np.zeros(max(kind for kind, *_ in DATA_TYPES.values()) + 1)
     for kind, count, _, _ in DATA_TYPES.values():
         shots[kind] = count
@@ -230,7 +225,7 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
 
     Args:
         packet_type: `REQUEST`, `REPLY` or `NOTIFICATION`.
-        number: command set and id; None for frames of several commands.
+        number: the command set and id; None for the frames of several commands.
         members: the data.
     """
     header = Struct(
@@ -367,12 +362,12 @@ def make_command(
 
 
 def make_setter(number: tuple[int, int], low: int, high: int) -> Command:
-    """Return a command that sets something to a number."""
+    """Return a command that sets a setting to a number."""
     return make_command("set", number=number, args={"number": ("number", low, high)})
 
 
 def make_getter(number: tuple[int, int]) -> Command:
-    """Return a command that requests a number."""
+    """Return a command that requests the number of a setting."""
     return make_command("ask", "number", number)
 
 

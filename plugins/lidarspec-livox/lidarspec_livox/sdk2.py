@@ -1,17 +1,18 @@
 """Livox Mid-360 and HAP: generation 2 of the protocol (Livox-SDK2).
 
-Points, IMU samples and parameters come over UDP, each from and to its own port. A Lidar that is
-sampling (`start`) sends points to the host set with `set_point_host`. It sends its parameters once
-a second without a request. Some firmware of the Mid-360 is reported to leave the CRC of point
-packets 0: such packets are accepted without a check.
+Points, IMU samples and parameters are sent over UDP, each from and to its own port. After `start`,
+a Lidar sends points to the host that was set with `set_point_host`. It sends its parameters once a
+second without a request. Some firmware of the Mid-360 is reported to send point packets with a CRC
+of 0. Such packets are accepted without a check.
 
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP
 protocol document 1.4.8 where they differ. Rate, ranges and view of the HAP are from its user
 manual, table 1.2.1; those of the Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by
-the number of points, the document by one less: this module follows the driver, a difference of 1 %.
-The HAP is assumed to accept the commands of a Mid-360, because the SDK sends it the same. The port
-for its state is unknown, so its state is not requested. Commands for logs and firmware are not
-supported. Parameters with unknown keys are passed on as bytes.
+the number of points, and the document divides it by this number minus 1, a difference of 1 %. This
+module follows the driver. The HAP is assumed to accept the commands of a Mid-360, because the SDK
+sends the same commands to both. The port for the state of a HAP is unknown, so its state is not
+requested. Commands for logs and firmware are not supported. Parameters with unknown keys are
+returned as bytes.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ IMU_RATE_HZ = 200
 DEVICE_TYPES = {"MID-360": 9, "HAP, industrial": 10, "HAP": 15, "MID-360S": 35}
 
 
-#: Mid-360 protocol document, point data, time_type.
+#: The types of timestamps (Mid-360 protocol document, point data, time_type).
 TIME_TYPES = {
     0: ClockState("not synchronized", False, epoch="boot"),
     1: ClockState("synchronized by PTP or gPTP", True),
@@ -161,8 +162,8 @@ def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: boo
     Args:
         cmd_id: the command; None for frames of several commands.
         members: the data.
-        ack: whether it is a reply.
-        lidar: whether the Lidar sends it.
+        ack: whether the message is a reply.
+        lidar: whether the Lidar sends the message.
     """
     header = Struct(
         SOF,
@@ -296,12 +297,12 @@ def make_set_frame(*values: Any) -> Frame:
 
 
 def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simulation:
-    """Return a simulated Lidar.
+    """Return the simulation of a Lidar.
 
     Args:
-        rate: shots per second.
+        rate: the number of shots per second.
         view: the field of view.
-        shots: the shot numbers of a packet.
+        shots: the numbers of the shots in a packet.
         more: further arguments of `Simulation`.
     """
     points = len(shots)
@@ -470,7 +471,7 @@ def make_setter(
         frame: the frame of the request.
         name: a key of `PARAMETERS`.
         values: fixed values by their field in the parameter.
-        args: ranges of arguments by their field in the parameter.
+        args: the ranges of arguments, by their field in the parameter.
         more: further arguments of `Command`.
     """
     all_values = {
@@ -642,9 +643,9 @@ def make_lidar(name: str) -> Sensor:
 
 
 def is_fast(f: Fields) -> Any:
-    """Return whether points follow each other in 2.2 us, as with a HAP.
+    """Return whether the time between points is about 2.2 us, as in packets of a HAP.
 
-    A HAP measures 452 000 points a second, a Mid-360 200 000.
+    A HAP measures 452,000 points a second, and a Mid-360 200,000.
     """
     return f.time_interval < 3.3e-6 * f.dot_num
 

@@ -1,17 +1,17 @@
-"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars, high byte first.
+"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars with a UART.
 
-They send over a UART. The C16 is in `c16`.
+Numbers have the high byte first. The C16 is in `c16`.
 
 Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
-lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a sum;
-packets of the M10 family have no checksum, only marks at both ends. The value called speed in the
-older driver is the time of 15 degrees in microseconds: 4167 at 10 revolutions a second, and 3460 to
+lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a sum.
+Packets of the M10 family have no checksum, only marks at both ends. The value that the older driver
+calls speed is the time of 15 degrees in microseconds: 4167 at 10 revolutions a second, and 3460 to
 3490 for an M10P at 12.
 
-Known contradictions: angles are clockwise in the older driver and in this module, counter-clockwise
-in the newer driver. Both drivers spread the samples of an M10 over 15 degrees by the number of
-samples that are not FFFF, which gives the same result if no sample is FFFF. The meaning of bytes
-103 and 104 of an N10P is not documented.
+Angles are clockwise in the older driver and in this module, but counter-clockwise in the newer
+driver. For an M10, both drivers divide 15 degrees by the number of samples that are not FFFF; this
+module divides it by the number of all samples. The meaning of bytes 103 and 104 of an N10P is not
+documented.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ CLOCK = Clock(
 
 
 def make_packet(size: Construct, samples: Construct, *rest: Construct) -> Frame:
-    """Return the frame of a packet of the N family: 16 samples between two angles."""
+    """Return the frame of a packet of the N family, with 16 samples between two angles."""
     struct = Struct(
         "header" / START,
         "size" / size,
@@ -123,7 +123,10 @@ def mask_no_return(distance: Any) -> Any:
 
 
 def sample_directions(f: Fields) -> tuple[Any, Any]:
-    """Return azimuths in radians and seconds after the first sample, of the N family."""
+    """Return the azimuths and times of the samples of the N family.
+
+    Azimuths are in radians, and times are in seconds after the first sample.
+    """
     clockwise = spread(f.start_angle, f.end_angle, N_SAMPLES, full=360.0)  # degrees, (n, 16)
     return -np.deg2rad(wrap(clockwise, 360.0)), (clockwise - f.start_angle) / SPAN_DEG * f.period
 
@@ -140,7 +143,7 @@ def n10_points(f: Fields) -> Polar:
 
 
 def n10p_points(f: Fields) -> Polar:
-    """Return points as of an N10, with two returns of each sample."""
+    """Return points as for an N10, with two returns of each sample."""
     azimuth, time = sample_directions(f)
     return Polar(
         range=stack(mask_no_return(f.samples.first), mask_no_return(f.samples.second)),
@@ -152,10 +155,10 @@ def n10p_points(f: Fields) -> Polar:
 
 
 def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
-    """Return points at even steps through 15 degrees from the start angle on.
+    """Return points at even steps over 15 degrees from the start angle on.
 
-    Strongly reflecting points have the intensity 255, as in the driver. `count` returns the samples
-    of a packet.
+    Strongly reflecting points have the intensity 255, as in the driver. The function `count`
+    returns the number of samples of a packet.
     """
     samples = count(f)
     clockwise = spread(
@@ -191,7 +194,7 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     Args:
         i: the number of the packet.
         hertz: revolutions per second.
-        count: samples of a packet that contains its length; 0 for other packets.
+        count: the number of samples of a packet that contains its length; 0 for other packets.
         timed: whether packets have a time.
     """
     seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS_PER_TURN)), 1_000_000)
@@ -303,11 +306,11 @@ class Model:
     Attributes:
         name: the name of the model.
         data: the frame of its packets.
-        points: its points function.
-        sweep: its simulated values.
+        points: its `points` function.
+        sweep: the function that returns simulated values.
         baud: the baud rate.
-        hertz: the lowest and the highest revolutions per second.
-        clock: its clock.
+        hertz: the lowest and the highest number of revolutions per second.
+        clock: the clock.
         status: the status of the sensor.
     """
 
@@ -353,8 +356,8 @@ MODELS = {
 def make_lidar(name: str) -> Sensor:
     """Return the sensor of one row of `MODELS`.
 
-    The lidars rotate as soon as they have power. They are not stopped on closing, because drivers
-    rely on that.
+    The lidars rotate as soon as they have power. They are not stopped when the device is closed,
+    because drivers expect them to rotate.
     """
     model = MODELS[name]
     family = name.startswith("lslidar-n")

@@ -3,15 +3,16 @@
 Numbers have the low byte first.
 
 Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
-manual of the C32 for the offsets of the device information. The times of the lasers are 3.125 us
-apart, as for the edition before, which agrees with the steps of 0.36 degrees of a captured packet
-at 20 revolutions a second. Firings end at the time of their packet, as in the driver.
+manual of the C32 for the offsets of the device information. The lasers fire at intervals of 3.125
+us, as in the previous edition. This agrees with the steps of 0.36 degrees in a captured packet at
+20 revolutions a second. The last firing of a packet is at the time of the packet, as in the driver.
 
-The clock is read as with GPS: date and nanoseconds. With PTP the same bytes are seconds, with NTP
-the last part has microseconds; only the device information contains the time source. A C16 of the
-edition before sends packets of 1206 bytes, which equal a Velodyne's except for their angles: they
-are not supported. Not supported either: configuration, for which the whole device information is
-sent back, and angles that a unit measured itself.
+The clock is read as a date and nanoseconds, which the sensor sends with GPS. With PTP the same
+bytes are seconds, and with NTP the last part has microseconds; only the device information contains
+the time source. A C16 of the previous edition sends packets of 1206 bytes, which are the same as
+those of a Velodyne except for their angles. They are not supported. Configuration, for which the
+whole device information is sent back, and angles that a unit has measured itself are not supported
+either.
 """
 
 from __future__ import annotations
@@ -123,8 +124,8 @@ def plausible(f: Fields) -> Any:
 def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
     """Return points clockwise from ahead, with azimuths interpolated between blocks.
 
-    The optical centre rotates with the lasers at a distance from the axis. `unit` is the distance
-    step in centimetres.
+    The optical centre is at a distance from the axis and rotates with the lasers. `unit` is the
+    distance step in centimetres.
     """
     dual = f.return_mode == DUAL
     block = np.arange(BLOCKS)[:, None, None]
@@ -150,7 +151,7 @@ def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds of the blocks of a packet.
+    """Return the time that the blocks of a packet take, seconds.
 
     With dual return, two blocks are one firing.
     """
@@ -158,7 +159,7 @@ def pace(f: Fields) -> Any:
 
 
 def block_step(f: Fields, dual: Any) -> Any:
-    """Return the degrees from each block's azimuth to the next azimuth."""
+    """Return the degrees from the azimuth of each block to the next azimuth."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2), following(azimuth))
     return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * BLOCK_PERIOD_S)

@@ -2,13 +2,14 @@
 
 Source: the drivers xv_11_laser_driver, kaiaai/LDS (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and
 hls_lfcd_lds_driver of ROBOTIS; there are no public manuals. The XV-11 and Xiaomi's LDS01RR count
-counter-clockwise, the LDS02RR clockwise; the packets do not contain the direction. The host drives
-their motors with PWM, at 5 revolutions a second; they send nothing while the motor is off.
+angles counter-clockwise, and the LDS02RR counts them clockwise; the packets do not contain the
+direction. The host drives their motors with PWM, at 5 revolutions a second; they send nothing while
+the motor is off.
 
-Known contradictions on the HLS-LFCD2: its speed is in tenths of a revolution per minute (ROBOTIS,
-thijses/HLS_LFCD) or in whole ones (kaiaai). Its last two bytes are both FF minus the sum of the
-other bytes (thijses), or the folded sum of an XV-11 (kaiaai). ROBOTIS ignores them, and so does
-this module: it requires two consecutive packets instead.
+The sources disagree about the HLS-LFCD2. Its speed is in tenths of a revolution per minute
+(ROBOTIS, thijses/HLS_LFCD) or in whole revolutions per minute (kaiaai). Its last two bytes are both
+FF minus the sum of the other bytes (thijses), or the folded sum of an XV-11 (kaiaai). ROBOTIS
+ignores these bytes. This module ignores them as well, and requires two consecutive packets instead.
 """
 
 from __future__ import annotations
@@ -100,14 +101,14 @@ def plausible(f: Fields) -> Any:
 
 
 def is_lfcd_plausible(f: Fields) -> Any:
-    """Return whether the start angle fits, and the speed is at most twice the usual."""
+    """Return whether the start angle is valid, and the speed at most twice the usual speed."""
     return (f.start_angle >= 0) & (f.start_angle < 360) & (f.speed <= 600)
 
 
 def sample_times(f: Fields, count: int) -> Any:
     """Return the seconds from the first sample of a packet to each sample.
 
-    Samples are one degree apart. The result is 0 if the motor stops.
+    Samples are one degree apart. The result is 0 if the motor does not rotate.
     """
     return np.where(f.speed > 0, np.arange(count) / (np.maximum(f.speed, 1 / 64) * 6), 0)
 

@@ -1,14 +1,14 @@
 """Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP.
 
-Layout and directions come with the unit's metadata, from a file, `configure(metadata=path)`, or
-from the sensor's web server when the sensor is opened. Without metadata a layout can be given
-(`rows`, `turn`, `profile`). The angles are then those of an ideal sensor, evenly spread over its
-field of view, and marked as nominal.
+The layout of packets and the directions of beams are read from the metadata of the unit, which are
+in a file (`configure(metadata=path)`), or are requested from the sensor's web server when the
+sensor is opened. Without metadata a layout can be given (`rows`, `turn`, `profile`). The angles are
+then those of an ideal sensor, evenly spread over its field of view, and marked as nominal.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
 (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
-OS2, are those of the data sheets and of one captured unit each; the range limits are from the data
-sheets, for bright targets.
+OS2, are from the data sheets and from one captured unit of each model. The range limits are from
+the data sheets, for bright targets.
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ MODELS = {
     "OS2": ("OS-2", -11.25, 11.25, 13.762, 74.296, (0.8, 500.0)),
     "OSDome": ("OS-DOME", 0.0, 90.0, 0.0, 36.18, (0.3, 45.0)),
 }
-#: Pixel fields that become extra columns.
+#: The pixel fields that become columns in `extra`.
 EXTRA_FIELDS = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
 METADATA_ONLY = "identical packets; see the model in the metadata"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Return the points of the pixels by the tables of the unit.
+    """Return the points of the pixels, calculated with the tables of the unit.
 
-    Two returns of a pixel are next to each other.
+    Two returns of a pixel are adjacent.
     """
     columns = f.columns
     bits = PROFILES[unit.profile]
@@ -211,13 +211,13 @@ def configure(
 
     Args:
         metadata: the unit's JSON file, as its web server returns it at /api/v1/sensor/metadata.
-        rows: pixels per column, 16 to 128.
-        turn: columns per revolution, 512 to 4096.
-        profile: how pixels are packed, RNG19_RFL8_SIG16_NIR16 and others.
+        rows: the number of pixels per column, 16 to 128.
+        turn: the number of columns per revolution, 512 to 4096.
+        profile: the packing of pixels, such as RNG19_RFL8_SIG16_NIR16.
 
     Raises:
-        UsageError: if the metadata cannot be read or are of another model, or the layout does not
-            exist.
+        UsageError: if the metadata cannot be read or belong to another model, or if the layout does
+            not exist.
     """
     arguments = {"rows": rows, "turn": turn, "profile": profile}
     arguments = {name: value for name, value in arguments.items() if value is not None}
@@ -254,7 +254,7 @@ def configure(
     return apply_unit(sensor, make_nominal_unit(sensor.model, **layout))
 
 
-#: The default layout: few rows make a simulation fast.
+#: The default layout, which has few rows so that a simulation is fast.
 DEFAULT_LAYOUT: dict[str, Any] = {"rows": 16, "turn": 1024, "profile": "RNG19_RFL8_SIG16_NIR16"}
 HTTP = {
     "ask": Frame(HttpRequest, direction="out", max_length=65_536),

@@ -64,13 +64,14 @@ class Unit:
     """One sensor as described by its metadata.
 
     Attributes:
-        profile: how its pixels are packed, a key of `PROFILES`.
-        turn: columns per revolution.
-        columns: columns per packet.
-        window: the first and the last column that it sends.
-        rate: revolutions per second; 0 if unknown.
-        elevation, azimuth: (rows,) degrees of each beam; azimuth is clockwise.
-        shifts: (rows,) columns by which each row lags behind in a picture:
+        profile: the packing of pixels, a key of `PROFILES`.
+        turn: the number of columns per revolution.
+        columns: the number of columns per packet.
+        window: the first and the last column that the sensor sends.
+        rate: the number of revolutions per second; 0 if unknown.
+        elevation: (rows,) the elevation of each beam in degrees.
+        azimuth: (rows,) the azimuth of each beam in degrees, clockwise.
+        shifts: (rows,) the number of columns by which each row is shifted in an image, for
             `PointCloud.destagger`.
         beam, lidar, imu: transforms (4, 4) with millimetres: from beam to lidar, from lidar to
             sensor, and from IMU to sensor.
@@ -99,15 +100,15 @@ class Unit:
 
     @property
     def rows(self) -> int:
-        """Pixels per column."""
+        """The number of pixels per column."""
         return len(self.elevation)
 
     def compute_beams(self) -> tuple[Table, Table]:
-        """Return the direction of each pixel's beam and the point where it begins.
+        """Return the direction of each pixel's beam, and its starting point.
 
         Returns:
-            directions: (turn, rows, 3) unit vectors.
-            starts: (turn, rows, 3) metres, the points at range 0.
+            The directions, (turn, rows, 3) unit vectors, and the points at range 0, (turn, rows, 3)
+            metres.
         """
         encoder = 2 * np.pi * (1 - np.arange(self.turn) / self.turn)[:, None]
         azimuth = encoder - np.deg2rad(self.azimuth)
@@ -159,7 +160,7 @@ def read_unit(metadata: str | Path | Learned) -> Unit:
     """Return the unit described by a file or by the sensor itself.
 
     Raises:
-        UsageError: if it cannot be read, or a key that the points need is missing.
+        UsageError: if the metadata cannot be read, or lack a key that the points need.
     """
     name = "the sensor's metadata" if isinstance(metadata, Learned) else str(metadata)
     try:
@@ -212,7 +213,7 @@ class MetadataKeys:
         """Return the unit.
 
         Raises:
-            UsageError: if a key is missing or has an impossible value.
+            UsageError: if a key is missing or has an invalid value.
         """
         elevation = self._read_numbers("beam_altitude_angles", None)
         rows = len(elevation)
@@ -307,7 +308,7 @@ class MetadataKeys:
         return number
 
     def _read_transform(self, key: str, default: tuple[float, ...] | None) -> Any:
-        """Return a matrix (4, 4) from 16 numbers in one list or in four.
+        """Return a matrix (4, 4) from 16 numbers in one list or in four lists.
 
         Returns None if both the key and the default are missing.
         """

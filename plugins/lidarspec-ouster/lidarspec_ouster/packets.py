@@ -5,11 +5,13 @@ All values are little-endian.
     header | 16 columns: column header, H pixels, column footer | footer
     (LEGACY has no header and no footer)
 
-The metadata, not the packets, contain the number of pixels per column and their packing.
+The number of pixels per column and their packing are in the metadata of the unit, not in the
+packets.
 
 Source: ouster-sdk, parsing.cpp. The bits of LEGACY, RNG19 (single and dual) and RNG15 are verified
-with captures: each field has the MD5 of the vendor's digests. Those of FUSA are verified with one
-captured packet. The other profiles, and the IMU packets with NMEA, follow the source code only.
+with captures by the MD5 digests that the vendor publishes for each field. The bits of FUSA are
+verified with one captured packet. The other profiles, and the IMU packets with NMEA, are taken from
+the source code only.
 """
 
 from __future__ import annotations
@@ -114,7 +116,7 @@ ENCODER_COUNTS_PER_TURN = 90_112
 LIDAR = 1  # packet type
 IMU = 2  # packet type
 GRAVITY = 9.80665  # m/s2, one g of the IMU
-#: CRC values of firmware without a CRC: of 2.2, and of 2.3 up to 3.1.
+#: The values in place of a CRC that firmware 2.2, and firmware 2.3 to 3.1, send.
 ABSENT_CRCS = (0, 0xDEADBEEF0000C0DE)
 ONES = (1 << 64) - 1
 CRC = Crc(64, 0x42F0E1EBA9EA3693, init=ONES, refin=True, refout=True, xorout=ONES)  # CRC-64/XZ
@@ -146,7 +148,7 @@ FOOTER = ("reserved_footer" / Bytes(24), "crc" / Int64ul)
 
 
 def packet_bytes(profile: str, rows: int, columns: int = COLUMNS) -> int:
-    """Return the bytes of a lidar packet."""
+    """Return the size of a lidar packet in bytes."""
     header, column = (0, 20) if profile == "LEGACY" else (64, 12)
     return header + columns * (column + rows * sum(PROFILES[profile].values()) // 8)
 
@@ -163,8 +165,8 @@ def make_pixel(profile: str) -> Construct:
 def make_field(name: str, bits: int) -> Construct:
     """Return the type of a pixel's field.
 
-    Ranges of 15 bits have steps of 8 mm, others of 1 mm; near-infrared of 8 bits lacks its low 4
-    bits.
+    Ranges of 15 bits have steps of 8 mm, and all other ranges have steps of 1 mm. A near-infrared
+    value of 8 bits lacks its low 4 bits.
     """
     if name.startswith("range"):
         return Scaled(BitsInteger(bits), 0.008 if bits == 15 else 0.001, "m")
@@ -226,9 +228,9 @@ def is_plausible(f: Fields, turn: int) -> Any:
 
 
 def is_legacy_plausible(f: Fields, turn: int) -> Any:
-    """Return whether a LEGACY packet is plausible: also status, encoder and frame id.
+    """Return whether columns, status, encoder and frame id of a LEGACY packet are valid.
 
-    These packets have no type, so stricter rules distinguish them from noise.
+    These packets have no type, so more rules are needed to distinguish them from other data.
     """
     columns = f.columns
     has_known_status = (columns.status == VALID) | (columns.status == 0)
@@ -303,8 +305,8 @@ def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
     """Return the IMU measurements in the axes of the sensor: rad/s, m/s2 and seconds.
 
     Args:
-        path: array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single one of a
-            LEGACY packet.
+        path: the array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single
+            measurement of a LEGACY packet.
         rotation: rotation from the IMU to the sensor.
     """
     if path:
@@ -320,7 +322,7 @@ def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
 
 
 def rotate(rotation: Rotation, vector: Any) -> tuple[Any, ...]:
-    """Return a rotated vector of columns."""
+    """Return a vector of columns after rotating it."""
     parts = list(vector)
     return tuple(
         sum(weight * part for weight, part in zip(row, parts, strict=True) if weight)

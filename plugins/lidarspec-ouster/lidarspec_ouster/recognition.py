@@ -1,11 +1,12 @@
-"""Recognition of the layout of packets, which do not contain it.
+"""Recognize the layout of packets from their content, because they do not declare it.
 
 Several layouts have the same packet length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. If a
-layout has too many pixels, every other or every fourth range is another field, so the mean ranges
-of four adjacent rows differ. Among layouts with equally many pixels, the first of `PROFILES` with
-unused bits that are 0 in most pixels is used; some layouts cannot be distinguished. The columns per
-revolution follow from the encoder in LEGACY. In other profiles they follow from the largest column
-number and the time from column to column, at ten revolutions a second, the factory setting.
+layout with too many pixels is tried, every other or every fourth range is really another field, so
+the mean ranges of four adjacent rows differ. Of layouts with equally many pixels, the first one in
+`PROFILES` is used whose unused bits are 0 in most pixels. Some layouts cannot be distinguished. In
+LEGACY, the number of columns per revolution is determined from the encoder. In other profiles, it
+is estimated from the largest column number and the time between columns, assuming ten revolutions a
+second, which is the factory setting.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ ROW_COUNTS = (16, 32, 64, 128)
 COLUMNS_PER_TURN = (512, 1024, 2048, 4096)
 MAX_EXAMINED_PACKETS = 256
 FACTORY_TURN_NS = 100_000_000  # ten revolutions a second
-#: Maximum share of pixels with unused bits set; a captured OS2 stays below.
+#: The maximum share of pixels with unused bits set; a captured OS2 is below it.
 MAX_UNUSED_SHARE = 0.1
 Bytes2D = NDArray[np.uint8]
 
 
 def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
-    """Return the options of `configure` that fit most of the datagrams.
+    """Return the options of `configure` with which most of the datagrams are valid.
 
     Returns {} if the datagrams are not lidar packets.
     """
@@ -92,7 +93,7 @@ def estimate_turn(columns: Bytes2D, profile: str) -> int:
 
 
 def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
-    """Return the columns, (n * 16, bytes), or None if their headers do not fit."""
+    """Return the columns, (n * 16, bytes); None if their headers are not valid."""
     has_header = profile != "LEGACY"
     if has_header and not (packets[:, 0] == 1).all():
         return None
@@ -114,9 +115,10 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 
 
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
-    """Return the smallest mean range of rows modulo four, divided by the largest.
+    """Return a measure of the similarity of every fourth row, from 0 to 1.
 
-    The result is -1 if unused bits are set in many pixels.
+    It is the smallest mean range of the rows with one remainder modulo four, divided by the
+    largest. It is -1 if unused bits are set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]
