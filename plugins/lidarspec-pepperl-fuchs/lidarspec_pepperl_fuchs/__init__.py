@@ -64,18 +64,19 @@ KNOWN_HEADER_BYTES = (60, 76)
 HEADER_SIZES = range(MIN_HEADER_BYTES, 129, 4)
 #: An Ethernet frame without the headers of IP and UDP; 1404 bytes are the usual maximum.
 MAX_PACKET_BYTES = 1472
-#: Lower amplitudes are the codes of errors (packet_structure.h).
+#: Amplitudes below this are error codes (packet_structure.h).
 MIN_AMPLITUDE = 32
 #: The distance without an echo (pf_data_publisher.cpp); packets of type C have 20 bits.
 NO_ECHO = 0xFFFFFFFF
 NO_ECHO_20_BITS = 0xFFFFF
 MM = 0.001  # m
-#: Simulated scanner: samples a scan, packets a scan, scans a second, amplitude.
+#: The samples per scan, packets per scan, scans per second and amplitude of a simulated scanner.
 SAMPLES = 1440
 PACKETS = 8
 SCAN_RATE_HZ = 20
 SIMULATED_AMPLITUDE = 500
-#: Seconds between two `feed_watchdog`; the output ends after 60 (r2000_params.yaml).
+#: The seconds between two commands `feed_watchdog`; without them, the output ends after 60 seconds
+#: (r2000_params.yaml).
 FEED_INTERVAL_S = 20.0
 
 SAMPLES_BY_TYPE: Mapping[str, Construct] = {
@@ -124,7 +125,7 @@ def make_packet(letter: str) -> Construct:
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether sizes, counts and angles are possible."""
+    """Return whether sizes, counts and angles are valid."""
     return (
         (f.packet_number >= 1)
         & (f.num_points_scan >= 1)
@@ -141,9 +142,9 @@ def sample_interval(f: Fields) -> Any:
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds since the packet before, which may belong to the last revolution.
+    """Return the seconds since the previous packet, which may be of the last revolution.
 
-    All packets of a scan but the last have the same number of samples.
+    All packets of a scan except the last have the same number of samples.
     """
     interval = sample_interval(f)
     samples_before = f.first_index / np.maximum(f.packet_number - 1, 1)
@@ -210,7 +211,7 @@ def make_data_frame(letter: str) -> Frame:
     )
 
 
-#: The first type is the one that is asked for.
+#: The first type is requested by default.
 DATA_FRAMES = {f"packet_{letter.lower()}": make_data_frame(letter) for letter in "CBA"}
 HTTP_FRAMES = {
     "ask": Frame(HttpRequest, direction="out", max_length=4096),
@@ -219,7 +220,7 @@ HTTP_FRAMES = {
 
 
 def read_reply(reply: Any) -> dict[str, Any]:
-    """Return the handle and the port of a reply, if it has them.
+    """Return the handle and the port in a reply; both may be missing.
 
     Raises:
         ValueError: if the scanner reports an error.
@@ -311,7 +312,8 @@ def configure(
 ) -> Sensor:
     """Return the sensor for packets of this type over UDP or TCP.
 
-    Type A has distances, B and C have amplitudes as well; a sample of B has 6 bytes, of C 4.
+    Packets of type A have distances. Packets of types B and C have distances and amplitudes; a
+    sample has 6 bytes in B and 4 bytes in C.
     """
     first = f"packet_{packet.lower()}"
     frames = {first: sensor.frames[first], **sensor.frames}

@@ -2,11 +2,11 @@
 
 Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h,
 data_packet_parser_00.cpp, data_packet_parser_04.cpp, data_packet_parser_m_series.h). In the client,
-the time of a packet is the time of its last firing. Assumed: evenly spaced firings at 420 000
-points a second, the range limits, and the revolutions per second. The positions show the direction
-of rotation: they may decrease as well as increase. The nanoseconds of packets before version 4
-count tens of nanoseconds, which is not corrected here. Packets of other kinds (1 and 6) and
-settings over HTTP are not supported. No captured packet was available.
+the time of a packet is the time of its last firing. It is assumed that firings are evenly spaced,
+with 420,000 points a second; range limits and revolutions per second are assumed as well. The
+positions increase or decrease with the direction of rotation. The nanoseconds of packets before
+version 4 are in units of ten nanoseconds, which is not corrected here. Packets of other kinds (1
+and 6) and settings over HTTP are not supported. No captured packet was available.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FINE_STEP_VERSION = (
     5  # the first version of packets with steps of 10 um; before it they are of 10 mm
 )
 FIRING_PERIOD_S = LASERS / 420_000
-#: Seconds from the time of the packet to each firing.
+#: The seconds from the time of the packet to each firing.
 FIRING_TIMES_S = (np.arange(FIRINGS) - (FIRINGS - 1)) * FIRING_PERIOD_S
 
 #: Elevation in radians, from the lowest laser to the highest.
@@ -118,8 +118,8 @@ def plausible(f: Fields) -> Any:
 def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
     """Return three returns of each laser.
 
-    If a laser has fewer, the packet repeats the first or second distance as the third. The return
-    that equals the third is then not a point, so that it is not counted twice.
+    If a laser has fewer returns, the packet repeats the first or second distance as the third. The
+    first or second return is then left out, so that it is not counted twice.
 
     `elevation` is in radians, one per laser.
     """

@@ -1,18 +1,18 @@
 """RoboSense Airy: rotating lidar of 96 lasers from the horizon to the zenith over UDP, with an IMU.
 
-Two blocks of 48 lasers share an azimuth, the first with the lower half of the lasers; with dual
-return two such pairs do.
+A pair of blocks of 48 lasers has one azimuth. The first block has the lower half of the lasers.
+With dual return, two such pairs have one azimuth.
 
 Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C
 (registers of DIFOP). From the vendor's rs_driver (decoder_RSAIRY.hpp): the optical centre, firing
 times that depend on how the sensor is mounted, the bits of a distance, dual return, and the time in
 a packet of the IMU.
 
-Contradictions: in the manual's formula x has the sine of the azimuth and the sensor turns towards
-y. In rs_driver x has its cosine and y its negative sine, as for all models; this module follows
-rs_driver. Assumed: the integers of the IMU are big-endian, as all others are; the order of blocks
-with dual return, which rs_driver derives from their position only. Models of 48 and 192 lasers
-(bytes 1 and 3) send other packets, which are not accepted.
+The sources disagree about the axes. In the manual's formula, x is proportional to the sine of the
+azimuth. In rs_driver, x is proportional to the cosine and y to the negative sine, as for all
+models. This module follows rs_driver. It is assumed that the integers of the IMU are big-endian, as
+all others are, and that blocks with dual return have the order that rs_driver derives from their
+position. Models of 48 and 192 lasers (bytes 1 and 3) send other packets, which are not accepted.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ GRAVITY = 9.80665
 def make_firing_times(*times: float) -> Any:
     """Return the seconds from the azimuth to each laser's firing, (blocks, lasers).
 
-    `times` are microseconds of groups of eight lasers in a pair of blocks.
+    `times` has the microseconds of each group of eight lasers in a pair of blocks.
     """
     return np.tile(np.repeat(times, 8).reshape(2, HALF_LASERS), (BLOCKS // 2, 1)) * 1e-6
 
@@ -204,7 +204,7 @@ def is_plausible_imu(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return the points of 96 lasers in pairs of blocks, the upper half in the second."""
+    """Return the points of 96 lasers; the second block of a pair has the upper half."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
     difop = f.state.difop
@@ -239,7 +239,7 @@ def points(f: Fields) -> Polar:
 
 
 def imu(f: Fields) -> Imu:
-    """Return the IMU sample; a step is 1/32768 of the range in the packet (Table 13)."""
+    """Return the IMU sample; a raw step is 1/32768 of the range in the packet (Table 13)."""
     acceleration_step = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
     rotation_step = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)
     return Imu(
@@ -253,7 +253,7 @@ def imu(f: Fields) -> Imu:
 
 
 def sweep_data(i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i: four azimuths, of two blocks each."""
+    """Return the values of simulated packet i, with four azimuths of two blocks each."""
     values = rotation_values(i, BLOCKS // 2, ROTOR.period, packet_count=i % (1 << 32))
     return {**values, "blocks.azimuth": np.repeat(values["blocks.azimuth"], 2)}
 

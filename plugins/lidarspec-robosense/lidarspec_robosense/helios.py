@@ -1,6 +1,6 @@
 """RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP.
 
-A unit's own angles come with the device information (DIFOP).
+The angles of a unit are in its device information (DIFOP).
 
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
@@ -8,19 +8,19 @@ decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, offset of t
 angles, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its lasers,
 which reproduce the azimuths of its published point clouds to the last digit.
 
-Known errors and contradictions: the manual's worked distance, 320 steps of 0.25 cm, is printed as 8
-m and is 0.8 m; its vertical angle 00 05 d6, printed as 14.95 degrees, is 14.94, and its horizontal
-one, 01 01 96, needs brackets (-4.06). Appendix B.13 has nanoseconds in the second part of a time,
-Table 9 and the capture have microseconds. The manual of the Helios-1610 has the type at byte 31,
-rs_driver and the capture at 30. In rs_driver the second firing of a 16P is 27.68 us after the
-first; the manual's azimuth in between (half the step) and about 100 us from block to block require
-55.56 us. The times of 32 lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and others, up
-to 48 us.
+The manual has errors. Its example of a distance, 320 steps of 0.25 cm, is 0.8 m and not 8 m. Its
+vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the result for its horizontal angle 01
+01 96 is -4.06 degrees. The second part of a time is in nanoseconds in appendix B.13, but in
+microseconds in Table 9 and the capture. The type is at byte 31 in the manual of the Helios-1610,
+but at byte 30 in rs_driver and the capture. In rs_driver, the second firing of a 16P is 27.68 us
+after the first. According to the manual, its azimuth is half a step further, and blocks are about
+100 us apart, which requires 55.56 us. The times of 32 lasers are from rs_driver, 1.73 us apart;
+nebula has other times, up to 48 us.
 
-The published capture named after the 16P has type 6, Helios-5515, and its DIFOP has 32 different
-angles, at single return: it is of a 5515. Decoded as 16P, as it was published, the second half of
-each block gets directions of the wrong lasers, and the times of a packet take twice as long as the
-packet.
+The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its
+DIFOP has 32 different angles with single return. If it is decoded as a 16P, as it was published,
+the second half of each block has the directions of wrong lasers, and the times in a packet extend
+over twice the duration of the packet.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ FIRING_PERIOD_S = 55.56e-6  # from one firing of all lasers to the next (rs_driv
 TYPE_5515 = 6
 TYPE_1615 = 7  # and 16P
 LIDAR_TYPES = {"Helios-5515": TYPE_5515, "Helios-1615 and Helios-16P": TYPE_1615}
-#: Microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
+#: The microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
 TIMES_16P_US = (
     0,
     3.15,
@@ -81,7 +81,7 @@ TIMES_16P_US = (
     41.42,
     43.91,
 )
-#: Elevations of a captured unit's DIFOP, in steps of a third of a degree.
+#: The elevations in the DIFOP of a captured unit, in steps of a third of a degree.
 ELEVATION_5515_DEG = (
     *(15, 13, 11, 9, 7, 5.5, 4, 2.67, 1.33, 0, -1.33, -2.67, -4, -5.33, -6.67, -8),
     *(-10, -16, -13, -19, -22, -28, -25, -31, -34, -37, -40, -43, -46, -49, -52, -55),
@@ -125,8 +125,8 @@ def make_packet(rows: Construct) -> Struct:
     )
 
 
-#: Bytes from 313 on (Table 11). The 16P has angles of 16 lasers, and reserved bytes in place of the
-#: angles of lasers 17 to 32.
+#: The fields from byte 313 on (Table 11). A 16P has the angles of 16 lasers, and reserved bytes in
+#: place of the angles of lasers 17 to 32.
 STATUS: tuple[Construct, ...] = (
     "operating_status" / Bytes(12) * "current and voltages: input, 12 V, 5 V, 2.5 V, APD",
     "reserved_325" / Bytes(17),
@@ -174,7 +174,7 @@ def points_32(f: Fields, model: Rotor) -> Polar:
 
 
 def scale_range(f: Fields, polar: Polar) -> Any:
-    """Return ranges in metres, by the step in the header."""
+    """Return ranges in metres, with the distance step that the header declares."""
     return polar.range * np.where(f.range_resolution == 0, 2, 1)
 
 
@@ -185,14 +185,14 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether two blocks have one azimuth: two returns of 32 lasers."""
+    """Return whether two blocks have one azimuth, as with two returns of 32 lasers."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 
 def has_equal_halves(f: Fields) -> Any:
     """Return whether the halves of most blocks are equal.
 
-    These are two returns of 16 lasers, which are equal for beams with one echo.
+    Such blocks contain two returns of 16 lasers, which are equal for beams with one echo.
     """
     distance = np.asarray(f.blocks.channels.distance)
     first = distance[..., :16]

@@ -1,14 +1,16 @@
-"""Common parts of the rotating lidars: clocks, temperatures, DIFOP, and points of a rotor.
+"""The parts that the rotating lidars share: clocks, temperatures, DIFOP, and points.
 
-DIFOP contains the set speed, the return mode and the unit's angles of each laser, in three layouts:
-the first is that of RS-LiDAR-16, -32 and RS-Bpearl, the second that of Helios; the Ruby family has
-the beginning of the second and the end of the first, for 128 lasers.
+DIFOP, the device information, contains the configured speed, the return mode and the angles of each
+laser of the unit. It has three layouts. RS-LiDAR-16, -32 and RS-Bpearl have the first layout, and
+Helios has the second. The Ruby family has the beginning of the second and the end of the first, for
+128 lasers.
 
 Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hpp: layouts,
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
 layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-Not supported: if a field of view is set, blocks after the gap are later than the packet's times.
+If a field of view is configured, blocks after the gap are really later than their times in the
+points, which is not corrected.
 """
 
 from __future__ import annotations
@@ -81,9 +83,9 @@ def make_blocks(
     """Return the array of blocks; a block has one azimuth.
 
     Args:
-        count: blocks per packet.
-        lasers: channels of a firing.
-        step: metres of a distance step.
+        count: the number of blocks per packet.
+        lasers: the number of channels of a firing.
+        step: the size of a distance step in metres.
         firings: 1 for one firing, 2 for two groups of channels.
         flag: the type of the first bytes of a block.
     """
@@ -103,9 +105,9 @@ def make_blocks(
 
 
 def make_angles(lasers: int, step: float = 0.01) -> Construct:
-    """Return the array of an angle per laser, as sign and size.
+    """Return the array with the angle of each laser, as a sign and a magnitude.
 
-    `step` is the step of the size in degrees.
+    `step` is the size of a raw step of the magnitude in degrees.
     """
     sign = Enum(Int8ub, positive=0, negative=1, not_calibrated=255)
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
@@ -207,12 +209,13 @@ class Rotor:
     """The firing times, geometry and nominal angles of a model.
 
     Attributes:
-        delay: seconds from the block to the firing of each laser, (slots,), or (blocks, slots) if
-            blocks hold different lasers.
-        period: seconds from one firing of all lasers to the next.
-        lens: metres from the axis to the optical centre, in the rotor's direction.
-        vertical, horizontal: (lasers,) nominal degrees, until DIFOP contains the unit's angles.
-        height: metres from the origin up to the optical centre.
+        delay: the seconds from the time of the block to the firing of each laser, (slots,), or
+            (blocks, slots) if blocks contain different lasers.
+        period: the seconds from one firing of all lasers to the next.
+        lens: the distance from the axis to the optical centre in the rotor's direction, metres.
+        vertical, horizontal: (lasers,) the nominal angles in degrees, which are used until DIFOP
+            with the angles of the unit arrives.
+        height: the height of the optical centre above the origin, metres.
     """
 
     delay: NDArray[Any]
@@ -224,7 +227,7 @@ class Rotor:
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """The number of each laser, counted from the lowest nominal one, (lasers,)."""
+        """The number of each laser, counted from the one with the lowest elevation, (lasers,)."""
         return np.argsort(np.argsort(self.vertical))
 
     def make_default_state(self, **others: Any) -> dict[str, dict[str, Any]]:
@@ -238,14 +241,14 @@ class Rotor:
 
 
 def split_angles(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the default values of angles as sign and size, as in DIFOP."""
+    """Return the default values of angles as signs and magnitudes, as in DIFOP."""
     return {f"{name}.sign": values < 0, f"{name}.value": np.abs(values)}
 
 
 def laser_degrees(entry: Any) -> Any:
-    """Return the degrees of each laser, on the lasers' axis.
+    """Return the angle of each laser in degrees, on the axis of channels.
 
-    An angle is nan if the sensor is not calibrated, and its points are invalid.
+    If the sensor is not calibrated, angles are nan, so that points are invalid.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
@@ -309,12 +312,12 @@ def make_points(
     Args:
         lasers: elevation, and the clockwise angle from the rotor's direction, in degrees.
         ahead: azimuth of the next shot, degrees.
-        elapsed: seconds from the azimuth of a shot to each laser.
-        duration: seconds from shot to shot.
+        elapsed: the seconds from the azimuth of a shot to the firing of each laser.
+        duration: the seconds from shot to shot.
         shot: the number of the shot in the packet, for each block.
         echo: the number of the return, for each block.
-        distance: metres; by default the field of that name in `channels`.
-        ring: numbers of the lasers; by default in the order of their elevation.
+        distance: the distances in metres; by default the field `distance` of the channels.
+        ring: the numbers of the lasers; by default in the order of their elevations.
     """
     vertical, horizontal = lasers
     step = between_blocks(f.blocks.azimuth, ahead, fastest=MAX_SPEED_DEG_S * duration)
@@ -336,9 +339,10 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
     """Return the seconds from a packet to the next, by the return mode in DIFOP.
 
     Args:
-        shots: of a packet with single return; with dual return it has half as many.
-        period: seconds from shot to shot.
-        dual: the return mode with two returns.
+        shots: the number of shots of a packet with single return. With dual return, a packet has
+            half as many.
+        period: the seconds from shot to shot.
+        dual: the value of the return mode with two returns.
     """
     return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
 

@@ -4,13 +4,13 @@ Their DIFOP has the first layout.
 
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); angles of an example unit of
-each, ros_rslidar. The date of a packet is read as UTC, in rs_driver as local time of the computer.
-A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result in
-steps of 0.0001.
+each, ros_rslidar. The date of a packet is read as UTC, but rs_driver reads it as the local time of
+the computer. In the test of the RS-LiDAR-16, a comment has angles in steps of 0.001 degrees, and
+the result has steps of 0.0001.
 
-Assumed: the type byte 30 is 2 only in packets of an RS-LiDAR-32 and 1 only in those of an
-RS-LiDAR-16, as in rs_driver; a Bpearl of version 4 has the nominal angles of other Bpearls. Bytes
-31 and 32 identify version 4, as in rs_driver.
+As in rs_driver, it is assumed that the type in byte 30 is 2 only in packets of an RS-LiDAR-32 and 1
+only in packets of an RS-LiDAR-16, and that bytes 31 and 32 identify a Bpearl of version 4. It is
+assumed to have the nominal angles of other Bpearls.
 """
 
 from __future__ import annotations
@@ -155,9 +155,10 @@ def is_plausible(f: Fields, lidar_type: int) -> Any:
 
 
 def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
-    """Return whether azimuths are below 360 degrees and type and version fit a Bpearl.
+    """Return whether azimuths, type and version are those of a Bpearl.
 
-    Packets with the type of another model do not fit. `v4` is whether version 4 is required.
+    Azimuths have to be below 360 degrees, and the type must not be that of another model. `v4` is
+    whether version 4 is required.
     """
     is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (
@@ -183,7 +184,7 @@ def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
 def points_16(f: Fields) -> Polar:
     """Return the points of blocks with two firings of 16 lasers each.
 
-    Only vertical angles are corrected. Their signs are the same in every unit.
+    DIFOP has only vertical angles, without signs, which are the same in every unit.
     """
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
     return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))

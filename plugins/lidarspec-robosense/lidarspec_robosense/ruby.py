@@ -1,22 +1,23 @@
 """RoboSense RS-Ruby and RS-Ruby Plus: rotating lidars of 48 to 128 lasers over UDP.
 
-RS-Ruby are the RS-LiDAR-128, -80 and -48; RS-Ruby Plus have 128, 80, 80 (80V) or 48 lasers. Both
-series send the same packets, of 3, 4 or 8 blocks of all lasers. With dual return, three blocks hold
-one shot and a half: A A B, then B C C.
+The RS-Ruby models are RS-LiDAR-128, -80 and -48. The RS-Ruby Plus models have 128, 80, 80 (80V) or
+48 lasers. Both series send the same packets, which have 3, 4 or 8 blocks of all lasers. With dual
+return, three blocks contain one and a half shots: A A B, then B C C.
 
 Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
 manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and
 the RSP variants: firing times, optical centre, DIFOP).
 
-Contradictions: series and model are at bytes 31 and 32 in the manual, at 30 and 31 in rs_driver, so
-both are read. The return mode is in every packet in the manuals, which this module follows, and in
-DIFOP with codes of each model in rs_driver. The time is seconds and nanoseconds in early units. In
-dual return the manual has the last return first, then the strongest.
+The sources disagree. Series and model are at bytes 31 and 32 in the manual, and at 30 and 31 in
+rs_driver, so both are read. In the manuals, the return mode is in every packet; rs_driver reads it
+from DIFOP, with other codes for each model. This module follows the manuals. In early units the
+time is in seconds and nanoseconds. With dual return, the first return is the last one and the
+second is the strongest, according to the manual.
 
-Assumed, because no table was found: the nominal angles, which are evenly spaced over the 40 degrees
-of the data sheets of 128 and 80 lasers, lowest laser first. Clouds are marked as nominal before the
-first DIFOP packet. Also assumed: no RS-Ruby has the series number of the Ruby Plus, 5. The range
-limits, which are the same for all models, are those of rs_driver.
+No table of nominal angles was found. They are assumed to be evenly spaced over 40 degrees, which
+the data sheets of 128 and 80 lasers give, with the lowest laser first. Clouds are marked as nominal
+before the first DIFOP packet. It is also assumed that no RS-Ruby has the series number of the Ruby
+Plus, 5. The range limits are those of rs_driver and are the same for all models.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def make_packet(lasers: int) -> Struct:
 
 
 def make_difop(lasers: int) -> Struct:
-    """Return the device information: angles of 128 lasers.
+    """Return the struct of the device information, with the angles of 128 lasers.
 
     A model with fewer lasers uses the first angles.
     """
@@ -124,8 +125,8 @@ def is_plus(f: Fields) -> Any:
 def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
     """Return the points of a packet.
 
-    With dual return the first block may hold the second return of a shot. `variant` are the delays
-    of an 80V, in seconds.
+    With dual return, the first block may have the second return of a shot. `variant` has the delays
+    of an 80V in seconds.
     """
     late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
@@ -143,19 +144,20 @@ def pace(f: Fields, shots: int, period: float) -> Any:
 
 
 def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
-    """Return the seconds of each laser.
+    """Return the firing time of each laser in seconds.
 
     Args:
-        times: firing times in microseconds.
-        counts: how many lasers fire at each time.
+        times: the firing times in microseconds.
+        counts: the number of lasers that fire at each time.
     """
     return np.repeat(np.asarray(times, np.float64), counts) * 1e-6
 
 
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
-    """Return the seconds of each laser, for two rows of 16 times, 3.236 us apart.
+    """Return the firing time of each laser in seconds, for two rows of 16 times.
 
-    `counts` are the lasers that fire at each time. Source: rs_driver.
+    The times are 3.236 us apart. `counts` has the number of lasers that fire at each time. Source:
+    rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 

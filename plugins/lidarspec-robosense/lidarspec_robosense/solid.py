@@ -3,12 +3,13 @@
 Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their
 number in a frame, limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
 
-Contradictions: the E1's manual counts packets from 0, and has dual return as modes 9 to 11,
-rs_driver as 0. Not verified: the CRCs at the end of packets, because the bytes that they cover are
-not public; that of the E1 is called AUTOSAR E2E profile 4. Assumed: the other models count from 1,
-as the M1 does; frames with dual return have twice as many packets, except for the MX, whose points
-have two radii. Also assumed: g and rad/s of the E1's IMU, because rs_driver returns its numbers
-like those of the Airy, which have these units, from bytes that are reserved in the manual.
+In the manual of the E1, packets are counted from 0, and dual return has the modes 9 to 11; in
+rs_driver, dual return has the mode 0. The CRCs at the end of packets are not verified, because the
+bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2E profile 4. It is
+assumed that the other models count packets from 1, as the M1 does, and that frames with dual return
+have twice as many packets, except for the MX, whose points have two radii. The IMU of the E1 is
+assumed to measure in g and rad/s, as that of the Airy does, because rs_driver reads both in the
+same way; its bytes are reserved in the manual.
 """
 
 from __future__ import annotations
@@ -60,10 +61,11 @@ class Scanner:
     """The packets and the field of view of a model.
 
     Attributes:
-        blocks, channels: blocks per packet, channels per block.
-        packets: packets per frame with single return.
+        blocks: the number of blocks per packet.
+        channels: the number of channels per block.
+        packets: the number of packets per frame with single return.
         first: the number of the first packet of a frame.
-        wide, high: degrees of the simulated field of view.
+        wide, high: the width and height of the simulated field of view in degrees.
     """
 
     blocks: int
@@ -199,9 +201,9 @@ def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
 
 
 def common_columns(f: Fields) -> dict[str, Any]:
-    """Return azimuth, elevation, time and ring, which points of every model have.
+    """Return azimuth, elevation, time and ring of points.
 
-    The unit vectors have REP-103 axes.
+    The sent unit vectors have REP-103 axes.
     """
     channels = f.blocks.channels
     across = np.hypot(channels.x, channels.y)
@@ -216,9 +218,9 @@ def common_columns(f: Fields) -> dict[str, Any]:
 def points(f: Fields, returns: bool = False) -> Polar:
     """Return a point of each channel.
 
-    The length of the vector, 1 except for its rounding, is part of the range, as in rs_driver.
-    `returns` is whether blocks have the number of the return. Two packets then contain the returns
-    of the same firings, as assumed from the M1.
+    The range is multiplied by the length of the vector, which is 1 except for rounding, as in
+    rs_driver. `returns` is whether blocks have the number of the return. If so, two packets contain
+    the returns of the same firings, which is assumed from the M1.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
@@ -256,7 +258,7 @@ def imu(f: Fields) -> Imu:
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
     """Return the values of simulated packet i.
 
-    Lines run forth and back, downwards; each channel scans an equal part of a line.
+    Lines run to and fro, from the top to the bottom; each channel scans an equal part of a line.
     """
     number = i % model.packets
     time = i / (model.packets * FRAME_RATE_HZ)

@@ -7,9 +7,9 @@ A packet contains blocks of four channels, in spherical coordinates:
     [reserved(16), from version 2] count x [angles and their differences, 17 bytes, 4 points of 4
     bytes, or 8 with two returns]
 
-The checksum is not verified: the bytes that it covers are public, its CRC is not. The vendor's SDK
-moves points by some centimetres away from the axis, with a table of its own, which is left out. The
-number of blocks per packet and the simulated pattern are assumed.
+The checksum is not verified, because its CRC is not public. The vendor's SDK moves points by some
+centimetres away from the axis by a table, which is not used here. The number of blocks per packet
+and the simulated pattern are assumed.
 
 Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and
 inno_lidar_packet_utils.h (angles of the channels); its ROS driver (port 8010); data sheet of the
@@ -63,7 +63,7 @@ HEADER_1_BYTES = 54  # header of version 1
 HEADER_2_BYTES = 70  # header from version 2 on
 BLOCK_HEADER_BYTES = 17
 POINT_BYTES = 4
-#: Returns -> bytes of a block.
+#: The size of a block in bytes, by the number of returns.
 BLOCK_BYTES = {
     1: BLOCK_HEADER_BYTES + CHANNELS * POINT_BYTES,
     2: BLOCK_HEADER_BYTES + 2 * CHANNELS * POINT_BYTES,
@@ -164,7 +164,7 @@ def make_packet(returns: int) -> Struct:
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether the size fits the block count, header and maximum datagram."""
+    """Return whether the size is consistent with block count, header and datagram."""
     header = np.where(f.major >= 2, HEADER_2_BYTES, HEADER_1_BYTES)
     return (
         (f.count >= 1) & (f.count * f.item_size + header == f.size) & (f.size <= MAX_DATAGRAM_BYTES)

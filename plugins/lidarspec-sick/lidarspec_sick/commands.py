@@ -1,8 +1,9 @@
 """Commands of a scanner and its replies, in CoLa B or CoLa A.
 
-Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, prints how a stream is
-started. A change of settings needs `login` before and `run` afterwards. Settings are lost at
-power-off unless they are saved.
+Send `login` before and `run` after a change of settings. Settings are lost at power-off unless they
+are saved.
+
+Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, for starting a stream.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ CONTENT = (
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
     "interval" / Int16ub * "1: each scan, 2: every second scan",
 )
-#: Reasons for a refused command, numbered from 1 (8014631, error codes).
+#: The reasons for a refused command, numbered from 1 (8014631, error codes).
 ERRORS = (
     "access_denied",
     "method_unknown",
@@ -117,7 +118,7 @@ def make_message(cola: str, kind: str, method: str, content: tuple[Construct, ..
     Args:
         cola: "A" or "B".
         kind: the three letters of the message kind.
-        method: the name of the method; "" if there is none.
+        method: the name of the method; "" without a method.
         content: the fields after the method.
     """
     out = kind in REQUEST_KINDS

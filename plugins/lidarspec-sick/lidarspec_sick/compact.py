@@ -1,4 +1,4 @@
-"""multiScan100 and picoScan100: compact telegrams over UDP, of scans and of the IMU.
+"""multiScan100 and picoScan100: compact telegrams over UDP with scans or IMU samples.
 
 Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4;
 multiScan136 operating instructions 8027119 for segments and layers. A telegram is a chain of
@@ -51,7 +51,7 @@ CRC = Crc(
     32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little"
 )
 MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
-#: Three echoes of the 900 beams of a segment of a multiScan136 need 14 160.
+#: Three echoes of the 900 beams of a segment of a multiScan136 need 14,160 bytes.
 MAX_TELEGRAM_BYTES = 16_384
 AZIMUTH_STEP_RAD = 1 / 5215
 ZERO_AZIMUTH_STEPS = 16_384  # the azimuth straight ahead on the wire
@@ -61,7 +61,7 @@ SIMULATED_SPEED_HZ = 20.0  # revolutions per second
 def make_module(version: int) -> Struct:
     """Return the struct of a module in telegrams of version 3 or 4.
 
-    A module holds the beams of all its layers.
+    A module contains the beams of all its layers.
     """
     azimuth = "azimuth" / If(
         this._.beam_content.has_azimuth == 1,

@@ -38,7 +38,7 @@ from lidarspec_sick.telegrams import make_scan_frame
 CLOCK_WRAP_S = 2**32 * 1e-6
 STREAM_KIND = np.frombuffer(b"sSN", np.uint8)
 REPLY_KIND = np.frombuffer(b"sRA", np.uint8)
-#: Optional parts that a simulated telegram does not have.
+#: The optional parts that a simulated telegram does not have.
 ABSENT_PARTS = ("channels8", "has_position", "has_name", "has_comment", "has_date", "has_event")
 ANGLE_TOLERANCE_DEG = 1e-4
 
@@ -48,12 +48,12 @@ class Kind:
     """The possible settings of a family of models; a simulated scanner has the first.
 
     Attributes:
-        rates: scans per second.
-        steps: in degrees.
+        rates: the possible scans per second.
+        steps: the possible angular steps in degrees.
         start: the first angle in degrees.
-        beams: beams of a simulated scan.
-        echoes: maximum number of echoes.
-        layers: elevations in the order on the wire, degrees downwards.
+        beams: the number of beams of a simulated scan.
+        echoes: the maximum number of echoes.
+        layers: the elevations of the layers in the order in which they are sent, degrees downwards.
     """
 
     rates: tuple[float, ...]
@@ -64,7 +64,7 @@ class Kind:
     layers: tuple[float, ...] = (0.0,)
 
     def fits(self, f: Fields) -> Any:
-        """Return whether a scan has possible settings."""
+        """Return whether the settings in a scan are possible for this family."""
         steps = [np.abs(f.dist1.step - step) < ANGLE_TOLERANCE_DEG for step in self.steps]
         rates = [f.scan_rate == rate for rate in self.rates]
         return (
@@ -130,7 +130,8 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
 def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
     """Return the frames of scans, with one echo and with all, and of messages.
 
-    Scans come in both forms, first in the form `cola`; messages only in that form.
+    The frames of scans are in both forms, first in the form `cola`. The frames of messages are in
+    the form `cola` only.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}

@@ -43,7 +43,7 @@ MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
 
 def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
-    """Return the frame of CoLa B: four times 02, a length, the content, and its XOR."""
+    """Return the frame of CoLa B: four bytes 02, a length, the content, and its XOR."""
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
         "length" / SizeOf(Int32ub, plus=-9) * "bytes of the content",
@@ -158,7 +158,7 @@ def make_scan_fields(echoes: int) -> list[Construct]:
 
 
 def plausible(f: Fields, echoes: int) -> Any:
-    """Return whether there are beams, and all channels have the same length."""
+    """Return whether a scan has beams, and all its channels have the same length."""
     count = f.dist1.count
     is_plausible = (f.dist1.step > 0) & (count > 0)
     for number in range(1, echoes + 1):

@@ -4,25 +4,26 @@ Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler
 sl_lidar_driver.cpp); baud rates and ports from the SDK (_getNativeBaudRate) and the launch files of
 sllidar_ros2, ranges from the models' data sheets if `source` names them.
 
-A response descriptor announces the kind of the following frames, and a kind is searched for only
-after its descriptor. The first kind in an input is its data. ``configure(answer="express")``
-selects another kind, and starts as if its descriptor had been received, for recordings that begin
-after it. The kinds are `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
+A response descriptor announces the kind of the following data frames, and a kind is searched for
+only after its descriptor. The kinds are `node`, `express`, `ultra`, `dense`, `ultra_dense` and
+`hq`. By default, the first kind in an input is decoded. ``configure(answer="express")`` selects
+another kind, and starts as if its descriptor had been received, which is needed for recordings that
+begin after the descriptor.
 
-One rule ends scans for all kinds: the azimuth of the points passes zero. Nodes and HQ capsules mark
-the first node past zero with a bit, at the same point. The start angle of capsules passes zero up
-to a capsule earlier or later. So scans begin at the same angle for all kinds.
+For all kinds, a scan ends when the azimuth of the points passes zero. Nodes and HQ capsules also
+mark the first node after zero with a bit, but the start angle of capsules can pass zero a capsule
+earlier or later.
 
-Nodes have no checksum, and are accepted in unbroken runs of ten: the module `nodes` has the
-measured rates of false nodes. No frame contains the times of its points: all points of a frame have
-its time.
+Nodes have no checksum, and are accepted in runs of ten without a gap; the module `nodes` has the
+measured rates of false nodes. Frames do not contain the times of their points, so all points of a
+frame have the time of the frame.
 
-Verification: requests, descriptors, information and configuration replies against the recorded
-communication of a live A1; nodes, express and ultra capsules against bytes built after the SDK;
-dense, ultra-dense and HQ capsules against the SDK's arithmetic by hand. It is not known whether a
-C1 supports the speed command: by the SDK's rule for model numbers it would use PWM. An S2L is
-assumed to have the model numbers of an S2: no bytes distinguish them. A T1 receives requests over
-UDP, and sends its stream over UDP.
+Requests, descriptors, and replies with information and configuration were verified with the
+recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that
+were built by the rules of the SDK, and dense, ultra-dense and HQ capsules with the SDK's arithmetic
+by hand. It is not known whether a C1 supports the speed command; by the SDK's rule for model
+numbers it would use PWM. An S2L is assumed to have the model numbers of an S2, and their bytes
+cannot be distinguished. A T1 receives requests and sends its stream over UDP.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Single replies with their descriptors, and the descriptors before a stream of data frames.
 
-Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one reply, 1: an endless
+Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0 for one reply, 1 for an endless
 stream) and a type. A single reply and its descriptor are one frame. The descriptor of a stream is a
-separate frame: its kind of data frames is searched for until another descriptor follows.
+frame of its own. After it, the announced kind of data frames is searched for until another
+descriptor arrives.
 
 Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response";
 configuration keys and the widths of their values from the vendor's SDK (sl_lidar_cmd.h).
@@ -42,7 +43,7 @@ SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T
 
 
 def name_model(series: str, low: int) -> str:
-    """Return the name of a model; with its own name if the series has several models."""
+    """Return the name of a series, and of the model if the series has several models."""
     several = {"A2", "S2", "S3"}
     if series in several:
         return f"RPLIDAR {series}, {series}M{low}"
@@ -56,7 +57,8 @@ MODEL_NUMBERS = {
 }
 STATUSES = Enum(Int8ul, good=0, warning=1, error=2)
 
-#: Keys of configuration values: the first two of the sensor, the others of one of its scan modes.
+#: The keys of configuration values. The first two are values of the sensor, and the others are
+#: values of one of its scan modes.
 MODE_COUNT = 0x70
 TYPICAL_MODE = 0x7C
 US_PER_SAMPLE = 0x71
@@ -68,7 +70,7 @@ MODE_NAME = 0x7F
 STREAMS = {"scan": 0x81, "express": 0x82, "hq": 0x83, "ultra": 0x84, "dense": 0x85}
 STREAMS |= {"ultra_dense": 0x86}
 
-#: Configuration values of fixed width, by key.
+#: The configuration values of fixed width, by key.
 VALUES: dict[int, Construct] = {
     MODE_COUNT: "mode_count" / Int16ul,
     TYPICAL_MODE: "typical_mode" / Int16ul,

@@ -1,15 +1,15 @@
-"""Capsules: many distances after the angle of the first one.
+"""Capsules, which contain many distances and the angle of the first one.
 
-The angles of the other points need the start angle of the next capsule: point k of N is at ``start
-+ (next start - start) * k / N``, minus a compensation. Before lost bytes, at the end of the input,
-and before a capsule with the S bit (the first after a start) there is no next capsule, and the
-points of the last capsule have no direction. All four kinds begin with the sync nibbles A and 5,
-each next to one nibble of the checksum, the XOR of the bytes from the third on.
+The angles of the other points are computed with the start angle of the next capsule: point k of N
+is at ``start + (next start - start) * k / N``, minus a compensation. If the next capsule is
+missing, or has the S bit (the first after a start), the points of a capsule have no direction. All
+four kinds begin with the sync nibbles A and 5, each next to one nibble of the checksum, which is
+the XOR of the bytes from the third on.
 
 Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; facts missing there (dense and ultra-dense
 capsules, the ultra capsule's angles, that dtheta is unsigned) from the vendor's SDK
 (sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages adjacent points of an ultra-dense capsule
-that differ by up to 2 mm; that is a filter, and is left out.
+that differ by up to 2 mm. This filter is left out.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ ULTRA_CABINS = 32
 DENSE_CABINS = 40
 ULTRA_DENSE_CABINS = 32
 DTHETA_SIGN_BIT = 32  # of six bits
-#: Degrees of a simulated capsule: 720, 1440, 800 and 800 points a revolution.
+#: The degrees of a simulated capsule, for 720, 1440, 800 and 800 points a revolution.
 EXPRESS_STEP = 16.0
 ULTRA_STEP = 24.0
 DENSE_STEP = 18.0
 ULTRA_DENSE_STEP = 28.8
-#: Simulated capsules per second: 254 and 127 us per point, as of a live A1, give 5.5 revolutions a
-#: second; 125 us, assumed, give 10.
+#: The simulated capsules per second. 254 and 127 us per point, as measured with a live A1, result
+#: in 5.5 revolutions a second; 125 us, which are assumed, result in 10.
 EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
     1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64))
 )
 
-#: The five levels of the ultra capsule's codes: a level begins at the code _STARTS, which means
-#: _BASES millimetres, and its steps are 1, 2, 4, 8 or 16 mm.
+#: The five levels of the codes of an ultra capsule. A level begins at the code in _STARTS, which
+#: stands for the millimetres in _BASES, and its steps are 1, 2, 4, 8 or 16 mm.
 _STARTS = np.array([0, 512, 1280, 1792, 3328])
 _BASES = np.array([0, 512, 2048, 4096, 16384])
 _CODES = np.arange(1 << 12)
 CODE_LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
 CODE_MILLIMETRES = _BASES[CODE_LEVELS] + ((_CODES - _STARTS[CODE_LEVELS]) << CODE_LEVELS)
 
-#: First distance in mm of each of the ultra-dense capsule's four scales.
+#: The first distance in mm of each of the four scales of an ultra-dense capsule.
 SCALE_STARTS_MM = np.array([0, 2046, 8187, 24567])
 SIMULATED_QUALITY = 47
 
@@ -151,7 +151,7 @@ def plausible(f: Fields) -> Any:
 def point_step(f: Fields, count: int) -> Any:
     """Return the degrees from a point to the next, (n, 1), for `count` points.
 
-    The step is nan if there is no next capsule.
+    The step is nan without a next capsule.
     """
     after = np.where(following(f.start.sync) == 0, following(f.start.angle), np.nan)
     return wrap(after - f.start.angle, 360.0) / count
@@ -167,7 +167,11 @@ def uncompensated_angles(f: Fields, cabins: int, points: int) -> Any:
 
 
 def express_points(f: Fields, *, signed: bool = False) -> Polar:
-    """Return 32 points per capsule, with dtheta unsigned (SDK) or signed (protocol)."""
+    """Return 32 points per capsule.
+
+    `signed` is whether the compensation dtheta is signed, as in the protocol, or unsigned, as in
+    the SDK.
+    """
     first = f.cabins.first
     second = f.cabins.second
     low = f.cabins.dtheta_low
@@ -185,7 +189,7 @@ def dense_points(f: Fields) -> Polar:
 
 
 def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
-    """Return a predicted distance in mm, 0 for the two codes of no return.
+    """Return a predicted distance in mm; 0 for the two codes that mean no return.
 
     Args:
         base: the reference distance in mm.
@@ -234,8 +238,8 @@ def ultra_points(f: Fields) -> Polar:
 def ultra_dense_points(f: Fields) -> Polar:
     """Return 64 points per capsule.
 
-    By its scale, a point has 10 to 13 bits of distance in steps of 2 to 5 mm, and above them 8 to 5
-    bits of quality.
+    The scale of a point determines its bits: 10 to 13 bits of distance in steps of 2 to 5 mm, and 8
+    to 5 bits of quality above them.
     """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
@@ -255,7 +259,8 @@ def ultra_dense_points(f: Fields) -> Polar:
 def encode_ultra(polar: Polar) -> Mapping[str, Any]:
     """Return the fields of ultra capsules with these ranges.
 
-    A prediction that does not reach its point becomes the code of no return.
+    If the difference from a reference is too large for a prediction, the point becomes the code of
+    no return.
     """
     mm = np.asarray(polar.range) * 1000
     code = nearest_codes(mm[..., 0])
@@ -269,7 +274,7 @@ def encode_ultra(polar: Polar) -> Mapping[str, Any]:
 
 
 def nearest_codes(mm: Any) -> Any:
-    """Return the codes with the distances nearest to `mm`, 0 for no return."""
+    """Return the codes with the distances nearest to `mm`; 0 for no return."""
     above = np.clip(np.searchsorted(CODE_MILLIMETRES, mm), 1, len(CODE_MILLIMETRES) - 1)
     is_nearer_below = mm - CODE_MILLIMETRES[above - 1] < CODE_MILLIMETRES[above] - mm
     nearest = np.where(is_nearer_below, above - 1, above)
@@ -277,9 +282,9 @@ def nearest_codes(mm: Any) -> Any:
 
 
 def encode_prediction(mm: Any, code: Any) -> Any:
-    """Return the steps from the distance of a code to another one, 511 if impossible.
+    """Return the steps from the distance of a code to another distance.
 
-    A distance of 0, no return, is 511 too.
+    The result is 511 if the distance cannot be encoded, or if it is 0 (no return).
     """
     base = CODE_MILLIMETRES[code]
     scale = np.exp2(CODE_LEVELS[code])

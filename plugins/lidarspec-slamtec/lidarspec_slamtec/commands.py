@@ -1,8 +1,8 @@
-"""The commands of an RPLIDAR, including its motor: by the line DTR, by PWM or by a speed.
+"""The commands of an RPLIDAR, including its motor, which DTR, PWM or a speed controls.
 
 Source: RPLIDAR interface protocol, "requests"; delays after requests and the motor's commands from
 the vendor's SDK (sl_lidar_driver.cpp). While it sends scan data, a sensor does not reply to
-requests for information; a request for a scan starts a new one.
+requests for information. A request for a scan starts a new stream.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def make_request(
 ) -> Command:
     """Return the command for a request with a reply.
 
-    It is sent again if no reply arrives: requests for information do not change the sensor, and a
-    repeated request for a scan starts a new one.
+    The request is sent again if no reply arrives. This does no harm, because requests for
+    information do not change the sensor, and a repeated request for a scan starts a new stream.
     """
     return Command(
         frame, values or {}, reply=reply, retries=1, only_stopped=not more.get("starts"), **more
@@ -68,8 +68,8 @@ def make_mode_request(key: int) -> Command:
 def make_express_request(mode: int | None = None) -> Command:
     """Return the request for capsules of one scan mode.
 
-    The command requires the mode as an argument if `mode` is None. The descriptor in the reply
-    depends on the mode; get_answer_type returns it.
+    If `mode` is None, the mode is an argument of the command. The descriptor in the reply depends
+    on the mode; the command `get_answer_type` returns its type.
     """
     values = {"flags": 0, "param": 0} | ({} if mode is None else {"mode": mode})
     args = {"mode": ("mode", 0, 0xFF)} if mode is None else {}
