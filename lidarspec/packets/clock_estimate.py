@@ -91,16 +91,21 @@ class DeviceClock:
     A constant delay looks the same as an offset: the time on the line, and the time that the sensor
     needs before it sends, remain in the result.
 
+    Args:
+        parts: the number of parts, of a quarter of a second each, that determine the line. More
+            parts determine the drift better, fewer parts follow its changes sooner.
+
     Attributes:
         jumps: how often the sensor's clock was set.
         jump: the last change, until ten seconds after it; otherwise None.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, parts: int = PARTS) -> None:
+        self._parts = parts
         self._stamp = -(1 << 62)
         self.jumps = 0
         self.jump: ClockJump | None = None
-        self._min_delays = deque[ClockSample](maxlen=PARTS)
+        self._min_delays = deque[ClockSample](maxlen=parts)
         self._outliers = deque[ClockSample](maxlen=LATE_OUTLIERS)
         self._first_outlier_ns = 0
         self._line = ClockLine(0, 0, 0.0)
@@ -192,7 +197,8 @@ class DeviceClock:
         """
         deviation = self._deviation(sample)
         has_paused = (
-            bool(self._min_delays) and sum(sample) - sum(self._min_delays[-1]) > PARTS * PART_NS
+            bool(self._min_delays)
+            and sum(sample) - sum(self._min_delays[-1]) > self._parts * PART_NS
         )
         if has_paused and abs(deviation) < UNSETTLED_LIMIT_NS:
             self._forget_offset()  # the drift is not known well enough for such a pause
@@ -274,7 +280,7 @@ class DeviceClock:
         self._line = fit_line(self._min_delays, self._reliable_slope)
         if len(self._min_delays) >= SETTLED_PARTS:
             self.jump = None
-        if len(self._min_delays) == PARTS:
+        if len(self._min_delays) == self._parts:
             self._reliable_slope = self._line.slope
 
 

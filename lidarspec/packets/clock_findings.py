@@ -65,7 +65,7 @@ FINDING_TYPES = MappingProxyType(
             "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
         ),
         "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
-        "restart": FindingType("restarted: its time began again at 0", "check its power supply"),
+        "restart": FindingType("restarted: its time began again", "check its power supply"),
         "leap_second": FindingType(
             "set by {value:+.3f} s at a leap second", "record such a time again, or use --time host"
         ),

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ STEP_TOLERANCE_S = 0.05  # of a step by a second
 FIRST_DATE_S = 1e9
 LATE_NS = 50_000_000
 PIECE_NS = 250_000_000  # packets are judged in pieces of this duration
+ESTIMATE_PARTS = 360  # 90 s, for a drift within 1 ppm of a clock that counts milliseconds
 MIN_PIECES = 4  # after which a clock can be in order
 WRONG_DATE_S = 86_400.0
 #: the time that a clock shows at most when the first packets after its restart arrive, s
@@ -136,7 +138,7 @@ class ClockMonitor:
         self._sensor = sensor
         self._drift_limit_ppm = drift_limit_ppm
         self.samples = deque[OffsetSample](maxlen=KEPT_SAMPLES)
-        self._estimate = DeviceClock()
+        self._estimate = DeviceClock(ESTIMATE_PARTS)
         self._delays: NDArray[np.float64] = np.zeros(0)
         self._events = deque[ClockFinding](maxlen=KEPT_EVENTS)
         self._status = math.nan
@@ -283,12 +285,19 @@ class ClockMonitor:
         return event
 
     def _began_again(self, jump: ClockJump) -> bool:
-        """Return whether the clock showed a time near 0 after the jump, and did not before."""
-        after = [reading for host, reading in self._readings if host >= jump.host_ns]
-        before = [reading for host, reading in self._readings if host < jump.host_ns]
-        if not after or not before:
-            return False
-        return after[0] < RESTART_LIMIT_S * 1e9 and after[0] < before[-1]
+        """Return whether the clock went back by more than a day, or to 0 without a wrap."""
+        if jump.change_ns < -DAY_S * 1e9:
+            return True
+        around = [
+            reading for host, reading in self._readings if abs(host - jump.host_ns) <= 2 * PIECE_NS
+        ]
+        clock = self._sensor.clock
+        assert clock is not None
+        limit_ns = RESTART_LIMIT_S * 1e9
+        wrap_ns = math.inf if clock.wraps_at is None else clock.wraps_at * 1e9 - limit_ns
+        return any(
+            after < limit_ns and after < before < wrap_ns for before, after in pairwise(around)
+        )
 
     def _find_error_s(self) -> float:
         """Return the offset without the difference of the time scales, s; nan without a date."""
