@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
-from lidarspec.frames.commands import argument_slot, list_choices
+from lidarspec.frames.commands import argument_slot, has_only_names, list_choices
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
 from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
@@ -403,8 +403,9 @@ def describe_argument(sensor: Sensor, command: str, argument: str, between: str 
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(argument_slot(sensor, command, argument).info, kind)
-        if choices:
+        if has_only_names(kind, choices):
             return "|".join(choices)
+        return "|".join([*choices, format_argument_type(kind, between)])
     return format_argument_type(kind, between)
 
 

@@ -243,6 +243,11 @@ def list_choices(info: FieldInfo, kind: Range) -> dict[str, float]:
     return {name: value for name, value in values.items() if kind.low <= value <= kind.high}
 
 
+def has_only_names(kind: Range, choices: Mapping[str, float]) -> bool:
+    """Return whether each number that an argument takes has a name."""
+    return len(choices) > kind.high - kind.low
+
+
 def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
     """Return the physical value of a name.
 

@@ -208,7 +208,7 @@ def test_on_a_terminal_of_80_columns_ids_and_fields_stay_whole() -> None:
 
 
 def test_the_limits_of_a_command_are_printed_with_every_digit() -> None:
-    assert "command get_config key=0..4294967295, reply" in ran("show", "slamtec-rplidar-a1").stdout
+    assert "|mode_name|0..4294967295, reply" in ran("show", "slamtec-rplidar-a1").stdout
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,7 @@ def make_sensor(**more: object) -> Sensor:
         links={"data": Serial(9600)},
         commands={
             "set_mode": Command("set", args={"mode": ("mode", 0, 0x37)}, reply="report"),
+            "choose": Command("set", args={"mode": ("mode", 1, 1)}),
             "idle": Command("set", {"mode": "idle"}, reply="report", matches={"mode": "idle"}),
         },
         info={"model": "report.model"},
@@ -134,7 +135,8 @@ def test_arguments_take_names_within_their_range() -> None:
             SENSOR.command("set_mode", mode=name)
     assert parse_arguments(SENSOR, "set_mode", ["mode=idle"]) == {"mode": "idle"}
     assert parse_arguments(SENSOR, "set_mode", ["mode=0x37"]) == {"mode": 0x37}
-    assert describe_argument(SENSOR, "set_mode", "mode") == "idle|strongest"
+    assert describe_argument(SENSOR, "choose", "mode") == "idle"
+    assert describe_argument(SENSOR, "set_mode", "mode") == "idle|strongest|0..55"
 
 
 def test_a_reply_must_have_the_code_that_is_named() -> None:

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import Any, Literal
 
-from construct import Const, Int8ul, Int16ul, Int32ul, Struct
+from construct import Const, Enum, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import (
     Checksummed,
@@ -49,6 +49,17 @@ BAUD = 6
 OUTPUT = 7
 FACTORY = 0x10
 SAVE = 0x11
+IDS = {
+    "version": VERSION,
+    "reset": RESET,
+    "rate": RATE,
+    "trigger": TRIGGER,
+    "format": FORMAT,
+    "baud": BAUD,
+    "output": OUTPUT,
+    "factory_settings": FACTORY,
+    "save": SAVE,
+}
 HEAD = "header" / Const(b"\x5a") * "followed by the length of the frame"
 
 
@@ -109,19 +120,18 @@ def make_id(number: int) -> Any:
 
 RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "frames per second; 0: one per trigger"
 BAUD_FIELD = "baud" / Int32ul
+ID = "id" / Enum(Int8ul, **IDS)
 FRAMES = {
     "version": make_message(
         7, make_id(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul
     ),
     "rate": make_message(6, make_id(RATE), RATE_FIELD),
     "baud": make_message(8, make_id(BAUD), BAUD_FIELD),
-    "setting": make_message(
-        5, "id" / Int8ul, "value" / Int8ul * "the setting; for an action, 0: success"
-    ),
-    "request": make_message(4, "id" / Int8ul, out=True),
+    "setting": make_message(5, ID, "value" / Int8ul * "the setting; for an action, 0: success"),
+    "request": make_message(4, ID, out=True),
     "set_rate": make_message(6, make_id(RATE), RATE_FIELD, out=True),
     "set_baud": make_message(8, make_id(BAUD), BAUD_FIELD, out=True),
-    "set": make_message(5, "id" / Int8ul, "value" / Int8ul, out=True),
+    "set": make_message(5, ID, "value" / Int8ul, out=True),
 }
 
 

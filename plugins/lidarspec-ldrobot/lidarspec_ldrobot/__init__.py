@@ -24,7 +24,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
+from construct import Array, Const, Enum, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import (
     Checksummed,
@@ -81,7 +81,7 @@ DATA = with_crc(
 )
 HEALTH = with_crc(
     "header" / Const(b"\x54\xe0"),
-    "error" / Int8ul * "1: motor blocked, 2: occluded, 3: both",
+    "error" / Enum(Int8ul, none=0, motor_blocked=1, occluded=2, both=3),
 )
 INFO = with_crc(
     "header" / Const(b"\x54\x0f"),
@@ -92,11 +92,13 @@ INFO = with_crc(
     "hardware_version" / Int32ul,
     "firmware_version" / Int32ul,
 )
+#: Codes of commands; "get_firmware" is that of the motor's board.
+CODES = {"start": 0xA0, "stop": 0xA1, "set_speed": 0xA2, "get_firmware": 0xA8}
 COMMAND = with_crc(
     "header" / Const(b"\x54"),
-    "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
+    "command" / Enum(Int8ul, **CODES),
     "length" / Const(4, Int8ul),
-    "speed" / Scaled(Int32ul, 1, "deg/s") * "0 except for A2",
+    "speed" / Scaled(Int32ul, 1, "deg/s") * "0 except for set_speed",
 )
 
 
@@ -314,10 +316,12 @@ LD14P = make_lidar(
     frames={**STATUS_FRAMES, "command": Frame(COMMAND, direction="out")},
     links={"data": Serial(230_400)},
     commands={
-        "start": Command("command", {"command": 0xA0, "speed": 0}, starts=True),
-        "stop": Command("command", {"command": 0xA1, "speed": 0}, stops=True),
-        "set_speed": Command("command", {"command": 0xA2}, args={"speed": ("speed", 720, 2880)}),
-        "get_firmware": Command("command", {"command": 0xA8, "speed": 0}),
+        "start": Command("command", {"command": "start", "speed": 0}, starts=True),
+        "stop": Command("command", {"command": "stop", "speed": 0}, stops=True),
+        "set_speed": Command(
+            "command", {"command": "set_speed"}, args={"speed": ("speed", 720, 2880)}
+        ),
+        "get_firmware": Command("command", {"command": "get_firmware", "speed": 0}),
     },
     # it rotates after power-up, but not if it was stopped before
     on_open=("start",),

@@ -30,6 +30,7 @@ from construct import (
     Const,
     Construct,
     Default,
+    Enum,
     Int8ub,
     Int16ub,
     Struct,
@@ -267,15 +268,18 @@ INFO = Frame(
         "end" / END,
     )
 )
+#: Codes of commands, and filters.
+CODES = {"run": 1, "stop_motor": 3, "filter": 6, "get_info": 8, "set_speed": 0x0A}
+FILTERS = {"none": 0x0A, "normal": 0x0B, "near": 0x0C}
 COMMAND = Frame(
     Struct(
         "header" / MARK,
         "unused_1" / Const(bytes(169)),
         "turns" / Default(Scaled(Int8ub, 1, "Hz"), 0) * "revolutions per second",
         "unused_2" / Const(bytes(8)),
-        "filter" / Int8ub * "A none, B normal, C near",
+        "filter" / Enum(Int8ub, unused=0, **FILTERS),
         "unused_3" / Const(bytes(2)),
-        "code" / Int8ub * "1 run, 3 speed, 6 filter, 8 report state, A speed",
+        "code" / Enum(Int8ub, **CODES),
         "argument" / Int8ub,
         "end" / END,
     ),
@@ -283,19 +287,24 @@ COMMAND = Frame(
 )
 
 
-def make_command(code: int, argument: int, scan_filter: int = 0, **more: Any) -> Command:
+def make_command(code: str, argument: int, scan_filter: str = "unused", **more: Any) -> Command:
     """Return the command with this code, argument and filter."""
     return Command("command", {"code": code, "argument": argument, "filter": scan_filter}, **more)
 
 
-RUN_COMMANDS = {"start": make_command(1, 1, starts=True), "stop": make_command(1, 0, stops=True)}
-N_COMMANDS = RUN_COMMANDS | {"set_speed": make_command(0x0A, 1, args={"speed": ("turns", 6, 12)})}
+RUN_COMMANDS = {
+    "start": make_command("run", 1, starts=True),
+    "stop": make_command("run", 0, stops=True),
+}
+N_COMMANDS = RUN_COMMANDS | {
+    "set_speed": make_command("set_speed", 1, args={"speed": ("turns", 6, 12)})
+}
 M_COMMANDS = RUN_COMMANDS | {
-    "stop_motor": make_command(3, 0, stops=True),
-    "filter_none": make_command(6, 1, scan_filter=0x0A),
-    "filter_normal": make_command(6, 1, scan_filter=0x0B),
-    "filter_near": make_command(6, 1, scan_filter=0x0C),
-    "get_info": make_command(8, 1, reply="info", retries=1),
+    "stop_motor": make_command("stop_motor", 0, stops=True),
+    "filter_none": make_command("filter", 1, scan_filter="none"),
+    "filter_normal": make_command("filter", 1, scan_filter="normal"),
+    "filter_near": make_command("filter", 1, scan_filter="near"),
+    "get_info": make_command("get_info", 1, reply="info", retries=1),
 }
 
 

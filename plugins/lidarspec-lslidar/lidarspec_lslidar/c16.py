@@ -103,7 +103,7 @@ DIFOP = Struct(
     "data_port" / Int16ub,
     "device_port" / Int16ub,
     "reserved_28" / Bytes(17),
-    "time_service" / Int8ub * "0 GPS, 1 PTP, 2 NTP",
+    "time_service" / Enum(Int8ub, gps=0, ptp=1, ntp=2),
     "reserved_46" / Bytes(1158),
     "tail" / Const(b"\x0f\xf0"),
 )

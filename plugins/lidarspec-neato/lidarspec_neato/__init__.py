@@ -27,6 +27,7 @@ from construct import (
     Bytes,
     ByteSwapped,
     Const,
+    Enum,
     Int8ul,
     Int16ul,
     Struct,
@@ -189,14 +190,16 @@ HLS_LFCD2 = Sensor(
             confirm=2,
             acknowledged={"LS212": "its sources contradict each other about the trailer"},
         ),
-        "command": Frame(Struct("letter" / Int8ul * "ASCII: b begin, e end"), direction="out"),
+        "command": Frame(
+            Struct("letter" / Enum(Int8ul, begin=ord("b"), end=ord("e"))), direction="out"
+        ),
     },
     points=lfcd_points,
     scan=OnWrap("azimuth", at=np.deg2rad(359.5)),
     links={"data": Serial(230_400)},
     commands={
-        "start": Command("command", {"letter": ord("b")}, starts=True),
-        "stop": Command("command", {"letter": ord("e")}, stops=True),
+        "start": Command("command", {"letter": "begin"}, starts=True),
+        "stop": Command("command", {"letter": "end"}, stops=True),
     },
     simulation=Simulation(partial(sweep, count=6)),
     on_open=("start",),

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct
+from construct import Array, Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32ub, Struct
 from numpy.typing import NDArray
 
 from lidarspec.spec import (
@@ -56,6 +56,8 @@ DISTANCES: Construct = Array(
     LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; 10 mm per step before version 5"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
+#: A version mismatch is that of software and firmware.
+STATUS = Enum(Int16ub, good=0, version_mismatch=1, watchdog=2)
 
 
 def make_header(kind: int, size: int) -> tuple[Construct, ...]:
@@ -90,11 +92,11 @@ THREE_RETURNS = Struct(
     "body_seconds" / Int32ub * "as in the header",
     "body_nanoseconds" / Int32ub * "as in the header",
     "api" / Int16ub * "packet version",
-    "status" / Int16ub * "0 good, 1 version mismatch of software and firmware, 2 watchdog",
+    "status" / STATUS,
 )
 ONE_RETURN = Struct(
     *make_header(4, 2224),
-    "status" / Int16ub * "0 good, 1 version mismatch of software and firmware, 2 watchdog",
+    "status" / STATUS,
     "return_id" / Int8ub * "which of the three returns this packet contains",
     "reserved" / Bytes(1),
     "firings"

@@ -30,6 +30,7 @@ from construct import (
     Bytes,
     ByteSwapped,
     Const,
+    Enum,
     Float64l,
     If,
     Int8ul,
@@ -91,7 +92,7 @@ BLOCK_HEADER = (
         BitStruct(
             "reserved" / BitsInteger(2),
             "facet" / BitsInteger(3),
-            "region" / BitsInteger(2) * "0 sparse, 1 slow, 3 centre",
+            "region" / Enum(BitsInteger(2), sparse=0, slow=1, centre=3),
             *(
                 make_difference(f"tilt_{channel}", bits)
                 for channel, bits in ((3, 9), (2, 9), (1, 8))
@@ -107,7 +108,7 @@ BLOCK_HEADER = (
 PIXEL = ByteSwapped(
     BitStruct(
         "elongation" / BitsInteger(4),
-        "type" / BitsInteger(2) * "0 normal, 1 ground, 2 fog",
+        "type" / Enum(BitsInteger(2), normal=0, ground=1, fog=2),
         "second" / BitsInteger(1) * "1: second return",
         "strength" / BitsInteger(8) * "reflectance or intensity, see flags; 255: reflector",
         "radius"
@@ -150,7 +151,8 @@ def make_packet(returns: int) -> Struct:
                 "last_packet" / BitsInteger(1),
                 "last_part" / BitsInteger(1),
                 "confidence" / BitsInteger(2),
-                "returns" / BitsInteger(3) * "1 single, 2 two strongest, 3 strongest and farthest",
+                "returns"
+                / Enum(BitsInteger(3), single=1, two_strongest=2, strongest_and_farthest=3),
                 "reflectance" / BitsInteger(1) * "1: strength is reflectance, else intensity",
                 "upwards" / BitsInteger(1),
             )

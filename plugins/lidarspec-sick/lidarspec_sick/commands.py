@@ -83,7 +83,7 @@ MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
     "state": (
         "sRA",
         "SCdevicestate",
-        ("readiness" / Int8ub * "0 busy, 1 ready, 2 error, 3 standby",),
+        ("readiness" / Enum(Int8ub, busy=0, ready=1, error=2, standby=3),),
     ),
     "ask_identity": ("sRN", "DeviceIdent", ()),
     "identity": (

@@ -19,6 +19,7 @@ from construct import (
     Bytes,
     Const,
     Construct,
+    Enum,
     Float32b,
     If,
     Int8ub,
@@ -109,8 +110,8 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "device" / Int16ub,
         "serial" / Int32ub,
         "status"
-        / Array(2, Int8ub)
-        * "0 0 ok, 0 1 error, 0 2 pollution warning, 0 4 pollution error",
+        / Array(2, Enum(Int8ub, ok=0, error=1, pollution_warning=2, pollution_error=4))
+        * "the second value counts",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
         "time" / Scaled(Int32ub, 1, "us") * "start of the scan, since power-up",

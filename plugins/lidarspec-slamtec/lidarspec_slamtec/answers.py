@@ -66,8 +66,18 @@ MAX_DISTANCE = 0x74
 ANSWER_TYPE = 0x75
 MODE_NAME = 0x7F
 
+KEYS = {
+    "mode_count": MODE_COUNT,
+    "typical_mode": TYPICAL_MODE,
+    "us_per_sample": US_PER_SAMPLE,
+    "max_distance": MAX_DISTANCE,
+    "answer_type": ANSWER_TYPE,
+    "mode_name": MODE_NAME,
+}
+KEY = Enum(Int32ul, **KEYS)
+
 #: Streams -> the type of their descriptors.
-STREAMS = {"scan": 0x81, "express": 0x82, "hq": 0x83, "ultra": 0x84, "dense": 0x85}
+STREAMS = {"node": 0x81, "express": 0x82, "hq": 0x83, "ultra": 0x84, "dense": 0x85}
 STREAMS |= {"ultra_dense": 0x86}
 
 #: The configuration values of fixed width, by key.
@@ -125,19 +135,19 @@ def make_config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
 
 CONFIG = Struct(
     *make_descriptor(0x20, SINGLE, BitsInteger(30)),
-    "key" / Int32ul,
+    "key" / KEY,
     "value"
     / Switch(
         this.key,
-        {key: Struct(value) for key, value in VALUES.items()},
+        {name: Struct(VALUES[key]) for name, key in KEYS.items() if key in VALUES},
         default=Struct(
-            "data" / Bytes(this._.descriptor.length - 4) * "7F: name of the mode, terminated by 00"
+            "data" / Bytes(this._.descriptor.length - 4) * "mode_name: text, terminated by 00"
         ),
     ),
 )
 CONFIG_SET = Struct(
     *make_descriptor(0x21, SINGLE, BitsInteger(30)),
-    "key" / Int32ul,
+    "key" / KEY,
     "data" / Bytes(this.descriptor.length - 4),
 )
 

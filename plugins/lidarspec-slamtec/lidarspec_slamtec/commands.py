@@ -31,13 +31,13 @@ CAPSULE_DESCRIPTORS = (
 ANY_KEY = ("key", 0, 0xFFFF_FFFF)
 
 
-def make_plain_request(cmd: int, **more: Any) -> Command:
+def make_plain_request(cmd: str, **more: Any) -> Command:
     """Return the command for a request without payload and reply."""
     return Command("request", {"cmd.number": cmd}, **more)
 
 
 def make_request(
-    frame: str, reply: str | tuple[str, ...], values: Mapping[str, int] | None = None, **more: Any
+    frame: str, reply: str | tuple[str, ...], values: Mapping[str, Any] | None = None, **more: Any
 ) -> Command:
     """Return the command for a request with a reply.
 
@@ -77,14 +77,16 @@ def make_express_request(mode: int | None = None) -> Command:
 
 
 COMMANDS = {
-    "stop": make_plain_request(0x25, settle=STOP_DELAY_S, stops=True),
-    "reset": make_plain_request(0x40, settle=RESET_DELAY_S, stops=True),
-    "scan": make_request("request", "scan_descriptor", {"cmd.number": 0x20}, starts=True),
-    "force_scan": make_request("request", "scan_descriptor", {"cmd.number": 0x21}, starts=True),
+    "stop": make_plain_request("stop", settle=STOP_DELAY_S, stops=True),
+    "reset": make_plain_request("reset", settle=RESET_DELAY_S, stops=True),
+    "scan": make_request("request", "scan_descriptor", {"cmd.number": "scan"}, starts=True),
+    "force_scan": make_request(
+        "request", "scan_descriptor", {"cmd.number": "force_scan"}, starts=True
+    ),
     "express_scan": make_express_request(),
-    "get_info": make_request("request", "info", {"cmd.number": 0x50}),
-    "get_health": make_request("request", "health", {"cmd.number": 0x52}),
-    "get_samplerate": make_request("request", "sample_rate", {"cmd.number": 0x59}),
+    "get_info": make_request("request", "info", {"cmd.number": "get_info"}),
+    "get_health": make_request("request", "health", {"cmd.number": "get_health"}),
+    "get_samplerate": make_request("request", "sample_rate", {"cmd.number": "get_samplerate"}),
     "get_config": make_request("config_request", "config", args={"key": ANY_KEY}, echoes=("key",)),
     "get_mode_config": make_request(
         "mode_config_request",

@@ -12,6 +12,7 @@ from construct import (
     Bytes,
     Const,
     Construct,
+    Enum,
     Int8ul,
     Int16ul,
     Int32ul,
@@ -20,8 +21,26 @@ from construct import (
 )
 
 from lidarspec.spec import Checksummed, Frame, Scaled, Xor
+from lidarspec_slamtec.answers import KEY
 
 START = Const(b"\xa5")
+#: Codes of requests without a payload, and with one.
+PLAIN_CODES = {
+    "scan": 0x20,
+    "force_scan": 0x21,
+    "stop": 0x25,
+    "reset": 0x40,
+    "get_info": 0x50,
+    "get_health": 0x52,
+    "get_samplerate": 0x59,
+}
+PAYLOAD_CODES = {
+    "express_scan": 0x82,
+    "get_config": 0x84,
+    "motor_speed": 0xA8,
+    "motor_duty": 0xF0,
+    "get_accessory": 0xFF,
+}
 
 
 def make_request(*fields: Construct) -> Checksummed:
@@ -43,11 +62,12 @@ PLAIN = Struct(
     "start" / START,
     "cmd"
     / BitStruct(
-        "payload" / Const(0, BitsInteger(1)) * "0: no payload follows", "number" / BitsInteger(7)
+        "payload" / Const(0, BitsInteger(1)) * "0: no payload follows",
+        "number" / Enum(BitsInteger(7), **PLAIN_CODES),
     ),
 )
 PAYLOAD = make_request(
-    "cmd" / Int8ul * "80 or above",
+    "cmd" / Enum(Int8ul, **PAYLOAD_CODES) * "80 or above",
     "size" / Int8ul * "bytes of the payload",
     "payload" / Bytes(this.size),
 )
@@ -61,9 +81,9 @@ REQUESTS = {
         "flags" / Int16ul,
         "param" / Int16ul,
     ),
-    "config_request": make_payload_request(0x84, 4, "key" / Int32ul),
+    "config_request": make_payload_request(0x84, 4, "key" / KEY),
     "mode_config_request": make_payload_request(
-        0x84, 6, "key" / Int32ul, "mode" / Int16ul * "requested scan mode"
+        0x84, 6, "key" / KEY, "mode" / Int16ul * "requested scan mode"
     ),
     "rpm_request": make_payload_request(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stop"),
     "pwm_request": make_payload_request(0xF0, 2, "duty" / Int16ul * "0: stop, 1023: full speed"),

@@ -140,7 +140,7 @@ NAV_TIMEUTC = make_ubx(  # p. 168
     "second" / Int8ul * "to 60, a leap second",
     "valid"
     / BitStruct(
-        "standard" / BitsInteger(4) * "3: USNO, 5: European, 6: Soviet Union, 7: NTSC",
+        "standard" / Enum(BitsInteger(4), usno=3, european=5, soviet_union=6, ntsc=7),
         "reserved" / BitsInteger(1),
         "utc" / BitsInteger(1),
         "week" / BitsInteger(1),
@@ -159,14 +159,14 @@ TIM_TP = make_ubx(  # p. 183
     / BitStruct(
         "reserved" / BitsInteger(3),
         "error_invalid" / BitsInteger(1),
-        "raim" / BitsInteger(2) * "1: not active, 2: active",
+        "raim" / Enum(BitsInteger(2), not_active=1, active=2),
         "utc" / BitsInteger(1) * "1: UTC is available",
-        "time_base" / BitsInteger(1) * "0: GNSS, 1: UTC",
+        "time_base" / Enum(BitsInteger(1), gnss=0, utc=1),
     ),
     "reference"
     / BitStruct(
         "utc_standard" / BitsInteger(4),
-        "gnss" / BitsInteger(4) * "0: GPS, 1: GLONASS, 2: BeiDou, 15: unknown",
+        "gnss" / Enum(BitsInteger(4), gps=0, glonass=1, beidou=2, unknown=15),
     ),
 )
 

@@ -47,6 +47,19 @@ from lidarspec_velodyne.frames import BLOCKS, CLOCK_WRAP_S, SLOTS, SPEED_LIMITS_
 UPPER_BANK = 0xFFEE
 LOWER_BANK = 0xFFDD
 MAX_CALIBRATION_BYTES = 1 << 20
+#: Meanings of the status byte, which change from packet to packet.
+STATUS_LETTERS = {
+    "hours": "H",
+    "minutes": "M",
+    "seconds": "S",
+    "day": "D",
+    "month": "N",
+    "year": "Y",
+    "gps": "G",
+    "temperature": "T",
+    "version": "V",
+    "others_in_turn": "W",
+}
 CORRECTION_NAMES = (
     "rotCorrection_",
     "vertCorrection_",
@@ -167,8 +180,8 @@ DATA = Struct(
     "blocks" / Array(BLOCKS, BLOCK),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time of the first firing, since the full hour",
     "status_type"
-    / Int8ul
-    * "letter: H, M, S time, D, N, Y date, G GPS, T temperature, V version, W others in turn",
+    / Enum(Int8ul, **{name: ord(letter) for name, letter in STATUS_LETTERS.items()})
+    * "an ASCII letter",
     "status_value" / Int8ul,
 )
 

@@ -7,7 +7,7 @@ from typing import Any
 from lidarspec import Sensor
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.exports.reference import effect
-from lidarspec.frames.commands import argument_slot, list_choices
+from lidarspec.frames.commands import argument_slot, has_only_names, list_choices
 from lidarspec.spec.arguments import Range
 
 
@@ -58,7 +58,8 @@ def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
     if not isinstance(kind, Range):
         text = ": ".join(filter(None, (info.docs, format_argument_type(kind))))
         return {**field, "text": text, "low": None, "high": None, "choices": []}
-    choices = [
-        {"value": f"{value:g}", "text": label} for label, value in list_choices(info, kind).items()
-    ]
+    names = list_choices(info, kind)
+    choices = []
+    if has_only_names(kind, names):
+        choices = [{"value": f"{value:g}", "text": label} for label, value in names.items()]
     return {**field, "text": info.docs, "low": kind.low, "high": kind.high, "choices": choices}

@@ -64,10 +64,27 @@ ANSWERS = {
         ),
     ),
 }
-REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Int8ul), direction="out")
+CODES = {
+    "rotate_forward": 0x06,
+    "rotate_back": 0x07,
+    "faster": 0x09,
+    "slower": 0x0A,
+    "faster_1hz": 0x0B,
+    "slower_1hz": 0x0C,
+    "get_speed": 0x0D,
+    "scan": 0x60,
+    "force_scan": 0x61,
+    "stop": 0x65,
+    "reset": 0x80,
+    "get_info": 0x90,
+    "get_health": 0x92,
+    "next_rate": 0xD0,
+    "get_rate": 0xD1,
+}
+REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Enum(Int8ul, **CODES)), direction="out")
 
 
-def make_request(cmd: int, reply: str | None = None, **more: Any) -> Command:
+def make_request(cmd: str, reply: str | None = None, **more: Any) -> Command:
     """Return the command for a request without payload."""
     return Command("request", {"cmd": cmd}, reply=reply, **more)
 
@@ -75,19 +92,19 @@ def make_request(cmd: int, reply: str | None = None, **more: Any) -> Command:
 COMMANDS = {
     "start_motor": Command(lines={"dtr": True}, settle=MOTOR_START_DELAY_S),
     "stop_motor": Command(lines={"dtr": False}),
-    "scan": make_request(0x60, "scan_start", retries=1, starts=True),
-    "force_scan": make_request(0x61, "scan_start", retries=1, starts=True),
-    "stop": make_request(0x65, stops=True, settle=STOP_DELAY_S),
-    "get_info": make_request(0x90, "info", retries=1, only_stopped=True),
-    "get_health": make_request(0x92, "health", retries=1, only_stopped=True),
-    "reset": make_request(0x80, stops=True),
-    "faster": make_request(0x09, "speed", only_stopped=True),
-    "slower": make_request(0x0A, "speed", only_stopped=True),
-    "faster_1hz": make_request(0x0B, "speed", only_stopped=True),
-    "slower_1hz": make_request(0x0C, "speed", only_stopped=True),
-    "get_speed": make_request(0x0D, "speed", retries=1, only_stopped=True),
-    "rotate_forward": make_request(0x06, "setting", retries=1, only_stopped=True),
-    "rotate_back": make_request(0x07, "setting", retries=1, only_stopped=True),
-    "next_rate": make_request(0xD0, "setting", only_stopped=True),
-    "get_rate": make_request(0xD1, "setting", retries=1, only_stopped=True),
+    "scan": make_request("scan", "scan_start", retries=1, starts=True),
+    "force_scan": make_request("force_scan", "scan_start", retries=1, starts=True),
+    "stop": make_request("stop", stops=True, settle=STOP_DELAY_S),
+    "get_info": make_request("get_info", "info", retries=1, only_stopped=True),
+    "get_health": make_request("get_health", "health", retries=1, only_stopped=True),
+    "reset": make_request("reset", stops=True),
+    "faster": make_request("faster", "speed", only_stopped=True),
+    "slower": make_request("slower", "speed", only_stopped=True),
+    "faster_1hz": make_request("faster_1hz", "speed", only_stopped=True),
+    "slower_1hz": make_request("slower_1hz", "speed", only_stopped=True),
+    "get_speed": make_request("get_speed", "speed", retries=1, only_stopped=True),
+    "rotate_forward": make_request("rotate_forward", "setting", retries=1, only_stopped=True),
+    "rotate_back": make_request("rotate_back", "setting", retries=1, only_stopped=True),
+    "next_rate": make_request("next_rate", "setting", only_stopped=True),
+    "get_rate": make_request("get_rate", "setting", retries=1, only_stopped=True),
 }
