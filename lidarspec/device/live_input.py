@@ -31,6 +31,7 @@ from lidarspec.errors import (
     UsageError,
     refuse_text,
     suggest,
+    suggestion,
 )
 from lidarspec.framing.decoder import Decoder, select_backend as backend_named
 from lidarspec.framing.results import Counters, Frames
@@ -269,7 +270,11 @@ class LiveInput(DeviceInput):
         with self._session_lock:
             self._find_own_endpoint(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
-            self._send_outgoing()
+            failure = self._send_outgoing()
+        if failure is not None and pending.done and pending.failure is None:
+            # Without a reply, nothing else reports that the command was not sent.
+            error = CommandError(f"{self.sensor.id} {name}: {failure}")
+            raise suggest(error, suggestion(failure)) from None
         while not pending.done:
             if self._failure is not None:
                 raise self._failure
@@ -575,8 +580,13 @@ class LiveInput(DeviceInput):
                     for name in changed
                 ]
 
-    def _send_outgoing(self) -> None:
-        """Send the outgoing data of the session; fail its requests if that is impossible."""
+    def _send_outgoing(self) -> LidarSpecError | None:
+        """Send the outgoing data of the session; fail its requests if that is impossible.
+
+        Returns:
+            The error; None if everything was sent.
+        """
+        failure: LidarSpecError | None = None
         for outgoing in self._session.outgoing():
             try:
                 self._write(outgoing)
@@ -584,6 +594,8 @@ class LiveInput(DeviceInput):
                 raise
             except LidarSpecError as error:
                 self._session.abandon(str(error))
+                failure = error
+        return failure
 
     def _write(self, outgoing: OutgoingData) -> None:
         transport = self._open_link(outgoing.link)

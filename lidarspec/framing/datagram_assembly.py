@@ -50,16 +50,18 @@ class _PartialMessage:
         place: the offset in the input of the fragment that arrived first.
         at: the arrival time of this fragment, ns.
         parts: the payloads of the fragments by index.
+        size: the number of bytes in them.
     """
 
     count: int
     place: int
     at: int
     parts: dict[int, bytes] = field(default_factory=dict)
+    size: int = 0
 
-    @property
-    def size(self) -> int:
-        return sum(map(len, self.parts.values()))
+    def add(self, fragment: _Fragment) -> None:
+        self.parts[fragment.index] = fragment.payload
+        self.size += len(fragment.payload)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,7 @@ class FragmentAssembler:
             while len(self._waiting) >= MAX_WAITING_MESSAGES:
                 self._drop(next(iter(self._waiting)))
             partial = self._waiting[fragment.key] = _PartialMessage(fragment.count, place, time)
-        partial.parts[fragment.index] = fragment.payload
+        partial.add(fragment)
         if partial.size > self._longest:
             self._drop(fragment.key)
             return None

@@ -26,6 +26,7 @@ from lidarspec.framing.frame_engine import get_codec
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.clock_faults import ClockTimeline
 from lidarspec.simulation.faults import Faults, FaultyLink
+from lidarspec.simulation.fragmenter import Fragmenter
 from lidarspec.simulation.scenes import Scene, make_room
 from lidarspec.simulation.simulator import (
     FrameSimulation,
@@ -36,7 +37,7 @@ from lidarspec.simulation.simulator import (
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
 from lidarspec.spec.description import Answer, Command, Frame, Sweep
 from lidarspec.spec.enum_values import find_code
-from lidarspec.spec.links import Http, is_datagram
+from lidarspec.spec.links import Http, Udp, is_datagram
 from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
@@ -435,6 +436,10 @@ class SimulatedDevice:
         self._time = 0.0
         self._plug: int | None = None
         self._timeline = ClockTimeline(self.faults.clock)
+        self._fragmenter: Fragmenter | None = None
+        link = sensor.links.get("data")
+        if isinstance(link, Udp) and link.assembled is not None:
+            self._fragmenter = Fragmenter(sensor.id, link.assembled)
         if sensor.has_points:
             self._simulation(sensor.data_frame)
         check_clock_faults(sensor, self.faults.clock)
@@ -534,12 +539,19 @@ class SimulatedDevice:
         out: list[tuple[str, str, bytes]] = []
         for link, link_packets in packets.items():
             self.sent.update(frame for frame, _ in link_packets if frame)
-            arrived = self.lines[link].transmit(link_packets)
+            datagrams = self._split_messages(link_packets) if link == "data" else link_packets
+            arrived = self.lines[link].transmit(datagrams)
             if is_datagram(self.sensor.links[link]):
                 out += [(link, frame, data) for frame, data in arrived]
             elif arrived:
                 out.append((link, "", b"".join(data for _, data in arrived)))
         return out
+
+    def _split_messages(self, packets: list[Packet]) -> list[Packet]:
+        """Return the datagrams of messages that the link splits into fragments."""
+        if self._fragmenter is None:
+            return packets
+        return [(frame, part) for frame, data in packets for part in self._fragmenter.split(data)]
 
     @property
     def deadline(self) -> int | None:

@@ -23,6 +23,7 @@ from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.sensor_operations import Sensor
+from lidarspec.spec.description import Frame
 from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.syntax import get_member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
@@ -55,6 +56,15 @@ class FrameMaker:
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
         self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
+
+    @classmethod
+    def of_struct(cls, sensor: str, frame: Frame) -> FrameMaker:
+        """Return a maker for a struct that is no frame type of a sensor.
+
+        Args:
+            sensor: the id of the sensor, for errors.
+        """
+        return cls._of_parts(sensor, frame.tree, frame.room, {})
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:

@@ -80,7 +80,8 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     assert "ldrobot-ld06" in result.stderr
     assert "ldrobot-stl27l" in result.stderr
     assert run_json("parse", EXAMPLE.hex())["fits"] == [
-        name for name in ls.sensors() if name.startswith("ldrobot-")
+        *(name for name in ls.sensors() if name.startswith("ldrobot-")),
+        "oradar-ms200",
     ]
     assert (
         run_json("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"]

@@ -143,6 +143,15 @@ def test_the_demonstration_starts_the_sensor(sensor: Sensor) -> None:
     assert result.digest == result.recorded_digest
 
 
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems have no broadcast on the loopback"
+)
+def test_the_demonstration_finds_a_sensor_without_a_broadcast() -> None:
+    links = {"data": Udp(free_port()), "control": Udp(broadcast=free_port())}
+    sensor = dataclasses.replace(SENSOR, links=links, on_open=("hello",))
+    assert [reply.command for reply in demonstrate(sensor, turns=1).replies] == ["hello"]
+
+
 def test_a_simulated_source_needs_no_ports() -> None:
     for sensor in (TOLD, REPORTED):
         with ls.open("sim:?rate=max", sensor) as device:
@@ -190,6 +199,15 @@ def test_commands_over_the_data_link_go_to_the_sensor_before_it_sends() -> None:
         elsewhere = port.path.replace(f":{data}?", f":{free_port()}?")
         with ls.open(elsewhere, sensor) as device:
             assert device.latest(TIMEOUT_S).complete
+
+
+def test_a_command_without_an_address_is_an_error() -> None:
+    sensor = over_data(Udp(free_port()))
+    hello = dataclasses.replace(sensor.commands["hello"], reply=None, echoes=(), timeout=0.1)
+    sensor = dataclasses.replace(sensor, commands={"hello": hello}, simulation=Simulation())
+    source = f"udp://127.0.0.1:{sensor.links['data'].ports[0]}"
+    with pytest.raises(CommandError, match=r"hello: .*the address of the sensor is unknown"):
+        ls.open(source, sensor)
 
 
 @pytest.mark.parametrize("option", ["control", "src"])

@@ -50,7 +50,10 @@ def test_sensors_without_a_counter_are_known() -> None:
 
 def test_sensors_with_datagrams_that_count_no_losses_are_known() -> None:
     datagrams = [sensor for sensor in ls.sensors().values() if sensor.datagrams]
-    assert [sensor.id for sensor in datagrams if not sensor.counts_losses] == ["seyond-falcon"]
+    assert [sensor.id for sensor in datagrams if not sensor.counts_losses] == [
+        "benewake-ce30d",
+        "seyond-falcon",
+    ]
 
 
 @pytest.mark.parametrize("name", ["shape-paced", *UNCOUNTED, "ldrobot-ld06", "robosense-m1"])

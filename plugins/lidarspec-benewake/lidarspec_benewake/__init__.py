@@ -1,5 +1,7 @@
 """Benewake TFmini-S, TFmini Plus and TF-Luna: single-beam rangefinders, which stream over a UART.
 
+The CE30-D, a lidar over UDP, is in `ce30d`.
+
 Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections,
 and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The first TFmini sends
 the same frames with other data in place of the temperature, and has other commands. Distances are
@@ -33,6 +35,7 @@ from lidarspec.spec import (
     Sum,
     hookimpl,
 )
+from lidarspec_benewake.ce30d import CE30D
 
 # A distance is unreliable if the strength is below the first or equal to the second value
 # (TFmini-S 5.3, TF-Luna 5.4).
@@ -255,10 +258,11 @@ def make_rangefinder(name: str) -> Sensor:
     )
 
 
-TFMINI, TFMINI_PLUS, TF_LUNA = SENSORS = [make_rangefinder(name) for name in MODELS]
+TFMINI, TFMINI_PLUS, TF_LUNA = [make_rangefinder(name) for name in MODELS]
+SENSORS = [TFMINI, TFMINI_PLUS, TF_LUNA, CE30D]
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """Return the Benewake rangefinders."""
+    """Return the Benewake sensors."""
     return SENSORS

@@ -1,4 +1,4 @@
-"""SICK scanners with LMDscandata, and multiScan and picoScan with compact telegrams."""
+"""SICK scanners with LMDscandata, multiScan and picoScan with compact telegrams, microScan3."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from lidarspec.spec import Sensor, hookimpl
 from lidarspec_sick.compact import COMPACT
+from lidarspec_sick.safety import MICROSCAN3 as MICROSCAN3
 from lidarspec_sick.scanners import SCANNERS
 
 TIM551, TIM561, TIM571, TIM781, TIM781S, TIM871S, LMS111, LMS151, LMS511, MRS1104 = SCANNERS
@@ -15,4 +16,4 @@ MULTISCAN136, PICOSCAN150 = COMPACT
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
     """Return the SICK scanners."""
-    return [*SCANNERS, *COMPACT]
+    return [*SCANNERS, *COMPACT, MICROSCAN3]
