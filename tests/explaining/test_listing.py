@@ -70,7 +70,7 @@ def test_differences_are_listed_by_field_and_bit() -> None:
 def test_fields_of_one_frame_only_are_listed_together() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
-    head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
+    head = dict(mt=dict(m=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))
     parts = [
         explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)
     ]
