@@ -10,6 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.spec import Chunk
 from tests.cli.running import ran
+from tests.evidence import capture
 
 ID = "livox-mid360"
 BEGAN_NS = 1_767_000_000 * 10**9
@@ -83,3 +84,21 @@ def test_a_clock_that_nothing_sets_is_no_problem_for_doctor(tmp_path: Path) -> N
     diagnoses = json.loads(ran("doctor", path, "--json").stdout)
     assert all(one["ok"] for one in diagnoses)
     assert "not synchronized" in diagnoses[-1]["text"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "verdict", "state"),
+    [
+        ("velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap", "not_locked", "no PPS"),
+        ("robosense/helios16p/packets.derived.pcap", "not_locked", "internal clock"),
+        ("hesai/xt32/packets.derived.pcap", "wrong_date", ""),
+        ("hesai/qt64/packets.derived.pcap", "wrong_date", ""),
+    ],
+)
+def test_the_verdict_on_a_capture_agrees_with_its_status(
+    name: str, verdict: str, state: str
+) -> None:
+    report = json.loads(ran("clock", capture(name), "--json", code=1).stdout)
+    assert report["findings"][0]["code"] == verdict
+    assert report["state"] == state

@@ -9,6 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.packets.clock_status import read_clock_status
+from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import ClockStatus
 from tests.shapes import SHAPES
 from tests.shapes.synced import FREE, HOLDOVER, LOCKED, STATES
@@ -40,6 +41,15 @@ def test_a_report_applies_to_the_packets_after_it() -> None:
     np.testing.assert_array_equal(with_reports[1:], [FREE, LOCKED])
     without = read_clock_status(sensor.decode(datagrams[:1]))
     assert np.isnan(without).all()
+
+
+def test_the_state_is_unknown_before_the_first_report() -> None:
+    sensor = with_status(ClockStatus("sync", STATES, frame="report"))
+    decoder = sensor.decoder()
+    stream = PacketStream(sensor, "data", decoder.stats)
+    report = SYNCED.build("report", sync=LOCKED, load=0)
+    packets = stream.add([decoder.datagrams([data(FREE, 0), report, data(FREE, 1)])])
+    np.testing.assert_array_equal(read_clock_status(packets), [np.nan, LOCKED])
 
 
 def test_the_frame_of_a_status_must_exist() -> None:
