@@ -216,7 +216,7 @@ class CaptureThread:
         self._clock = clock or HostClock()
         self.warnings = list[str]()
         self._stop = threading.Event()
-        self._handing = threading.Lock()
+        self._recording_lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"capture of {link}", daemon=True)
         self._thread.start()
 
@@ -232,12 +232,12 @@ class CaptureThread:
 
         All events that are taken from the queue afterwards are in the recording.
         """
-        while not self._handing.acquire(timeout=POLL_S):
+        while not self._recording_lock.acquire(timeout=POLL_S):
             self._queue.take(0.0)  # the thread may wait for room in the queue
         self._log = log
         while self._queue.take(0.0):
             pass
-        self._handing.release()
+        self._recording_lock.release()
 
     def _run(self) -> None:
         try:
@@ -257,7 +257,7 @@ class CaptureThread:
                     continue
                 if chunks:
                     self.last_arrival = time.monotonic()
-                    self._hand_on(chunks, gap=gap, quiet=quiet)
+                    self._record_and_queue(chunks, gap=gap, quiet=quiet)
                     silence = 0.0
                     gap = False
                     quiet = False
@@ -269,7 +269,7 @@ class CaptureThread:
         except BaseException as error:
             self._queue.put(self._link, [error])
 
-    def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
+    def _record_and_queue(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
         """Record and queue chunks.
 
         Args:
@@ -278,14 +278,14 @@ class CaptureThread:
         """
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
-        self._follow_wall_clock(chunks[0])
-        with self._handing:
+        self._check_wall_clock(chunks[0])
+        with self._recording_lock:
             if self._log is not None:
                 for chunk in chunks:
                     self._log.write(chunk)
             self._queue.put(self._link, chunks)
 
-    def _follow_wall_clock(self, chunk: Chunk) -> None:
+    def _check_wall_clock(self, chunk: Chunk) -> None:
         """Warn if the computer's wall clock was set, and record the change.
 
         Arrival times continue without a step.

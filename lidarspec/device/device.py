@@ -203,7 +203,7 @@ class Device(ClosingContext):
         if frame is None:
             self.sensor.require_points()
         reader = self._get_reader(frame)
-        ahead = self._take_ahead()
+        ahead = self._take_batch_of_latest()
         yield_timer = _YieldTimer(wait)
         for batch in self._iter_batches(wait, ahead):
             packets = None
@@ -239,7 +239,7 @@ class Device(ClosingContext):
         """
         readers = {frame: self._get_reader(frame) for frame in frames}
         yield_timer = _YieldTimer(wait)
-        for batch in self._iter_batches(wait, self._take_ahead()):
+        for batch in self._iter_batches(wait, self._take_batch_of_latest()):
             packets_by_frame = dict[str, Packets]()
             if batch is not None:
                 for frame, reader in readers.items():
@@ -298,7 +298,7 @@ class Device(ClosingContext):
         if not self.sensor.imu_frames:
             raise UsageError(f"{self.sensor.id}: no frame type contains IMU samples")
         reader = self._get_reader(None)
-        ahead = self._take_ahead()
+        ahead = self._take_batch_of_latest()
         yield_timer = _YieldTimer(wait)
         for batch in self._iter_batches(wait, ahead):
             if batch is not None and batch is not ahead:
@@ -523,7 +523,7 @@ class Device(ClosingContext):
 
     def _iter_scans(self, wait: float | None) -> Iterator[Scan | None]:
         reader = self._get_reader(None)
-        ahead = self._take_ahead()
+        ahead = self._take_batch_of_latest()
         yield_timer = _YieldTimer(wait)
         stream = self._make_scan_stream()
         for batch in self._iter_batches(wait, ahead):
@@ -550,7 +550,7 @@ class Device(ClosingContext):
         if batch.interrupted:
             self._latest_stream = None
 
-    def _take_ahead(self) -> FrameBatch | None:
+    def _take_batch_of_latest(self) -> FrameBatch | None:
         """Return the batch in which `latest` found the last returned scan of a file.
 
         A new iterator begins with this batch, so the other scans of the batch are no longer kept
@@ -593,7 +593,7 @@ class Device(ClosingContext):
     def _check_first_frames(self) -> list[str]:
         """Return warnings if the first frames belong to another model, or have unknown codes.
 
-        They are checked once: when enough of them have arrived, or at the end of the input.
+        The frames are checked once: when enough have arrived, or at the end of the input.
         """
         has_enough = len(self._first_frames) >= _MAX_CHECKED_FRAMES or self._input.ended
         if not self._is_checked and has_enough:

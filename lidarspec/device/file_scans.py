@@ -95,7 +95,7 @@ class FileScans(ClosingContext):
         self._added_warnings += warnings
 
     def __iter__(self) -> Iterator[Scan]:
-        while (scans := self._next()) is not None:
+        while (scans := self._read_next_scans()) is not None:
             yield from scans
         yield from self._stream.finish()
 
@@ -112,7 +112,7 @@ class FileScans(ClosingContext):
         """
         scan_count = 0
         end = self._offset + size
-        while (scans := self._next()) is not None:
+        while (scans := self._read_next_scans()) is not None:
             scan_count += sum(1 for _ in scans)
             if self._offset >= end and (bookmark := self._make_bookmark()) is not None:
                 return scan_count + self._stream.is_under_way, bookmark
@@ -122,7 +122,7 @@ class FileScans(ClosingContext):
         """Close the file."""
         self._input.close()
 
-    def _next(self) -> Iterator[Scan] | None:
+    def _read_next_scans(self) -> Iterator[Scan] | None:
         """Return the scans that the next batch of frames completes; None at the end."""
         batch = self._input.next(0)
         if batch is None:

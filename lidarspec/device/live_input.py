@@ -321,7 +321,7 @@ class LiveInput(DeviceInput):
         data = self._captures["data"].transport
         is_known = (
             link in self._captures
-            or self._host()
+            or self._find_sensor_host()
             or has_control(self._source)
             or _is_broadcast(self.sensor.links.get(link))
         )
@@ -494,7 +494,7 @@ class LiveInput(DeviceInput):
             self._senders.choose(address)
         return mine
 
-    def _host(self) -> str | None:
+    def _find_sensor_host(self) -> str | None:
         """Return the address of the sensor; None if unknown."""
         replying_hosts = [
             sender_filter.address[0]
@@ -614,7 +614,7 @@ class LiveInput(DeviceInput):
         if link not in self._captures:
             data = self._captures["data"].transport
             opened = data.link(link) or control_link(
-                self._source, link, self.sensor.links[link], self._host()
+                self._source, link, self.sensor.links[link], self._find_sensor_host()
             )
             if _is_broadcast(self.sensor.links[link]):
                 self._broadcast_senders[link] = SenderFilter(

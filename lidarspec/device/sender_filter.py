@@ -157,7 +157,7 @@ class SenderFilter(SenderCheck):
                 for earlier in mine:
                     self._count_foreign(earlier.sender)
                 mine = []
-            if chunk.sender is None or self._is_ours(chunk.sender):
+            if chunk.sender is None or self._is_sensor(chunk.sender):
                 mine.append(chunk)
             else:
                 self._count_foreign(chunk.sender)
@@ -209,9 +209,9 @@ class SenderFilter(SenderCheck):
         if self._is_sure or (names and owner is None):
             self._owner = self._current[""] = sender
         current = owner or self._first
-        return current is not None and self._owner is not None and not self._is_ours(current)
+        return current is not None and self._owner is not None and not self._is_sensor(current)
 
-    def _is_ours(self, sender: Sender) -> bool:
+    def _is_sensor(self, sender: Sender) -> bool:
         if self._owner is None:
             self._first = self._first or (None if self._datagrams else sender)
             return self._first in (None, sender)

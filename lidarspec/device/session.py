@@ -370,7 +370,7 @@ class Session:
             filled = arguments
         data = self.sensor.command(name, **filled)
         command = self.sensor.commands[name]
-        tables = {reply: self._table(reply) for reply in command.replies}
+        tables = {reply: self._get_fields(reply) for reply in command.replies}
         if command.echoes:
             sent = self.sensor.parse(data, command.frame)
         else:
@@ -530,7 +530,7 @@ class Session:
             except UsageError as error:
                 raise CommandError(f"{error}; the sensor has reported this value") from None
 
-    def _table(self, frame: str) -> Mapping[str, FieldInfo]:
+    def _get_fields(self, frame: str) -> Mapping[str, FieldInfo]:
         return get_codec(self.sensor.frames[frame]).schema.fields
 
     def _advance(self, link: str, now: int) -> None:
@@ -569,7 +569,7 @@ class Session:
             differs = current.expected.find_differences(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
             reply = Reply(
-                current.name, item.frame, values, True, now, item.data, self._table(item.frame)
+                current.name, item.frame, values, True, now, item.data, self._get_fields(item.frame)
             )
             self._free_link(line, current, reply_count=1, since=now)
             self.unanswered.pop(current.name, None)
@@ -615,8 +615,10 @@ class Session:
             and now >= current.sent[0]
         ):
             self._free_link(line, current, reply_count=1, since=now)
-            why = _describe_labels(self._table(item.frame), values) or repr(
-                Reply(current.name, item.frame, values, True, now, fields=self._table(item.frame))
+            why = _describe_labels(self._get_fields(item.frame), values) or repr(
+                Reply(
+                    current.name, item.frame, values, True, now, fields=self._get_fields(item.frame)
+                )
             )
             current.pending.settle(
                 CommandError(

@@ -154,7 +154,7 @@ class Column(NDArrayOperatorsMixin):
             raise SpecError(
                 "only a field has elements, with one index for each array: f.columns[0].timestamp"
             )
-        return _column(self.batch, self.frame, f"{self.source}[{index}]")
+        return _read_column(self.batch, self.frame, f"{self.source}[{index}]")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if kwargs.get("out") is not None:
@@ -430,7 +430,7 @@ def align(
     if (
         columns
         and all(column.axes == columns[0].axes for column in columns)
-        and _only_numbers_beside(values)
+        and _need_no_alignment(values)
     ):
         arrays = [
             value.array if isinstance(value, Column) else np.asarray(value) for value in values
@@ -457,7 +457,7 @@ def align(
             )
     for at, places in named.items():
         for place, axis in places.items():
-            length = _length(values[at], axis)
+            length = _count_elements(values[at], axis)
             axes[place], lengths[place] = (
                 _merge_axis_names(axes[place], f"{axis}?" if length != 1 else None),
                 max(lengths[place], length),
@@ -473,7 +473,7 @@ def align(
             )
             arrays.append(value.lined_up(names))
         else:
-            arrays.append(_place(np.asarray(value), axes, lengths, batch.table))
+            arrays.append(_reshape_to_axes(np.asarray(value), axes, lengths, batch.table))
     if not len(batch):
         arrays = _cut_to_shortest(arrays)
     return arrays, tuple(axes), min((column.ready for column in columns), default=len(batch))
@@ -518,7 +518,7 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
     return min(first, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
 
 
-def _length(value: AlongAxis, axis: str) -> int:
+def _count_elements(value: AlongAxis, axis: str) -> int:
     """Return the number of elements along an array."""
     return int(
         value.array.shape[
@@ -527,7 +527,7 @@ def _length(value: AlongAxis, axis: str) -> int:
     )
 
 
-def _place(
+def _reshape_to_axes(
     array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table
 ) -> NDArray[Any]:
     """Reshape a plain array to the given axes, and name axes that have no name.
@@ -719,7 +719,7 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
     return ", ".join(texts)
 
 
-def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
+def _need_no_alignment(values: tuple[Any, ...]) -> bool:
     """Return whether all operands are columns or numbers."""
     return all(isinstance(value, Column | int | float) for value in values)
 
@@ -780,7 +780,7 @@ def field_column(
     axes = list[str | None]([None] * (array.ndim - 1))
     for name in info.axes:
         place = table.schema.places[name]
-        axes[place] = _axis(name, array.shape[1 + place], table, known=which is None)
+        axes[place] = _name_axis(name, array.shape[1 + place], table, known=which is None)
     return Column(array, tuple(axes), batch, source=info.path, frame=frame)
 
 
@@ -806,7 +806,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
     return add_axes(array, depth)
 
 
-def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
+def _name_axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
     """Return the name of an axis; None if it has one element, which no packet lacks."""
     if length != 1 or (
         known
@@ -861,10 +861,10 @@ class Fields:
         if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
             return Fields(self._batch, frame=AROUND)
         path = f"{self._prefix}{name}"
-        paths = _paths(self._batch, self._frame)
+        paths = _list_paths(self._batch, self._frame)
         base = without_indices(path)[0]
         if base in paths:
-            return _column(self._batch, self._frame, path)
+            return _read_column(self._batch, self._frame, path)
         if any(other.startswith(f"{base}.") for other in paths):
             return Fields(self._batch, f"{path}.", self._frame)
         axis = base.rpartition(".")[0]
@@ -887,12 +887,12 @@ class Fields:
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
     @property
-    def _is_around(self) -> bool:
+    def _is_other_type(self) -> bool:
         """Whether the fields belong to another frame type."""
         return bool(self._frame)
 
 
-def _paths(batch: Batch, frame: str) -> Iterable[str]:
+def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
     """Return the field paths of a batch, or of another frame type in its state."""
     if not frame:
         return batch.table.schema.columns
@@ -914,7 +914,7 @@ class _States:
         return Fields(self._batch, frame=name)
 
 
-def _column(batch: Batch, frame: str, path: str) -> Column:
+def _read_column(batch: Batch, frame: str, path: str) -> Column:
     """Return a field of a batch as a column.
 
     For a field of another frame type, the value of a packet is the value of the last such frame

@@ -213,7 +213,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         arrays, _, _ = align(
             tuple(samples), self.node.sample.batch
         )  # other operands are recorded as aligned arrays
-        table = _fold(function, values, arrays)
+        table = _fold_table_rows(function, values, arrays)
         if table is not None:
             return TracedColumn(table[0], self._tape).gather(table[1])
         args = tuple(
@@ -339,7 +339,9 @@ class TracedFields:
             return TracedFields(value, self._tape, path, read)
         if not value.frame:
             _check_raw(value.batch.table.schema, without_indices(path)[0])
-        return self._tape.add("state" if self._real._is_around else "field", read, (), value, path)
+        return self._tape.add(
+            "state" if self._real._is_other_type else "field", read, (), value, path
+        )
 
     def __getitem__(self, index: Any) -> TracedFields:
         before = self._read
@@ -359,7 +361,7 @@ def _check_raw(schema: Schema, path: str) -> None:
         raise UntraceableError(f"a Python function makes the values of {path}")
 
 
-def _fold(
+def _fold_table_rows(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
     """Apply a function to the rows of tables, instead of to the rows that are looked up.
@@ -565,7 +567,7 @@ class HeaderFunction:
             self._is_tried, self._terms = True, self._split_terms(batch, table)
         if self._terms is None:
             return [
-                self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))
+                self._made(term, len(batch)) for term in _to_terms(self._function(Fields(batch)))
             ]
         return [term(table) for term in self._terms]
 
@@ -574,13 +576,13 @@ class HeaderFunction:
             traced, _ = trace(self._function, make_sample(batch, table.groups[0]))
             return [
                 _ResultPart(Expression.of(term.node, table.schema), self._made)
-                for term in _several(traced)
+                for term in _to_terms(traced)
             ]
         except Exception:  # calling the function itself reports the error
             return None
 
 
-def _several(terms: Any) -> Sequence[Any]:
+def _to_terms(terms: Any) -> Sequence[Any]:
     if isinstance(terms, tuple | list):
         return terms
     return (terms,)
@@ -609,14 +611,14 @@ class _ResultPart:
             changes[1:] |= column[1:] != column[:-1]
         starts = np.flatnonzero(changes)
         if not len(starts):
-            return self._once([column[:1] for column in columns])
+            return self._get_cached([column[:1] for column in columns])
         if 2 * len(starts) > len(table):
             return self._compute(columns)
         starts = np.concatenate([[0], starts])
         values = self._compute([column[starts] for column in columns])
         return np.repeat(values, np.diff(starts, append=len(table)))
 
-    def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
+    def _get_cached(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
         """Return the integer for one packet, (1,), from the cache if its fields were seen before.
 
         Args:
@@ -739,7 +741,7 @@ def split_sum(value: Any, width: int) -> list[Term]:
     args = value.args
     if value.kind == "call" and get_only_field(value) is None:
         if function in FACTORS:
-            return _scale(value, split_sum(args[0], width), FACTORS[function])
+            return _scale_terms(value, split_sum(args[0], width), FACTORS[function])
         if function in (np.add, np.subtract):
             sign = 1.0 if function is np.add else -1.0
             return split_sum(args[0], width) + [
@@ -750,13 +752,13 @@ def split_sum(value: Any, width: int) -> list[Term]:
                 factor = np.asarray(args[1], np.float64)
             else:
                 factor = 1 / np.asarray(args[1], np.float64)
-            return _scale(value, split_sum(args[0], width), factor)
+            return _scale_terms(value, split_sum(args[0], width), factor)
         if function is np.multiply and not isinstance(args[0], Node):
-            return _scale(value, split_sum(args[1], width), np.asarray(args[0], np.float64))
+            return _scale_terms(value, split_sum(args[1], width), np.asarray(args[0], np.float64))
     return [Term(np.ones(()), full=value)]
 
 
-def _scale(value: Node, parts: list[Term], factor: Any) -> list[Term]:
+def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Multiply the terms of a sum by a factor.
 
     If a full term would be multiplied by a row, the whole product is returned as one term.

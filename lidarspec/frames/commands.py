@@ -122,7 +122,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     """
     declared = sensor.commands[name].arguments[argument]
     place = f"commands.{name}.args.{argument}"
-    slot = _slot(sensor, name, declared.path, place)
+    slot = _make_slot(sensor, name, declared.path, place)
     template = sensor.commands[name].templates.get(declared.path)
     if template is not None:
         return _template_slot(sensor, template, declared, argument, place)
@@ -159,7 +159,7 @@ def _template_slot(
     return ArgumentSlot(FieldInfo(declared.path, kind="bytes"), None, in_template=True)
 
 
-def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:
+def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:
     frame = sensor.commands[name].frame or ""
     names = split_path(path)
     table = make_schema(sensor.frames[frame].tree) if frame else None
@@ -285,7 +285,7 @@ def _resolve_filled(
         return given
     if isinstance(value, Port):
         return given or 0
-    slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
+    slot = _make_slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
         return _to_raw_value(slot, bytes(slot.room or 4))
     return raw_argument(slot, value, given, path, f"{sensor.id} {name}")

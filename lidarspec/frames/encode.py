@@ -178,9 +178,11 @@ class _Encoder:
         """Return the bytes of parts, and set the fields that count or measure them."""
         parts = get_member(self._given, node.axis, None)
         if parts is None:
-            raise self._missing(node.axis)
+            raise self._make_missing_error(node.axis)
         if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
-            raise self._wrong(self._shown(node.axis), "a list of its parts", parts)
+            raise self._make_value_error(
+                self._make_shown_path(node.axis), "a list of its parts", parts
+            )
         around = {}
         for ref in node.outer:
             value = self.read(ref.path)
@@ -198,7 +200,7 @@ class _Encoder:
             kind = kinds[index]
             part = parts[index]
             fill_in(kind.following, part, following, make_schema(kind.root).fields, node.axis)
-            prefix = self._shown(f"{node.axis}[{index}]")
+            prefix = self._make_shown_path(f"{node.axis}[{index}]")
             encoder = _Encoder(layouts[kind], part, self._place, prefix, around)
             encoded.insert(0, encoder.encode())
             following = len(encoded[0])
@@ -235,7 +237,7 @@ class _Encoder:
         if value is None:
             value = {}
         if not isinstance(value, Mapping):
-            raise self._wrong(shown, "a mapping of its fields", value)
+            raise self._make_value_error(shown, "a mapping of its fields", value)
         for child in node.members:
             path = f"{node.path}.{child.name}".strip(".")
             below = f"{shown}.{child.name}".strip(".")
@@ -255,7 +257,7 @@ class _Encoder:
                 return
             raise MissingField(shown, place=self._place)
         if not isinstance(value, list | tuple | bytes):
-            raise self._wrong(shown, "a list of its elements", value)
+            raise self._make_value_error(shown, "a list of its elements", value)
         if len(value) != count:
             raise UsageError(f"{self._place}: {shown}: expected {count} elements, got {len(value)}")
         for index, element in enumerate(value):
@@ -273,22 +275,22 @@ class _Encoder:
             for key in part.bits.keys:
                 if isinstance(key, int):
                     below = f"{below}[{key}]"
-                    found = self._element(found, key, below)
+                    found = self._get_element(found, key, below)
                 else:
                     below = f"{below}.{key}".strip(".")
                     if found is not None and not isinstance(found, Mapping):
-                        raise self._wrong(below, "a mapping of its fields", found)
+                        raise self._make_value_error(below, "a mapping of its fields", found)
                     found = None if found is None else found.get(key)
             if part.bits.flag and found is not None:
                 found = int(bool(found))
             self._add(part.info, names, below, found, 0)
 
-    def _element(self, array: Any, index: int, shown: str) -> Any:
+    def _get_element(self, array: Any, index: int, shown: str) -> Any:
         """Return an element of an array in a bit block."""
         if array is None:
             return None
         if not isinstance(array, list | tuple | bytes):
-            raise self._wrong(shown, "a list of its elements", array)
+            raise self._make_value_error(shown, "a list of its elements", array)
         if index >= len(array):
             raise MissingField(shown, place=self._place)
         return array[index]
@@ -313,7 +315,7 @@ class _Encoder:
             column.append(bytes(size) if info.kind == "bytes" else 0)
             return
         if info.const is not None and to_raw(info, value) != info.const:
-            raise self._wrong(shown, format_hex(info.const), value)
+            raise self._make_value_error(shown, format_hex(info.const), value)
         if info.adapter is not None:
             value = self._encode_adapted(info.adapter, shown, value, size)
         if info.kind == "bytes":
@@ -336,27 +338,29 @@ class _Encoder:
         if isinstance(value, int) and 0 <= value < 1 << 8 * size:
             value = value.to_bytes(size, "big")
         if not isinstance(value, bytes | bytearray):
-            raise self._wrong(shown, f"{size} bytes", value)
+            raise self._make_value_error(shown, f"{size} bytes", value)
         if len(value) != size:
             raise UsageError(f"{self._place}: {shown}: expected {size} bytes, got {len(value)}")
         return bytes(value)
 
     def _float(self, shown: str, value: Any) -> float:
         if not isinstance(value, int | float):
-            raise self._wrong(shown, "a number", value)
+            raise self._make_value_error(shown, "a number", value)
         return value
 
     def _integer(self, info: FieldInfo, shown: str, value: Any) -> int:
         raw = value if info.adapter is not None else to_raw(info, value)
         if not isinstance(raw, int):
             if info.labels and isinstance(raw, str):
-                raise self._wrong(shown, f"one of {', '.join(info.labels.values())}", raw)
-            raise self._wrong(shown, "an integer", raw)
+                raise self._make_value_error(
+                    shown, f"one of {', '.join(info.labels.values())}", raw
+                )
+            raise self._make_value_error(shown, "an integer", raw)
         low, high = info.limits
         if not low <= raw <= high:
             raise OutOfRange(shown, raw, low, high, place=self._place)
         if info.allowed is not None and raw not in info.allowed:
-            raise self._wrong(shown, format_values(info.allowed), raw)
+            raise self._make_value_error(shown, format_values(info.allowed), raw)
         return raw
 
     def _store(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
@@ -403,13 +407,14 @@ class _Encoder:
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
                 raise UsageError(
-                    f"{self._place}: {self._shown(axis)}: expected {count} parts, got"
+                    f"{self._place}: {self._make_shown_path(axis)}: expected {count} parts, got"
                     f" {len(parts[axis])}"
                 )
             _, walked = region.in_rows(row)
             if walked.status[0] != FOUND or walked.sizes[0] != region.size:
                 raise UsageError(
-                    f"{self._place}: {self._shown(axis)}: the sizes of the parts do not match"
+                    f"{self._place}: {self._make_shown_path(axis)}:"
+                    " the sizes of the parts do not match"
                     " the header"
                 )
         for condition in layout.conditions:
@@ -417,7 +422,7 @@ class _Encoder:
                 named = ", ".join(info.path for info in condition.fields)
                 raise UsageError(f"{self._place}: the condition on {named} is false")
 
-    def _shown(self, path: str) -> str:
+    def _make_shown_path(self, path: str) -> str:
         return f"{self._prefix}.{path}".strip(".")
 
     def _missing_count_error(self, path: str) -> UsageError:
@@ -425,13 +430,15 @@ class _Encoder:
         for axis, counting in self._schema.counting_fields.items():
             array = get_member(self._given, axis, None)
             if array is not None and counting == path:
-                return self._wrong(self._shown(axis), "a list of its elements", array)
-        return self._missing(path)
+                return self._make_value_error(
+                    self._make_shown_path(axis), "a list of its elements", array
+                )
+        return self._make_missing_error(path)
 
-    def _missing(self, path: str) -> MissingField:
-        return MissingField(self._shown(path), place=self._place)
+    def _make_missing_error(self, path: str) -> MissingField:
+        return MissingField(self._make_shown_path(path), place=self._place)
 
-    def _wrong(self, shown: str, expected: str, found: object) -> UsageError:
+    def _make_value_error(self, shown: str, expected: str, found: object) -> UsageError:
         return UsageError(
             f"{self._place}: {shown or 'frame'}: expected {expected}, got {found!r:.60}"
         )

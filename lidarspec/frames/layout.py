@@ -133,9 +133,9 @@ class Leaf:
         if self.wire is not None:
             return self._view(rows, self.wire, 0).astype(self._native)
         assert self.info.dtype is not None
-        if not self._packed:
-            return self._bits(rows, self.elements[0])
-        columns = [self._bits(rows, element) for element in self.elements]
+        if not self._is_packed:
+            return self._read_bits(rows, self.elements[0])
+        columns = [self._read_bits(rows, element) for element in self.elements]
         return np.stack(columns, axis=-1)
 
     def scalar(self, frame: bytes | memoryview) -> int:
@@ -189,7 +189,7 @@ class Leaf:
             self._view(rows, self.wire, 0)[...] = full.astype(self.wire.newbyteorder("="))
             return
         for index, element in enumerate(self.elements):
-            column = (full[..., index] if self._packed else full).astype(np.int64)
+            column = (full[..., index] if self._is_packed else full).astype(np.int64)
             for part in element.segments:
                 view = self._view(rows, np.dtype("u1"), part.byte)
                 bits = (column >> part.target << part.low).astype(np.uint8) & np.uint8(part.mask)
@@ -235,7 +235,7 @@ class Leaf:
         return self.wire.newbyteorder("=")
 
     @property
-    def _packed(self) -> bool:
+    def _is_packed(self) -> bool:
         """Whether the innermost array is inside the bit block, so that it has no stride."""
         return len(self.shape) > len(self.strides)
 
@@ -245,13 +245,13 @@ class Leaf:
             return np.empty((len(rows), *shape), dtype)
         return view_elements(rows, dtype, self.offset + offset, shape, self.strides)
 
-    def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
+    def _read_bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
         wide = np.dtype(f"u{self.info.dtype.itemsize}")
         total = (
-            self._within(rows, element.segments[0], wide)
+            self._read_bits_in_byte(rows, element.segments[0], wide)
             if len(element.segments) == 1
-            else self._whole(rows, element, wide)
+            else self._read_contiguous_bits(rows, element, wide)
         )
         if total is None:
             total = np.zeros((len(rows), *self.shape[: len(self.strides)]), wide)
@@ -265,7 +265,7 @@ class Leaf:
             return np.asarray(((total ^ sign) - sign).view(self.info.dtype))
         return total.astype(self.info.dtype, copy=False)
 
-    def _within(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
+    def _read_bits_in_byte(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
         """Return the values of bits within one byte."""
         total = self._view(rows, np.dtype("u1"), part.byte).astype(wide)
         if part.mask != 0xFF:
@@ -273,7 +273,9 @@ class Leaf:
             total >>= wide.type(part.low)
         return total
 
-    def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
+    def _read_contiguous_bits(
+        self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]
+    ) -> NDArray[Any] | None:
         """Return the values of contiguous bits, each read as one word.
 
         Each word ends with the last byte of the value. Returns None if the bits are not contiguous,

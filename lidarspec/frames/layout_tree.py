@@ -159,10 +159,10 @@ class HeaderWalk:
 
     def layout(self) -> Layout:
         """Return the layout that the walk found."""
-        held = self._held_bits()
+        held = self._find_held_bits()
         self.request = _raise_unknown  # the layout is known, so no other field may be requested
         seals = tuple(_order_seals(self.seals))
-        following = tuple(self._following())
+        following = tuple(self._iter_following())
         leaves = PathMapping(self.leaves, Leaf.element)
         found = (
             self.cursor,
@@ -189,7 +189,7 @@ class HeaderWalk:
         if path.startswith("_."):
             return self.given[path[2:]]
         if path not in self.parts and "[" in path:
-            return self._element(path)
+            return self._read_element(path)
         part = self.parts[path]
         if part is None:
             return None
@@ -199,7 +199,7 @@ class HeaderWalk:
             return self.request(part, self)
         return self.values[path]
 
-    def _element(self, path: str) -> int:
+    def _read_element(self, path: str) -> int:
         """Return the value of an array element that is before the formula."""
         base, indices = without_indices(path)
         if base in self.leaves:
@@ -277,7 +277,7 @@ class HeaderWalk:
         if count:
             self.visit(node.element, path, (*shape, count), (*strides, 0))
         else:
-            self._no_element(node.element, path, (*shape, count), (*strides, 0))
+            self._add_empty_array(node.element, path, (*shape, count), (*strides, 0))
         size = self.cursor - start
         depth = len(strides)
         self.empty += 0 if size else math.prod(shape) * count
@@ -364,7 +364,7 @@ class HeaderWalk:
         self.parts[node.total.path] = PartsSize(node.total, region)
         self.cursor += size
 
-    def _no_element(
+    def _add_empty_array(
         self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         """Add the fields of the element type of an empty array.
@@ -471,7 +471,7 @@ class HeaderWalk:
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
-    def _held_bits(self) -> dict[int, tuple[int, int]]:
+    def _find_held_bits(self) -> dict[int, tuple[int, int]]:
         """Return the bits of fields that contain the sizes of parts.
 
         They are constant within one layout.
@@ -493,7 +493,7 @@ class HeaderWalk:
         offsets = np.flatnonzero(rows[1]).tolist() if held_leaves else []
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
-    def _following(self) -> Iterator[tuple[Leaf, int]]:
+    def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
         """Yield fields with values that follow from constants and selectors, and the values."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
@@ -879,13 +879,13 @@ class HeaderTree:
             places: the candidates in their buffer, for reading single headers. If None, only `read`
                 is used.
         """
-        self._forget_many()
+        self._limit_cache()
         groups: list[Group] = []
         stack = [(self._root, np.arange(number))] if number else []
         while stack:
             node, which = stack.pop()
             if len(which) == 1 and places is not None:
-                node = self._end(places.longest(which), node, is_all=places.stops is not None)
+                node = self._find_end(places.longest(which), node, is_all=places.stops is not None)
             elif node.leaf is None and node.result is None:
                 data: bytes | memoryview = b"" if places is None else places.longest(which)
                 self._explore(node, data, is_all=places is not None and places.stops is not None)
@@ -958,10 +958,10 @@ class HeaderTree:
             is_all: whether the frame has no more bytes.
         """
         if since is None:
-            self._forget_many()
-        return self._end(frame, since or self._root, is_all=is_all)
+            self._limit_cache()
+        return self._find_end(frame, since or self._root, is_all=is_all)
 
-    def _forget_many(self) -> None:
+    def _limit_cache(self) -> None:
         """Remove all nodes if there are too many."""
         if self._size > MAX_CACHED_HEADERS:
             self._root = HeaderNode()
@@ -969,7 +969,7 @@ class HeaderTree:
 
     def layout(self, frame: bytes) -> Layout | LayoutRefusal | None:
         """Return the layout of one frame; None if its header is incomplete."""
-        return self._end(frame, self._root).result
+        return self._find_end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
         """Return the layout for these values of header fields.
@@ -980,7 +980,7 @@ class HeaderTree:
         Raises:
             Exception: the same as `find_layout`, or any error of `read`.
         """
-        self._forget_many()
+        self._limit_cache()
         node = self._root
         while node.result is None:
             if node.leaf is None:
@@ -991,7 +991,7 @@ class HeaderTree:
             return node.result
         return find_layout(self.root, node.values, self.limit, self._given)  # raises the error
 
-    def _end(
+    def _find_end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
     ) -> HeaderNode:
         """Return the last node for a header, starting from a node, as `_explore` does."""
@@ -1022,7 +1022,7 @@ class HeaderTree:
             node.leaf = leaf
             node.before = dict(walk.leaves)
             node.value_classes = self._get_value_classes(leaf)
-            node.constants = self._new_constants(walk)
+            node.constants = self._select_new_constants(walk)
             value = leaf.read_first(data)
             if value is None:
                 raise UnknownSelectorError(leaf)
@@ -1042,10 +1042,10 @@ class HeaderTree:
         except UnknownSelectorError:
             pass
         except CutOffError:
-            node.constants = self._new_constants(walk)
+            node.constants = self._select_new_constants(walk)
             node.least = walk.cursor
         except TooLongError:
-            node.result = LayoutRefusal(constants=self._new_constants(walk))
+            node.result = LayoutRefusal(constants=self._select_new_constants(walk))
         except UnknownPartError:
             node.result = LayoutRefusal(by_constant=True)
         except SpecError:
@@ -1062,7 +1062,7 @@ class HeaderTree:
             above.value_classes = above.value_classes.mark_too_long([*node.values.values()][-1])
         return node
 
-    def _new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
+    def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
         """Return the constants found by a walk, without those that all frames begin with.
 
         Candidates were already checked for the latter.

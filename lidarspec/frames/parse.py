@@ -70,7 +70,7 @@ def parse(
         WireError: if the bytes are not a valid frame of this type.
         UnknownFrame: if the sensor does not have this frame type.
     """
-    data = _as_bytes(data)
+    data = _to_bytes(data)
     typed_values = _try_parse_any(sensor, data, frame)
     if typed_values is None:
         typed_values = _parse_invalid(sensor, data, frame, verify=verify)
@@ -90,14 +90,14 @@ def identify(sensor: SensorDescription, data: bytes, *, frame: str | None = None
         WireError: if no type matches. The error describes the fault for the type that matches best.
         UnknownFrame: if the sensor does not have this frame type.
     """
-    data = _as_bytes(data)
+    data = _to_bytes(data)
     typed_values = _try_parse_any(sensor, data, frame)
     if typed_values is not None:
         return typed_values[0]
     return _parse_invalid(sensor, data, frame, verify=True)[0]
 
 
-def _as_bytes(data: bytes) -> bytes:
+def _to_bytes(data: bytes) -> bytes:
     if isinstance(data, bytes):
         return data
     refuse_text(data)

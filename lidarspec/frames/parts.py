@@ -310,7 +310,7 @@ class _PartWalk:
                 others = [active[~matches]]
             has_header = np.zeros(len(own), np.bool_)
             for layout, which in kind.layouts.classify(
-                self._buffer, self._ends[own], self._stops_of(own)
+                self._buffer, self._ends[own], self._select_stops(own)
             ):
                 has_header[which] = True
                 if isinstance(layout, LayoutRefusal):
@@ -333,7 +333,7 @@ class _PartWalk:
         self._status[active] = CONSTANT
         return pieces
 
-    def _stops_of(self, which: Offsets) -> Offsets | None:
+    def _select_stops(self, which: Offsets) -> Offsets | None:
         if self._stops is None:
             return None
         return self._stops[which]
@@ -344,7 +344,7 @@ class _PartWalk:
         """Return whether the next part of each frame has these constants; None if all have."""
         if constants:
             return match_constants_at(
-                self._buffer, self._ends[which], constants, self._stops_of(which)
+                self._buffer, self._ends[which], constants, self._select_stops(which)
             )
         return None
 

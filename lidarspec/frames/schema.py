@@ -124,7 +124,7 @@ class Schema:
         """The columns of a table by path: decoded fields and derived values."""
         every = {**self.fields, **self.derived}
         adapted = {
-            path: _adapt(info)
+            path: _apply_adapter(info)
             for path, info in every.items()
             if info.adapter is not None and info.adapter.has_columns
         }
@@ -231,7 +231,7 @@ class Schema:
         return len(self.chain)
 
 
-def _adapt(info: FieldInfo) -> FieldInfo:
+def _apply_adapter(info: FieldInfo) -> FieldInfo:
     """Return a field with the type of its decoded values."""
     assert info.adapter is not None
     dtype = info.adapter.dtype
@@ -296,7 +296,7 @@ def _find_branched(root: Node) -> frozenset[str]:
 def _add_struct_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[str, FieldInfo]:
     """Add the docs of the struct to each field without docs, and return the fields."""
     for path, info in fields.items():
-        docs = "" if info.docs else _docs_around(path, structs)
+        docs = "" if info.docs else _find_struct_docs(path, structs)
         if docs:
             fields[path] = replace(info, docs=docs)
     return fields
@@ -320,7 +320,7 @@ def _make_element(
     return replace(element, optional=True)
 
 
-def _docs_around(path: str, structs: Mapping[str, str]) -> str:
+def _find_struct_docs(path: str, structs: Mapping[str, str]) -> str:
     """Return the documentation of the innermost struct around an undocumented field."""
     while path and structs:
         path = path.rpartition(".")[0]

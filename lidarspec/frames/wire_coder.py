@@ -168,7 +168,7 @@ class FormCoder(Coder):
             decoded = self.decode_whole(data[:size])
         else:
             decoded = self.form.decode(data, _FieldFinder(self.tree))
-        return replace(decoded, problem=self._problem(data, size, decoded))
+        return replace(decoded, problem=self._find_problem(data, size, decoded))
 
     def decode_whole(self, data: bytes) -> Decoded:
         """Decode a frame that consists of exactly these bytes.
@@ -226,7 +226,7 @@ class FormCoder(Coder):
             elif self.form.is_text:
                 part[:] = part % 26 + ord("A")
 
-    def _problem(self, data: bytes, size: int, decoded: Decoded) -> Problem | None:
+    def _find_problem(self, data: bytes, size: int, decoded: Decoded) -> Problem | None:
         """Return the first error in bytes that should be one frame; None if they are valid."""
         begins = self.begins
         if not data or not data.startswith(begins):
@@ -307,7 +307,7 @@ def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[R
     inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))
     offsets = offsets[inside]
     owners = owners[inside]
-    all_sizes, all_kinds, all_little = _number_types(leaves)
+    all_sizes, all_kinds, all_little = _find_element_types(leaves)
     sizes = all_sizes[owners]
     ends = offsets + sizes
     is_text = all_kinds[owners] == "S"
@@ -332,7 +332,7 @@ def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[R
     return tuple(runs)
 
 
-def _number_types(
+def _find_element_types(
     leaves: Sequence[Leaf],
 ) -> tuple[NDArray[np.intp], NDArray[np.str_], NDArray[np.bool_]]:
     """Return the size, kind and byte order of one element of each field.

@@ -160,16 +160,16 @@ class ExaminedFrame:
 
     def parts_of(self, axis: str) -> list[ExaminedFrame]:
         """Return the parts at a path, up to the first invalid part."""
-        return self._examined_parts(axis).parts
+        return self._get_parts(axis).parts
 
     def broken_part(self, axis: str) -> ExaminedFrame | None:
         """Return the invalid part at a path; None if all parts are valid."""
-        examined = self._examined_parts(axis)
+        examined = self._get_parts(axis)
         if examined.is_whole:
             return None
         return examined.parts[-1]
 
-    def _examined_parts(self, axis: str) -> ExaminedParts:
+    def _get_parts(self, axis: str) -> ExaminedParts:
         if axis not in self._parts:
             self._parts[axis] = _examine_parts(self, axis)
         return self._parts[axis]

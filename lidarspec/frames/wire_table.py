@@ -115,13 +115,13 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
             return _format_length(node.size, shown)
         case tree.Struct():
             return sum(
-                (extent(member, _member_path(shown, member)) for member in node.members),
+                (extent(member, _make_member_path(shown, member)) for member in node.members),
                 SizeFormula(),
             )
         case tree.Sealed():
             return extent(node.body, shown)
         case tree.Repeat():
-            return extent(node.element, _element(shown)[0]).times(_count(node))
+            return extent(node.element, _make_element_path(shown)[0]).times(_format_count(node))
         case tree.PartSequence():
             return _format_length(node.within, shown)
         case tree.When() | tree.Select():
@@ -143,18 +143,18 @@ def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
 
 
-def _count(node: tree.Repeat) -> int | str:
+def _format_count(node: tree.Repeat) -> int | str:
     if isinstance(node.count, int):
         return node.count
     return format_formula(node.count)
 
 
-def _member_path(shown: str, member: tree.Node) -> str:
+def _make_member_path(shown: str, member: tree.Node) -> str:
     """Return the path of a member of a struct."""
     return ".".join(filter(None, (shown, member.name or tree.UNNAMED)))
 
 
-def _element(shown: str) -> tuple[str, str]:
+def _make_element_path(shown: str) -> tuple[str, str]:
     """Return the path of an array element, such as "points[i]", and the name of its index."""
     index = INDICES[shown.count("[") % len(INDICES)]
     return f"{shown}[{index}]", index
@@ -167,21 +167,23 @@ def _iter_rows(
     match node:
         case tree.Struct():
             for member in node.members:
-                below = _member_path(shown, member)
+                below = _make_member_path(shown, member)
                 yield from _iter_rows(member, below, start, condition, seals)
                 start = start + extent(member, below)
         case tree.Sealed():
             yield from _iter_rows(node.body, shown, start, condition, seals)
         case tree.Repeat():
-            element, index = _element(shown)
+            element, index = _make_element_path(shown)
             size = extent(node.element, element)
-            says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
-            yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
+            says = "; ".join(filter(None, (condition, f"{_format_count(node)} elements of {size}")))
+            yield WireRow(
+                str(start), str(size.times(_format_count(node))), "array", shown, "", says
+            )
             yield from _iter_rows(
                 node.element, element, start + size.times(index), condition, seals
             )
         case tree.PartSequence():
-            element, _ = _element(shown)
+            element, _ = _make_element_path(shown)
             yield WireRow(
                 str(start),
                 str(extent(node, shown)),
@@ -215,7 +217,7 @@ def _iter_rows(
                     part.info,
                     str(start),
                     *_describe_bits(part),
-                    _part(shown, part),
+                    _make_part_path(shown, part),
                     condition,
                     seals,
                 )
@@ -244,7 +246,7 @@ def _make_row(
     return WireRow(offset, size, kind, shown, unit_text(info), says)
 
 
-def _part(shown: str, part: tree.Part) -> str:
+def _make_part_path(shown: str, part: tree.Part) -> str:
     return ".".join(filter(None, (shown, *part.names))) + "".join(
         f"[{index}]" for index in part.indices
     )

@@ -306,7 +306,7 @@ class Candidates:
         self._live: dict[int, Frames] = {}
         self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
-        offsets_by_kind = self._find(mode)
+        offsets_by_kind = self._find_by_type(mode)
         limit = min(
             (
                 int(offsets[MAX_CANDIDATES])
@@ -324,14 +324,14 @@ class Candidates:
             }
         self.is_whole = len(self.buffer) == len(buffer)
         self.final = final and self.is_whole
-        self._judge(offsets_by_kind)
+        self._check(offsets_by_kind)
 
     def find_live(self, mode: SearchState) -> LiveCandidates | None:
         """Return the candidates that may be accepted; None if there are too many of them."""
-        offsets_by_kind = self._find(mode)
+        offsets_by_kind = self._find_by_type(mode)
         if any(len(offsets) > MAX_CANDIDATES for offsets in offsets_by_kind.values()):
             return None
-        self._judge(offsets_by_kind)
+        self._check(offsets_by_kind)
         parts = list[Frames]()
         all_runs = dict[int, WeakRuns]()
         active = self._framing.active_types(mode)
@@ -342,7 +342,7 @@ class Candidates:
             if self._framing.is_weak(kind):
                 runs = find_runs(
                     own,
-                    self._merge([*parts, *self._wait(active[: active.index(kind)])]),
+                    self._merge([*parts, *self._find_waiting(active[: active.index(kind)])]),
                     confirm=self._framing.codecs[kind].frame.confirm,
                     is_single=self._framing.switches(kind, mode),
                     final=self.final,
@@ -354,7 +354,7 @@ class Candidates:
             else:
                 own = self._live[kind] = select_live(own, final=self.final)
             parts.append(own)
-        frames = self._merge([*parts, *self._wait(active)])
+        frames = self._merge([*parts, *self._find_waiting(active)])
         ends = frames.starts + frames.sizes
         for kind, runs in all_runs.items():
             is_own = frames.kinds == kind
@@ -366,7 +366,7 @@ class Candidates:
             return merge_by_offset(parts)
         return Frames.make_empty(self.buffer)
 
-    def _wait(self, kinds: Sequence[int]) -> list[Frames]:
+    def _find_waiting(self, kinds: Sequence[int]) -> list[Frames]:
         """Return the candidates of some types whose constants have not all arrived.
 
         At each offset, only the candidate of the first type is returned.
@@ -388,7 +388,7 @@ class Candidates:
             )
         ]
 
-    def _find(self, mode: SearchState) -> dict[int, Offsets]:
+    def _find_by_type(self, mode: SearchState) -> dict[int, Offsets]:
         """Return the offsets at which the constants of each new type match, by type index."""
         groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active_types(mode):
@@ -410,7 +410,7 @@ class Candidates:
                 }
         return offsets_by_kind
 
-    def _judge(self, offsets_by_kind: Mapping[int, Offsets]) -> None:
+    def _check(self, offsets_by_kind: Mapping[int, Offsets]) -> None:
         self._known |= offsets_by_kind.keys()
         for kind, offsets in offsets_by_kind.items():
             number = self._count_arrived(kind, offsets)

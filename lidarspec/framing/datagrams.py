@@ -96,7 +96,7 @@ class _DatagramBatch:
         The last one is a frame that changes the active types, or the last datagram.
         """
         if mode.after not in self._known:
-            frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
+            frames, reasons = self._check(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
                 rows = (
                     np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position
@@ -122,7 +122,7 @@ class _DatagramBatch:
             mode.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
-    def _judge(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
+    def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
         """Return the type and layout of each datagram, and the reasons of invalid datagrams.
 
         All datagrams are checked with the active types of `mode`. The reason is 0 for datagrams
@@ -203,7 +203,7 @@ class _DatagramBatch:
         parts = list[Frames]()
         begun = 0
         for index in lost[reasons == PLUGIN].tolist():
-            alone = self._judge_alone(frames.select(slice(index, index + 1)), mode)
+            alone = self._check_alone(frames.select(slice(index, index + 1)), mode)
             if alone is None:
                 continue
             parts += [frames.select(slice(begun, index)), alone]
@@ -217,7 +217,7 @@ class _DatagramBatch:
             return Frames.join([*parts, frames.select(slice(begun, None))])
         return frames
 
-    def _judge_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
+    def _check_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
         """Return one datagram as a frame; count the reason and return None if it is invalid."""
         rejected = 0
         start = datagram.starts

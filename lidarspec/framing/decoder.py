@@ -184,13 +184,13 @@ class Decoder:
         if self._pending:
             held = len(self._pending)
             head = b"".join((self._pending, view[: max(self._least, self._need)]))
-            start = self._cut(np.frombuffer(head, np.uint8), at, parts) - held
+            start = self._find_frames(np.frombuffer(head, np.uint8), at, parts) - held
             if start < 0 or held + len(view) == len(head):
                 self._pending = head[start + held :]
                 start = len(view)
         if start < len(view):
             rest = np.frombuffer(view[start:], np.uint8)
-            self._pending = rest[self._cut(rest, at, parts, lasting=lasting) :].tobytes()
+            self._pending = rest[self._find_frames(rest, at, parts, lasting=lasting) :].tobytes()
         self.stats.pending = len(self._pending)
         return parts
 
@@ -199,9 +199,9 @@ class Decoder:
         parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:
-            self._drop(self._assembly.give_up())
+            self._count_dropped(self._assembly.give_up())
         if self._pending:
-            self._cut(np.frombuffer(self._pending, np.uint8), None, parts, final=True)
+            self._find_frames(np.frombuffer(self._pending, np.uint8), None, parts, final=True)
         self._pending = b""
         self.stats.pending = 0
         return parts
@@ -230,7 +230,7 @@ class Decoder:
             times = repeat(-1, len(data))
         else:
             times = np.array([-1 if one is None else one for one in at], np.int64)
-        return self.decode_placed(buffer, _places(sizes), sizes, times)
+        return self.decode_placed(buffer, _compute_offsets(sizes), sizes, times)
 
     def decode_placed(
         self,
@@ -254,7 +254,7 @@ class Decoder:
             total = int(sizes.sum())
         else:
             total = size * len(sizes)
-        places = _places(sizes, self._base)
+        places = _compute_offsets(sizes, self._base)
         joined = None
         if self.observer is not None:
             self.observer.observe_input(self, buffer, starts, sizes)
@@ -281,12 +281,12 @@ class Decoder:
             is_good = not np.count_nonzero(frames.kinds < 0)
         if self._gap or not is_good or (joined is not None and joined.dropped.any()):
             good = frames.kinds >= 0
-            gaps = self._lost(buffer, frames.starts, sizes, good, joined)
+            gaps = self._count_invalid(buffer, frames.starts, sizes, good, joined)
             if not is_good:
                 frames = frames.select(good)
                 places = to_array(places)[good]
                 at = at[good]
-        self._count(frames.kinds)
+        self._count_frames(frames.kinds)
         return self._observe(frames.locate(self.framing.names, places, gaps, at))
 
     def _observe(self, frames: Frames) -> Frames:
@@ -294,7 +294,7 @@ class Decoder:
             self.observer.observe_frames(frames)
         return frames
 
-    def _lost(
+    def _count_invalid(
         self,
         buffer: NDArray[np.uint8],
         starts: NDArray[np.intp],
@@ -313,15 +313,15 @@ class Decoder:
         before = np.concatenate([[-self._gap], np.cumsum(lost)[good]])
         self._gap = int(lost.sum() - before[-1])
         if joined is not None:
-            self._drop(int(joined.dropped[-1]))
+            self._count_dropped(int(joined.dropped[-1]))
         return np.diff(before)
 
-    def _drop(self, size: int) -> None:
+    def _count_dropped(self, size: int) -> None:
         """Count bytes before the next frame that belong to no frame."""
         self._gap = self._gap + size
         self.stats.bytes_skipped = self.stats.bytes_skipped + size
 
-    def _cut(
+    def _find_frames(
         self,
         buffer: NDArray[np.uint8],
         at: int | None,
@@ -344,8 +344,8 @@ class Decoder:
             part = buffer[start : start + self._size]
             last = start + len(part) == len(buffer)
             part = part if lasting else part.copy()
-            piece = self._piece(part, final=final and last)
-            frames = self._enter(part, piece, at)
+            piece = self._decode_piece(part, final=final and last)
+            frames = self._count_piece(part, piece, at)
             parts += [frames] if len(frames) else []  # none at all would keep its bytes
             start = start + piece.end
             self._base = self._base + piece.end
@@ -358,7 +358,7 @@ class Decoder:
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
-    def _piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
+    def _decode_piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
         """Return the frames of a piece of a stream.
 
         Frames at equal distances are checked as the rows of an array. All other pieces are
@@ -371,13 +371,13 @@ class Decoder:
             piece = find_frames(self.framing, buffer, self._mode, self._base, final=final)
         return piece
 
-    def _enter(self, buffer: NDArray[np.uint8], piece: PieceResult, at: int | None) -> Frames:
+    def _count_piece(self, buffer: NDArray[np.uint8], piece: PieceResult, at: int | None) -> Frames:
         """Count all bytes of a piece, and return its frames with their offsets in the input."""
         frames = piece.frames
         base = self._base
-        gaps = self._gaps(buffer, frames, piece.end)
+        gaps = self._count_gaps(buffer, frames, piece.end)
         self._count_rejected(piece.rejected, piece.errors)
-        self._count(frames.kinds)
+        self._count_frames(frames.kinds)
         places = frames.places
         if isinstance(places, range):
             places = range(places.start + base, places.stop + base, places.step)
@@ -389,7 +389,7 @@ class Decoder:
             )
         )
 
-    def _gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
+    def _count_gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
         """Count skipped bytes in a piece, and return their number before each frame.
 
         Fillers are not included in these numbers. The piece ends at `end`.
@@ -429,7 +429,7 @@ class Decoder:
             setattr(self.stats, name, getattr(self.stats, name) + number)
         self.stats.failures += errors[: 5 - len(self.stats.failures)]
 
-    def _count(self, kinds: NDArray[np.intp]) -> None:
+    def _count_frames(self, kinds: NDArray[np.intp]) -> None:
         frames = self.stats.frames
         known = len(frames)
         only = broadcast_value(kinds)
@@ -454,7 +454,7 @@ def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | Non
     )
 
 
-def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
+def _compute_offsets(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
     """Return the offsets of consecutive pieces of these sizes, from `first` on."""
     if size := broadcast_value(sizes):
         return range(first, first + len(sizes) * size, size)

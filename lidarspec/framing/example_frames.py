@@ -358,7 +358,7 @@ def _make_along_sweep(
     for _ in range(tries):
         values = sweep(source.randrange(10_000))
         layout, chosen = make_random_header(
-            engine, source, {**_draw_stated(engine, values), **drawn}
+            engine, source, {**_make_sweep_draws(engine, values), **drawn}
         )
         rows = _make_random_rows(engine, layout, 1, source)
         for path, value in values.items():
@@ -406,7 +406,7 @@ def _store_drawn(
             )
 
 
-def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
+def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     """Return functions that return the raw values of a sweep for header fields, by path."""
     fields = engine.schema.fields
     draws: dict[str, Callable[[random.Random], Any]] = {}

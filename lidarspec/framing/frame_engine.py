@@ -80,7 +80,7 @@ class CompiledCodec(Codec):
             and len(groups[0][1]) == len(offsets)
             and isinstance(only := groups[0][0], Layout)
         ):
-            status, sizes, rows = self._judge_layout(
+            status, sizes, rows = self._check_layout(
                 buffer, offsets, stops, only, errors, gathered=gathered, sums=sums
             )
             return Frames(
@@ -114,9 +114,9 @@ class CompiledCodec(Codec):
         sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
         together, left = self._families.split(left, self.make_checker)
         for some in together:
-            left += self._judge_together(buffer, offsets, stops, some, status, sizes, sums)
+            left += self._check_together(buffer, offsets, stops, some, status, sizes, sums)
         for layout, which in left:
-            status[which], own, _ = self._judge_layout(
+            status[which], own, _ = self._check_layout(
                 buffer,
                 offsets[which],
                 None if stops is None else stops[which],
@@ -139,7 +139,7 @@ class CompiledCodec(Codec):
             errors=tuple(errors),
         )
 
-    def _judge_together(
+    def _check_together(
         self,
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
@@ -165,7 +165,7 @@ class CompiledCodec(Codec):
             ends = stops[which]
         is_whole = offsets[which] + sizes[which] <= ends
         partial = which[~is_whole]
-        status[partial], sizes[partial] = _judge_incomplete(
+        status[partial], sizes[partial] = _check_incomplete(
             buffer, offsets[partial], ends[~is_whole], together.layouts[0], sizes[partial]
         )
         whole = which[is_whole]
@@ -185,7 +185,7 @@ class CompiledCodec(Codec):
         errors: list[PluginError] = []
         return layout, self.make_checker(layout)(rows, errors, sums), tuple(errors)
 
-    def _judge_layout(
+    def _check_layout(
         self,
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
@@ -227,7 +227,7 @@ class CompiledCodec(Codec):
         sizes = np.full(number, layout.size)
         status[whole] = judged
         ends = len(buffer) if stops is None else stops[~whole]
-        status[~whole], sizes[~whole] = _judge_incomplete(
+        status[~whole], sizes[~whole] = _check_incomplete(
             buffer, offsets[~whole], ends, layout, sizes[~whole]
         )
         return status, sizes, kept
@@ -275,7 +275,7 @@ class CompiledCodec(Codec):
         return CompiledTable(self.schema, groups)
 
 
-def _judge_incomplete(
+def _check_incomplete(
     buffer: NDArray[np.uint8],
     offsets: NDArray[np.intp],
     stops: NDArray[np.intp] | int,

@@ -161,7 +161,7 @@ class PlainCodec(Codec):
         errors: list[PluginError] = []
         for index in np.flatnonzero(status == VALID).tolist():
             data = buffer[offsets[index] : ends[index]].tobytes()
-            status[index], sizes[index] = self._judge(data, errors)
+            status[index], sizes[index] = self._check(data, errors)
         return Frames(
             buffer,
             repeat(kind, len(offsets)),
@@ -179,7 +179,7 @@ class PlainCodec(Codec):
             frames,
         )
 
-    def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
+    def _check(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
         stream = io.BytesIO(data)
         try:
             parsed = self.frame.prepared.parse_stream(stream)

@@ -249,7 +249,7 @@ class StructConditions:
     def __init__(
         self, plausible: Callable[[Any], Any] | None, schema: Schema, layout: Layout
     ) -> None:
-        self._parts = [] if plausible is None else _parts(plausible, schema, layout)
+        self._conditions = [] if plausible is None else _trace_conditions(plausible, schema, layout)
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def make_struct_conditions(self, layout: Layout) -> list[Check]:
@@ -268,21 +268,21 @@ class StructConditions:
 
         Returns None if the plausibility function has to be called.
         """
-        if self._parts is None:
+        if self._conditions is None:
             return None
         leaves = [
             {info.path: leaf for info in part.fields if (leaf := layout.leaves.get(info.path))}
-            for part in self._parts
+            for part in self._conditions
         ]
         if any(
             part.fields[0].axes and all(0 in leaf.shape for leaf in own.values())
-            for part, own in zip(self._parts, leaves, strict=True)
+            for part, own in zip(self._conditions, leaves, strict=True)
         ):
             # a test on an empty array holds, and so does any combination with it
             return []
         checks = list[Check]()
         together = list[Expression]()
-        for part, own in zip(self._parts, leaves, strict=True):
+        for part, own in zip(self._conditions, leaves, strict=True):
             check = self._check(part, own)
             if isinstance(check, LookupCondition) or part.fields[0].axes:
                 checks.append(check)
@@ -396,7 +396,7 @@ class LookupCondition:
         """Return whether the condition is true in each frame, (n,)."""
         if not len(rows):
             return np.empty(0, np.bool_)
-        held = self._hold_each(rows)
+        held = self._test_elements(rows)
         if not self.shape:
             return held
         if held.all():
@@ -410,14 +410,14 @@ class LookupCondition:
             rows: the frames, (n, size), padded to one size.
             lengths: the length of the outermost array in each frame, (n,).
         """
-        held = self._hold_each(rows)
+        held = self._test_elements(rows)
         if not self.shape:
             return held
         held = np.asarray(held.reshape(*held.shape[:2], math.prod(held.shape[2:])).all(axis=2))
         held |= np.arange(held.shape[1]) >= lengths[:, None]
         return np.asarray(held.all(axis=1))
 
-    def _hold_each(self, rows: Bytes2D) -> NDArray[np.bool_]:
+    def _test_elements(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Return whether the condition is true for each element, (n, *shape)."""
         view = view_elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
         if view.itemsize == 1:
@@ -477,7 +477,7 @@ def _find_window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     return (0, 0)
 
 
-def _parts(
+def _trace_conditions(
     plausible: Callable[[Any], Any], schema: Schema, layout: Layout
 ) -> list[Expression] | None:
     blank = LayoutRows(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))

@@ -63,7 +63,7 @@ def find_regular_frames(
             return None
         if is_weak:
             mode.run_end = base + valid * mode.size
-        return _piece(framing, mode, frames.select(slice(0, valid)))
+        return _make_result(framing, mode, frames.select(slice(0, valid)))
     return None
 
 
@@ -75,7 +75,7 @@ def find_regular_datagrams(
     Returns None if this is not possible, because the datagrams differ in size, lack constants of
     the type, have the constants of an earlier type, or change the active types.
     """
-    rows = _rows(buffer, starts, sizes)
+    rows = _view_rows(buffer, starts, sizes)
     if rows is None:
         return None
     kind = _guess_type(framing, rows, mode)
@@ -142,7 +142,7 @@ def find_common_step(starts: Indices) -> int:
     return 0
 
 
-def _piece(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
+def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
     """Return the result for a piece that ends with some frames and the begin of another."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
@@ -179,7 +179,7 @@ def _begins_with(marks: Marks, data: bytes) -> bool:
     return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
 
-def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
+def _view_rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D | None:
     """Return datagrams of one size at equal distances as rows of an array.
 
     Returns None if sizes or distances differ.

@@ -330,11 +330,11 @@ class Frames:
             for name in ("kinds", "sizes", "forms", "status", "gaps", "at")
             if name in vars(self)
         }
-        starts = _choose(self._starts, which)
+        starts = _select(self._starts, which)
         if self.places is self._starts:
             places = starts
         else:
-            places = _choose(self.places, which)
+            places = _select(self.places, which)
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
@@ -444,7 +444,7 @@ def _shift(forms: Indices, first: int) -> Indices:
     return repeat(form + first if form >= 0 else -1, len(forms))
 
 
-def _choose(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
+def _select(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
     if isinstance(which, slice):
         return numbers[which]
     return to_array(numbers)[which]

@@ -143,16 +143,16 @@ class _FrameWalk:
         while row < len(frames):
             last = self._stops[bisect.bisect_left(self._stops, row)]
             if self._changes[last]:
-                self._take(row, last)
+                self._accept_rows(row, last)
                 self._mode.after = self._framing.names[frames.kinds.item(last)]
                 return self._ends.item(last)
             if frames.status.item(last) == SHORT:
-                self._take(row, last - 1)
+                self._accept_rows(row, last - 1)
                 piece.end = frames.starts.item(last)
                 piece.waiting = self._is_whole
                 piece.need = frames.sizes.item(last)
                 break
-            self._take(row, last)
+            self._accept_rows(row, last)
             if self._after is None:
                 row = last + 1
             else:
@@ -165,7 +165,7 @@ class _FrameWalk:
             first, last = self._taken[0]
             taken = self._frames.select(slice(first, last + 1))
         else:
-            taken = self._frames.select(_rows_of(np.array(self._taken, np.intp).reshape(-1, 2)))
+            taken = self._frames.select(_list_rows(np.array(self._taken, np.intp).reshape(-1, 2)))
         parts = [taken]
         if self._runs:
             is_weak = np.isin(taken.kinds, list(self._runs))
@@ -176,7 +176,7 @@ class _FrameWalk:
                 parts.append(runs.members(np.concatenate(offsets)))
         return [part for part in parts if len(part)]
 
-    def _take(self, first: int, last: int) -> None:
+    def _accept_rows(self, first: int, last: int) -> None:
         """Accept the candidates of consecutive rows."""
         self._taken.append((first, last))
         if self._runs and last >= first:
@@ -209,7 +209,7 @@ class _FrameWalk:
         return self._frames.kinds.item(row) < kind
 
 
-def _rows_of(runs: Offsets) -> Offsets:
+def _list_rows(runs: Offsets) -> Offsets:
     """Return all numbers from the first to the last of each run, (k,).
 
     Args:

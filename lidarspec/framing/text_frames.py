@@ -68,10 +68,10 @@ class TextCodec(Codec):
         frames = Frames(buffer, repeat(kind, len(offsets)), offsets, sizes, status=status)
         self._found = {}
         if is_complete.any():
-            self._judge_whole(frames, np.flatnonzero(is_complete).tolist(), status, sums)
+            self._check_whole(frames, np.flatnonzero(is_complete).tolist(), status, sums)
         return frames
 
-    def _judge_whole(
+    def _check_whole(
         self, frames: Frames, which: Sequence[int], status: NDArray[np.uint8], sums: Sums | None
     ) -> None:
         """Check complete candidates; equal candidates are decoded once.
@@ -89,7 +89,7 @@ class TextCodec(Codec):
             if struct is not None:
                 structs[index] = struct
         owners = np.array(list(structs), np.intp)
-        groups, refused = self._group(list(structs.values()))
+        groups, refused = self._group_by_layout(list(structs.values()))
         for group in groups:
             judge = self.make_checker(group.layout)
             status[owners[group.where]] = judge(group.rows, errors, sums)
@@ -127,7 +127,7 @@ class TextCodec(Codec):
             return PLUGIN, None
         return LENGTH, None
 
-    def _group(
+    def _group_by_layout(
         self, structs: Sequence[bytes]
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
         """Group structs by layout; return the groups and the refused structs.
@@ -158,4 +158,4 @@ class TextCodec(Codec):
         )
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        return CompiledTable(self.schema, self._group(list(structs))[0])
+        return CompiledTable(self.schema, self._group_by_layout(list(structs))[0])

@@ -131,13 +131,13 @@ def _is_extended(seal: Seal) -> bool:
 def _seal_key(seal: Seal, size: int) -> Hashable:
     *spans, (start, stop) = seal.spans
     leaves = tuple(
-        (_place(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements)
+        (_find_checksum_position(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements)
         for leaf in seal.leaves
     )
     return seal.algorithm, seal.absent, tuple(spans), start, size - stop, leaves
 
 
-def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
+def _find_checksum_position(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
     """Return the position of a checksum, counted from the start or the end of the frame.
 
     It is counted from the end if the checksum is after the last covered byte.
@@ -211,10 +211,10 @@ class JointChecker:
         for which in _iter_by_size(sizes):
             longest = forms[which[-1]].item()
             rows = _gather_rows(buffer, offsets[which], self.layouts[longest].size)
-            status[which] = self._judge_rows(rows, sizes[which], forms[which], longest, sums)
+            status[which] = self._check_rows(rows, sizes[which], forms[which], longest, sums)
         return status
 
-    def _judge_rows(
+    def _check_rows(
         self, rows: Bytes2D, sizes: Offsets, forms: Offsets, longest: int, sums: Sums | None
     ) -> Status:
         """Check candidates in rows of the longest layout, and return their status, (n,).

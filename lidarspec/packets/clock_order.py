@@ -100,10 +100,10 @@ class ClockOrder:
         paces = read_paces(self._clock, batch)
         if self._gaps is not None:
             self._gaps.read(batch.table)
-        odd_rows = self._find_odd(times, paces)
+        odd_rows = self._find_unexpected(times, paces)
         count = len(times)
         self._arrived = times.item(-1)
-        if not odd_rows and self._follows(times.item(0), paces.item(0)):
+        if not odd_rows and self._is_next(times.item(0), paces.item(0)):
             first = self._add_run(batch, times, 0, count)
             self._trim()
             return range(first, first + count), times + self._offset
@@ -114,7 +114,7 @@ class ClockOrder:
         while row < count:
             while odd_rows[next_odd] <= row:
                 next_odd += 1
-            if self._follows(times.item(row), paces.item(row)):
+            if self._is_next(times.item(row), paces.item(row)):
                 stop = odd_rows[next_odd]
                 first = self._add_run(batch, times, row, stop)
                 index[row:stop] = np.arange(first, first + stop - row)
@@ -138,7 +138,7 @@ class ClockOrder:
         if self._gaps is not None:
             self._gaps.forget()
 
-    def _find_odd(self, times: Times, paces: Paces) -> list[int]:
+    def _find_unexpected(self, times: Times, paces: Paces) -> list[int]:
         """Return the rows of packets that do not directly follow the previous packet."""
         passed = np.empty(len(times), np.int64)
         passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
@@ -148,7 +148,7 @@ class ClockOrder:
         is_odd = (passed <= 0) | (passed > MAX_STEP_NS) | (passed > 1.5 * paces)
         return np.flatnonzero(is_odd).tolist()
 
-    def _follows(self, time: int, pace: float) -> bool:
+    def _is_next(self, time: int, pace: float) -> bool:
         """Return whether a packet directly follows the newest packet."""
         if not self._neighbours:
             return False
@@ -171,7 +171,7 @@ class ClockOrder:
                 checksum = None
             time = times.item(row)
             self._newest = RecentPacket(
-                time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row)
+                time, time + self._offset, first + row - start, 0, checksum, self._get_angle(row)
             )
             self._neighbours.append(self._newest)
         return first
@@ -183,14 +183,14 @@ class ClockOrder:
         """
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
-            return self._begin(batch, row, time, checksum)
+            return self._restart(batch, row, time, checksum)
         newest = self._neighbours[-1]
         passed = time - newest.time
         if self._leap is not None and self._leaps_back(time, passed, pace):
             self._stats.lost -= self._leap[1].missing  # one reading was damaged
-            return self._begin(batch, row, time, checksum)
+            return self._restart(batch, row, time, checksum)
         if passed > MAX_STEP_NS or self._is_too_early(time, passed, pace):
-            return self._begin(batch, row, time, checksum)
+            return self._restart(batch, row, time, checksum)
         start = bisect_left(self._neighbours, time, key=_time_of)
         stop = bisect_right(self._neighbours, time, key=_time_of)
         for twin in self._neighbours[start:stop]:
@@ -200,7 +200,7 @@ class ClockOrder:
         if stop < len(self._neighbours):
             return self._insert(stop, row, time, pace, checksum)
         missing = _count_missing(passed, pace)
-        angle = self._angle_at(row)
+        angle = self._get_angle(row)
         masked = 0
         if missing and self._gaps is not None:
             masked = self._gaps.count_masked(newest.angle, angle, missing)
@@ -220,30 +220,30 @@ class ClockOrder:
             self._stats.lost -= self._gaps.find_unlost(row, newest.angle, angle, self._newest)
         return self._newest
 
-    def _angle_at(self, row: int) -> float:
+    def _get_angle(self, row: int) -> float:
         if self._gaps is None:
             return math.nan
         return self._gaps.angle_at(row)
 
     @property
-    def _places_late(self) -> int:
+    def _max_places_late(self) -> int:
         """The maximum number of places by which a packet can be late."""
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
         """Return whether the clock returns to its value before the last leap."""
         assert self._leap is not None
-        reach = self._places_late * pace
+        reach = self._max_places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
         """Return whether the clock goes back further than for a late packet."""
         if pace > 0:
-            return passed < -self._places_late * pace
+            return passed < -self._max_places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
-    def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
+    def _restart(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
         """Begin with a first packet, or again after the clock was set.
 
         After the clock was set, the index leaves out one number.
@@ -257,7 +257,7 @@ class ClockOrder:
             index = before.index + 2
             batch.breaks[row] = True
         self._newest = RecentPacket(
-            time, time + self._offset, index, 0, checksum, self._angle_at(row)
+            time, time + self._offset, index, 0, checksum, self._get_angle(row)
         )
         if before is None:
             self._leap = None
@@ -292,7 +292,7 @@ class ClockOrder:
         self._stats.lost += missing + missing_after - after.missing
         after.missing = missing_after
         after.masked = masked_after
-        placed = RecentPacket(time, order, index, missing, checksum, self._angle_at(row), masked)
+        placed = RecentPacket(time, order, index, missing, checksum, self._get_angle(row), masked)
         self._neighbours.insert(position, placed)
         return placed
 

@@ -165,7 +165,7 @@ class CounterOrder:
         readings = self._read(batch, times)
         self._gaps.read(batch.table)
         index = np.empty(count, np.int64)
-        odd_rows = [*self._find_odd(readings), count]
+        odd_rows = [*self._find_unexpected(readings), count]
         next_odd = row = 0
         while row < count:
             while odd_rows[next_odd] <= row:
@@ -232,7 +232,7 @@ class CounterOrder:
             return largest
         return int(last)
 
-    def _find_odd(self, readings: CounterReadings) -> list[int]:
+    def _find_unexpected(self, readings: CounterReadings) -> list[int]:
         """Return the rows of packets that do not directly follow the previous packet.
 
         Row 0 is not included.
@@ -284,7 +284,7 @@ class CounterOrder:
             return self._count_by_number(ahead, period), number
         by_clock = passed / pace
         near = ahead + period * round((by_clock - ahead) / period)
-        if _agree(near, by_clock) and near >= -MAX_PLACES_LATE:
+        if _is_consistent(near, by_clock) and near >= -MAX_PLACES_LATE:
             self._suspect = None
             return (None if near == -MAX_PLACES_LATE else near), number
         if ahead == 1:  # the clock was set, or a recording starts again
@@ -332,7 +332,7 @@ class CounterOrder:
         if suspect is not None:
             number_before, time_before = suspect
             places = (number - number_before) % self._period
-            if _agree(places, (time - time_before) / pace):
+            if _is_consistent(places, (time - time_before) / pace):
                 return ahead, number
         assert self._number is not None
         return ahead, self._number + ahead
@@ -353,21 +353,21 @@ class CounterOrder:
         if jump is not None and self._is_continued(jump, number):
             if jump.loss is not None:
                 self._stats.lost -= jump.loss.missing
-            self._begin(number)
+            self._restart(number)
             is_break = True
         elif ahead is None:
-            self._note_jump(None)
-            self._begin(number)
+            self._store_jump(None)
+            self._restart(number)
             is_break = not is_first
         else:
             loss = self._add_loss(row, ahead)
             if ahead > MAX_PLACES_LATE:
-                self._note_jump(loss)
+                self._store_jump(loss)
             is_break = not is_first and loss.missing > 0
         self._set_newest(number, readings.time(row), row)
         return self._index, is_break
 
-    def _note_jump(self, loss: CountedLoss | None) -> None:
+    def _store_jump(self, loss: CountedLoss | None) -> None:
         """Store a jump of the counter, unless a clock can show that the value is corrupt."""
         if self._clock is None and self._number is not None:
             self._jump = CounterJump(self._number, loss)
@@ -402,7 +402,7 @@ class CounterOrder:
         self._missing = kept | dict.fromkeys(added, loss)
         return loss
 
-    def _begin(self, number: int | None) -> None:
+    def _restart(self, number: int | None) -> None:
         """Begin with a first packet, or again after the sensor restarted.
 
         This counts no loss. After a restart, the index leaves out one number.
@@ -440,7 +440,7 @@ class CounterOrder:
         self._angle = self._gaps.angle_at(row)
 
 
-def _agree(ahead: int, by_clock: float) -> bool:
+def _is_consistent(ahead: int, by_clock: float) -> bool:
     """Return whether the counter and the clock show about the same number of packets."""
     is_near = abs(ahead - by_clock) <= 1 + abs(by_clock) / 8
     return is_near and (ahead > 0) == (by_clock > 0.5)

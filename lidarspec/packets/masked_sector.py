@@ -268,7 +268,7 @@ class MaskedGaps:
     def read(self, table: Table) -> None:
         """Read the angles of the next packets."""
         if self._angles is not None:
-            self._note_until(len(self._angles))
+            self._record_angles_before(len(self._angles))
         if len(table):
             self._angles = self._reader.angles(table)
         else:
@@ -278,7 +278,7 @@ class MaskedGaps:
             direction = self._reader.direction(table)
             self._finder = SectorFinder(direction) if direction else None
 
-    def _note_until(self, row: int) -> None:
+    def _record_angles_before(self, row: int) -> None:
         """Record the angles of the current packets before a row as not masked."""
         if self._finder is not None and self._angles is not None:
             self._finder.add_angles(self._angles[self._first_unnoted : row])
@@ -335,7 +335,7 @@ class MaskedGaps:
         step = width / (loss.missing + 1)
         if width < max(MIN_WIDTH, MIN_WIDTH_STEPS * step):
             return 0
-        self._note_until(row)
+        self._record_angles_before(row)
         ago = finder.add_gap(start, stop, step)
         if not ago:
             self._losses.append(loss)

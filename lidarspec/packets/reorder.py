@@ -62,7 +62,7 @@ class Reorder:
         self._held = None
         if held is None:
             return []
-        return [self._mark(held.take(np.argsort(held.order, kind="stable")), self._next)]
+        return [self._mark_breaks(held.take(np.argsort(held.order, kind="stable")), self._next)]
 
     def _push_ascending(self, packets: Packets) -> list[Packets]:
         """Release packets up to the first gap that may still be filled.
@@ -94,7 +94,7 @@ class Reorder:
         has_gap = len(gaps) > (before is None) or bool(packets.breaks.any())
         if not packets.is_clocked and not has_gap:
             return [packets]
-        return [self._mark(packets, before)]
+        return [self._mark_breaks(packets, before)]
 
     def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
         """Sort packets into the held ones, and release all that have no gap before them.
@@ -133,10 +133,10 @@ class Reorder:
         else:
             self._held = None
         if rows:
-            return [self._mark(packets.take(np.array(rows, np.intp)), before)]
+            return [self._mark_breaks(packets.take(np.array(rows, np.intp)), before)]
         return []
 
-    def _mark(self, packets: Packets, before: int | None) -> Packets:
+    def _mark_breaks(self, packets: Packets, before: int | None) -> Packets:
         """Return sorted packets, with a break at each gap of the index.
 
         Args:
@@ -144,13 +144,15 @@ class Reorder:
         """
         marked = copy.copy(packets)
         if packets.is_clocked:
-            marked.index, marked.breaks = self._judge(packets)
+            marked.index, marked.breaks = self._find_breaks_by_clock(packets)
             return marked
         start = packets.index.item(0) if before is None else before
         marked.breaks = np.diff(packets.index, prepend=start - 1) != 1
         return marked
 
-    def _judge(self, packets: Packets) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _find_breaks_by_clock(
+        self, packets: Packets
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the index and the breaks of sorted packets, found by their clock."""
         if self._clock_order is None:
             assert packets.sensor.clock is not None

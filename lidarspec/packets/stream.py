@@ -106,14 +106,14 @@ class PacketStream:
                 a state type use this frame.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
-        columns = _join([self._read(part) for part in parts])
+        columns = _join_columns([self._read_columns(part) for part in parts])
         if columns is None:
             columns = self._make_empty_columns()
         table = columns.table
         state: dict[str, StateOf] = {}
         if self._type.others:
             state = self._find_states(parts, len(table), whole=whole)
-        host = _host_times(columns.at)
+        host = _to_host_times(columns.at)
         breaks = np.zeros(len(table), np.bool_)
         if broadcast_value(columns.skipped) != 0:
             breaks = columns.skipped > 0
@@ -125,7 +125,7 @@ class PacketStream:
             with np.errstate(all="ignore"):
                 if self._clock is not None:
                     time = self._call_plugin("clock", self._read_times, None, batch, host, whole)
-                index, breaks, order = self._judge(batch, time, columns.skipped)
+                index, breaks, order = self._find_losses(batch, time, columns.skipped)
         return Packets(
             self._type.sensor,
             self._type.frame,
@@ -148,7 +148,7 @@ class PacketStream:
             if judge is not None:
                 judge.forget()
 
-    def _judge(
+    def _find_losses(
         self, batch: Batch, time: Integers | None, skipped: Integers
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
         """Return the index, the breaks and the order of packets, (n,) each.
@@ -253,7 +253,7 @@ class PacketStream:
             self._skipped -= int(own_sums[-1])
         return np.diff(own_sums, prepend=0)
 
-    def _read(self, part: OwnFrames) -> _Columns:
+    def _read_columns(self, part: OwnFrames) -> _Columns:
         """Return the columns of the own frames in one piece of input."""
         frames = part.frames
         skipped = self._count_skipped_bytes(part)
@@ -476,7 +476,7 @@ class _Columns(NamedTuple):
     skipped: Integers
 
 
-def _join(parts: Sequence[_Columns]) -> _Columns | None:
+def _join_columns(parts: Sequence[_Columns]) -> _Columns | None:
     """Return the columns of all pieces of input as one; None if there are no packets."""
     parts = [part for part in parts if len(part.table)]
     if len(parts) < 2:
@@ -515,7 +515,7 @@ def _join_values(parts: Sequence[Integers]) -> Integers:
     return np.concatenate(parts)
 
 
-def _host_times(at: Integers) -> Integers:
+def _to_host_times(at: Integers) -> Integers:
     """Return arrival times; unknown times of -1 become 0."""
     only = broadcast_value(at)
     if only is not None:

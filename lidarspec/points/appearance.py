@@ -102,7 +102,7 @@ def choose_appearance(
         ramp = "range"
     if ramp == "range":
         return CloudAppearance("range", shown_reach, shown_reach, flat=is_flat(cloud))
-    values = _read_shown(cloud, ramp)
+    values = _read_column(cloud, ramp)
     values = values[np.isfinite(values)]
     weak, strong = (
         np.percentile(values, (100 - RAMP_PERCENTILE, RAMP_PERCENTILE))
@@ -204,7 +204,7 @@ def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float
     """
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
-    return np.nan_to_num((_read_shown(cloud, look.ramp) - look.low) / (look.full - look.low))
+    return np.nan_to_num((_read_column(cloud, look.ramp) - look.low) / (look.full - look.low))
 
 
 def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
@@ -217,6 +217,6 @@ def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
     ).astype(np.intp)
 
 
-def _read_shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
+def _read_column(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
     """Return the column that colours show, (n,)."""
     return np.asarray(cloud.intensity if ramp == "intensity" else cloud.extra[ramp], np.float64)

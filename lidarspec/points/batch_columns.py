@@ -113,7 +113,7 @@ class BatchColumns(ColumnSource):
         pieces: list[dict[str, NDArray[Any]]] = []
         index = start
         while index < stop:
-            block = self._block_at(index)
+            block = self._get_block(index)
             missing = [name for name in names if name not in block.computed]
             block.computed.update(self._compute(missing, block.start, block.stop))
             inside = slice(index - block.start, stop - block.start)
@@ -123,7 +123,7 @@ class BatchColumns(ColumnSource):
             return pieces[0]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def _block_at(self, index: int) -> PointBlock:
+    def _get_block(self, index: int) -> PointBlock:
         """Return the block that contains the point at an index; make it on first use.
 
         Blocks do not overlap.
@@ -167,7 +167,7 @@ class BatchColumns(ColumnSource):
             return {}
         if name == "time":
             first, last = self._packet_range(start, stop)
-            times = [self._times(share, first, last) for share in self._shares]
+            times = [self._compute_times(share, first, last) for share in self._shares]
             return {name: self._flatten(times, np.dtype(np.float64), start, stop)}
         if name in self._plan.expressions and name not in self._plan.sent:
             return self._compute_compiled(name, start, stop)
@@ -239,7 +239,9 @@ class BatchColumns(ColumnSource):
             scatter_points(part, share.first, share.plan.width, column)
         return column
 
-    def _times(self, share: GroupPoints, first: int, last: int | None) -> NDArray[np.float64]:
+    def _compute_times(
+        self, share: GroupPoints, first: int, last: int | None
+    ) -> NDArray[np.float64]:
         """Return the times of the points of some packets, (packets, *shape), s since `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)

@@ -94,10 +94,10 @@ def coordinates(
     level: Any = np.cos(elevation)
     sides = [np.cos(azimuth), np.sin(azimuth)]
     if _is_row(azimuth) or _is_row(elevation):
-        known = [_product(level, side) for side in sides]
+        known = [_multiply(level, side) for side in sides]
         level, sides = (1, known) if all(map(_is_row, known)) else (level, sides)
-    level = _product(distance, level)
-    places = *(_product(level, side) for side in sides), distance * np.sin(elevation)
+    level = _multiply(distance, level)
+    places = *(_multiply(level, side) for side in sides), distance * np.sin(elevation)
     x, y, z = (
         place if is_zero(start) else place + start
         for place, start in zip(places, origin, strict=True)
@@ -128,7 +128,7 @@ def find_direction(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
 
-def _product(first: Any, second: Any) -> Any:
+def _multiply(first: Any, second: Any) -> Any:
     if not isinstance(second, TracedColumn) and np.size(second) == 1 and np.all(second == 1):
         return first
     return first * second

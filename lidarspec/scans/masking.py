@@ -90,19 +90,22 @@ class Masking:
         else:
             held = packets
         if self._is_holding or leap is None:
-            return self._pass_on(held)
+            return self._hold_or_release(held)
         before = len(held) - len(packets) + max(leap - 1, -1 if self._held else 0)
         self._is_holding = True
         passed = [held.take(slice(0, before))] if before else []
         self._held = []
-        return [*map(self._remember_last, passed), *self._pass_on(held.take(slice(before, None)))]
+        return [
+            *map(self._store_last, passed),
+            *self._hold_or_release(held.take(slice(before, None))),
+        ]
 
     def finish(self) -> list[Packets]:
         """Return a list of the packets that are still held."""
         self._is_settled = True
         return self._release(None)
 
-    def _pass_on(self, held: Packets) -> list[Packets]:
+    def _hold_or_release(self, held: Packets) -> list[Packets]:
         """Release or hold packets, and return a list of the released packets.
 
         After a leap, all packets from the last one before the leap on are held. Otherwise only the
@@ -120,7 +123,7 @@ class Masking:
             return []
         self._held = [held.take(slice(-1, None))]
         if len(held) > 1:
-            return [self._remember_last(held.take(slice(0, -1)))]
+            return [self._store_last(held.take(slice(0, -1)))]
         return []
 
     def _release(self, packets: Packets | None) -> list[Packets]:
@@ -179,7 +182,7 @@ class Masking:
         ahead[ahead > 1 - JITTER] = 0
         return ahead
 
-    def _remember_last(self, packets: Packets) -> Packets:
+    def _store_last(self, packets: Packets) -> Packets:
         """Store the angle and the index of the last packet, and return the packets."""
         angles = self._reader.angles(packets.table)
         if angles is not None:
@@ -214,7 +217,7 @@ class Masking:
         few = missing <= self._masked + VARYING_PACKETS
         marked = copy.copy(packets)
         marked.masked = np.where(few, missing, self._masked)
-        self._remember_last(packets)
+        self._store_last(packets)
         return marked
 
 

@@ -141,18 +141,20 @@ class WrapDetector:
             return np.empty(0, np.intp), np.empty(0)
         before = previous_values(angles, self._angle)
         self._angle = angles.item(-1)
-        direction = self._rotation.push((_fold(angles - before + full / 2, full) - full / 2) / full)
-        behind = _fold(direction * (angles - at), full)
+        direction = self._rotation.push(
+            (_reduce_to_turn(angles - before + full / 2, full) - full / 2) / full
+        )
+        behind = _reduce_to_turn(direction * (angles - at), full)
         if len(direction) == 1:
-            first = _fold(direction * (before[:1] - at), full).item()
+            first = _reduce_to_turn(direction * (before[:1] - at), full).item()
             behind_earlier = previous_values(behind, first)
         else:
-            behind_earlier = _fold(direction * (before - at), full)
+            behind_earlier = _reduce_to_turn(direction * (before - at), full)
         passed = np.flatnonzero(behind_earlier - behind > full / 2)
-        found = self._keep_armed(passed, behind, full)
+        found = self._select_armed(passed, behind, full)
         return found, 1 - (behind_earlier[found] - behind[found]) / full
 
-    def _keep_armed(
+    def _select_armed(
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
         """Return the passes before which the angle had moved away from the given angle.
@@ -240,7 +242,7 @@ def previous_values(values: Floats, first: float | None) -> Floats:
     return previous
 
 
-def _fold(angles: Floats, full: float) -> Floats:
+def _reduce_to_turn(angles: Floats, full: float) -> Floats:
     """Return angles modulo a whole turn, in [0, full), as a read-only array.
 
     The result is the same as that of `np.mod`, but faster.
@@ -250,7 +252,7 @@ def _fold(angles: Floats, full: float) -> Floats:
         return angles
     if 8 * len(outside) < len(angles):
         folded = angles.copy()
-        folded[outside] = _fold(angles[outside], full)
+        folded[outside] = _reduce_to_turn(angles[outside], full)
         return folded
     turns = angles / full
     np.floor(turns, out=turns)

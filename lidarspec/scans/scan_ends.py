@@ -103,7 +103,7 @@ class EndFinder:
         path = _make_own_path(packets, rule.name)
         column = _read_field(points, path)
         values, starts = _read_rows(column, points)
-        rows = self._find_changes(rule, values, _full_turn(packets, path))
+        rows = self._find_changes(rule, values, _find_full_turn(packets, path))
         if _is_per_packet(column):
             return _make_ends(starts[rows], rows)
         return _make_ends(starts[rows])
@@ -114,19 +114,19 @@ class EndFinder:
         if rule.name in COLUMNS:
             values = np.asarray(LazyColumns(points.source).read(rule.name), np.float64)
             full = 2 * np.pi
-            ends, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
+            ends, steps = self._wraps.push(values, full, self._find_cut_angle(rule, full))
         else:
             path = _make_own_path(packets, rule.name)
             column = _read_field(points, path)
             values, starts = _read_rows(column, points)
-            full = _full_turn(packets, path) or 2 * np.pi
-            wrap_rows, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
+            full = _find_full_turn(packets, path) or 2 * np.pi
+            wrap_rows, steps = self._wraps.push(values, full, self._find_cut_angle(rule, full))
             ends = starts[wrap_rows]
             if _is_per_packet(column):
                 rows = wrap_rows
         return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
 
-    def _cut_angle(self, rule: OnWrap, full: float) -> float:
+    def _find_cut_angle(self, rule: OnWrap, full: float) -> float:
         """Return the angle at which scans are cut.
 
         Args:
@@ -150,7 +150,7 @@ class EndFinder:
             path = _make_own_path(packets, self._rule.name)
             column = _read_field(points, path)
             values, starts = _read_rows(column, points)
-            rows = passes.push(values / (_full_turn(packets, path) or 2 * np.pi))
+            rows = passes.push(values / (_find_full_turn(packets, path) or 2 * np.pi))
             if _is_per_packet(column):
                 return _make_ends(starts[rows], rows)
             return _make_ends(starts[rows])
@@ -213,7 +213,7 @@ def _make_ends(
     return list(map(ScanEnd, points.tolist(), rows, leaps))
 
 
-def _full_turn(packets: Packets, path: str) -> float | None:
+def _find_full_turn(packets: Packets, path: str) -> float | None:
     """Return a whole turn in the unit of a field; None if it is not an angle."""
     if path.startswith("frame."):
         table, _ = packets.frames

@@ -109,7 +109,7 @@ class ScanStream:
             scans += self._add_marked(self._masking.finish())
         if self._waiting is not None:
             scans += self._evaluate(self._waiting, final=True)
-        scans += self._close(None)
+        scans += self._end_scan(None)
         return scans
 
     def _add_ordered(self, batches: list[Packets]) -> list[Scan]:
@@ -191,19 +191,19 @@ class ScanStream:
         scans = list[Scan]()
         first = 0
         for cut, start in zip(cuts, starts, strict=True):
-            self._keep(PointRun(packets, points, first, cut.point, parts_before))
-            scans += self._close(start, whole=cut.whole, complete=cut.complete)
+            self._add_run(PointRun(packets, points, first, cut.point, parts_before))
+            scans += self._end_scan(start, whole=cut.whole, complete=cut.complete)
             self._start = start
             first = cut.point
-        self._keep(PointRun(packets, points, first, points.source.size, parts_before))
+        self._add_run(PointRun(packets, points, first, points.source.size, parts_before))
         return scans
 
-    def _keep(self, run: PointRun) -> None:
+    def _add_run(self, run: PointRun) -> None:
         """Add points to the scan that has not ended."""
         if run.start < run.stop:
             self._runs.append(run)
 
-    def _close(
+    def _end_scan(
         self, following: ScanStart | None, *, whole: bool = False, complete: bool = False
     ) -> list[Scan]:
         """End the current scan, and return it in a list; the list is empty without points.

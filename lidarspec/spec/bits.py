@@ -116,15 +116,16 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
             if value:
                 weights[keys].append((bit, int(value)))
     fields = [
-        _field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()
+        _make_field(keys, pairs, flag=isinstance(base[keys], bool))
+        for keys, pairs in weights.items()
     ]
     complete = [field for field in fields if field is not None]
-    if len(complete) == len(fields) and _confirm(parse, size, complete):
+    if len(complete) == len(fields) and _is_confirmed(parse, size, complete):
         return complete
     return None
 
 
-def _field(
+def _make_field(
     keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool
 ) -> BitField | None:
     """Return the field with the given bits.
@@ -148,10 +149,10 @@ def _field(
         targets[bit] = magnitude.bit_length() - 1
     if sorted(targets.values()) != list(range(width)) or not width:
         return None
-    return BitField(keys, tuple(_segments(targets)), width, signed, flag)
+    return BitField(keys, tuple(_iter_segments(targets)), width, signed, flag)
 
 
-def _segments(targets: dict[int, int]) -> Iterator[Segment]:
+def _iter_segments(targets: dict[int, int]) -> Iterator[Segment]:
     """Yield runs of bits that are in one byte, and in the same order as in the value.
 
     Args:
@@ -165,7 +166,7 @@ def _segments(targets: dict[int, int]) -> Iterator[Segment]:
         yield Segment(bits[0] // 8, ((1 << len(bits)) - 1) << low, low, targets[bits[0]])
 
 
-def _confirm(parse: Parse, size: int, fields: list[BitField]) -> bool:
+def _is_confirmed(parse: Parse, size: int, fields: list[BitField]) -> bool:
     import random  # imported here because finding a sensor does not need it otherwise
 
     source = random.Random(size)

@@ -304,13 +304,13 @@ def _xor(data: Bytes) -> int:
     The data is converted to one large integer, whose halves are XORed until one byte is left.
     """
     value = int.from_bytes(data, "little")
-    for power in _powers(8, len(data)):
+    for power in _list_shifts(8, len(data)):
         value ^= value >> power
     return value & 0xFF
 
 
 @lru_cache(maxsize=4096)
-def _powers(bits: int, count: int) -> tuple[int, ...]:
+def _list_shifts(bits: int, count: int) -> tuple[int, ...]:
     """Return the shifts that XOR all parts of an integer into its lowest part.
 
     Args:
@@ -481,7 +481,7 @@ def _single_word_xor(algorithm: WordXor) -> Single:
     head = algorithm.head
     groups = algorithm.groups
     size = sum(groups)
-    head_powers = _powers(16, head + 1 >> 1)
+    head_powers = _list_shifts(16, head + 1 >> 1)
     words = [
         (8 * sum(groups[:number]), (1 << 8 * width) - 1) for number, width in enumerate(groups)
     ]
@@ -492,7 +492,7 @@ def _single_word_xor(algorithm: WordXor) -> Single:
             total ^= total >> power
         total &= 0xFFFF
         value = int.from_bytes(data[head:], "little")
-        for power in _powers(8 * size, -((head - len(data)) // size)):
+        for power in _list_shifts(8 * size, -((head - len(data)) // size)):
             value ^= value >> power
         for start, mask in words:
             total ^= value >> start & mask

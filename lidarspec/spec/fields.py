@@ -262,12 +262,12 @@ class Checksummed(layer.SealedStruct):
         stored, computed = self.verdict(data, obj, start)
         if stored != computed and stored not in self.absent:
             name = self.fields[0]
-            width = (sum(layer.bit_width(self._field(name)) for name in self.fields) + 3) // 4
+            width = (sum(layer.bit_width(self._find_field(name)) for name in self.fields) + 3) // 4
             expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
             reason = "checksum"
             raise layer.MismatchError(
                 f"{path} -> {name.replace('.', ' -> ')}",
-                self._span(obj, name)[0],
+                self._find_span(obj, name)[0],
                 expected,
                 got,
                 reason,
@@ -278,7 +278,7 @@ class Checksummed(layer.SealedStruct):
         given = [layer.get_member(obj, name, None) for name in self.fields]
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
-            blank = _replace(blank, name, self._zero(name) if value is None else value)
+            blank = _replace(blank, name, self._make_zero(name) if value is None else value)
         con = self._marked
         trial = io.BytesIO()
         con._build(blank, trial, context, path)
@@ -289,7 +289,9 @@ class Checksummed(layer.SealedStruct):
         parsed = con._parsereport(io.BytesIO(data), unverified, path)
         if None not in given and self._load_stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)
-        return con._build(self._fill(blank, self._compute(data, parsed, 0)), stream, context, path)
+        return con._build(
+            self._fill_in_checksum(blank, self._compute(data, parsed, 0)), stream, context, path
+        )
 
     @property
     def _marked(self) -> Construct:
@@ -321,9 +323,9 @@ class Checksummed(layer.SealedStruct):
             base: the offset of the struct in the parsed stream.
         """
         if self.over is not None:
-            spans = [self._span(obj, name) for name in self.over]
+            spans = [self._find_span(obj, name) for name in self.over]
             return [(spans[0][0] - base, spans[-1][1] - base)]
-        held = sorted(self._span(obj, name) for name in self.fields)
+        held = sorted(self._find_span(obj, name) for name in self.fields)
         edges = [0, *(edge - base for span in held for edge in span), size]
         return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 
@@ -347,31 +349,31 @@ class Checksummed(layer.SealedStruct):
             if isinstance(part, bytes):
                 part = int.from_bytes(part, self.algorithm.order if self.algorithm else "little")
             value |= int(part) << shift
-            shift += layer.bit_width(self._field(name))
+            shift += layer.bit_width(self._find_field(name))
         return value
 
-    def _fill(self, obj: Any, value: int) -> Any:
+    def _fill_in_checksum(self, obj: Any, value: int) -> Any:
         for name in self.fields:
-            con = self._field(name)
+            con = self._find_field(name)
             width = layer.bit_width(con)
             part: int | bytes = value & ((1 << width) - 1)
-            if isinstance(self._zero(name), bytes):
+            if isinstance(self._make_zero(name), bytes):
                 assert self.algorithm is not None
                 part = int(part).to_bytes(width // 8, self.algorithm.order)
             obj = _replace(obj, name, part)
             value >>= width
         return obj
 
-    def _field(self, name: str) -> Construct:
+    def _find_field(self, name: str) -> Construct:
         con = self.subcon
         for part in name.split("."):
             con = layer.unwrap(layer.unwrap(con)._subcons[part])
         return con
 
-    def _zero(self, name: str) -> int | bytes:
-        return self._field(name).parse(bytes(8 * layer.bit_width(self._field(name))))  # type: ignore[no-any-return]
+    def _make_zero(self, name: str) -> int | bytes:
+        return self._find_field(name).parse(bytes(8 * layer.bit_width(self._find_field(name))))  # type: ignore[no-any-return]
 
-    def _span(self, obj: Any, name: str) -> tuple[int, int]:
+    def _find_span(self, obj: Any, name: str) -> tuple[int, int]:
         """Return the byte range of a dotted field in the parsed stream.
 
         The range of a bit field includes all bytes that contain its bits.
@@ -444,11 +446,11 @@ class Parts(layer.Partition):
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         parsed = layer.ParsedParts()
-        next_size = self._rule(context, path)
+        next_size = self._make_size_rule(context, path)
         while (announced := next_size(parsed)) != 0:
             place = f"{path}[{len(parsed)}]"
             offset = stream.tell()
-            kind = self._kind(stream, context, place)
+            kind = self._choose_kind(stream, context, place)
             part = self.cases[kind]._parsereport(stream, context, place)
             self._append(parsed, kind, part, (offset, stream.tell()), announced, place)
             if stream.tell() - start > self.limit:
@@ -459,7 +461,7 @@ class Parts(layer.Partition):
         if not isinstance(obj, list | tuple):
             raise layer.MismatchError(path, 0, "a list of its parts", repr(obj), "value")
         built = layer.ParsedParts()
-        next_size = self._rule(context, path)
+        next_size = self._make_size_rule(context, path)
         for index, part in enumerate(obj):
             announced = next_size(built)
             place = f"{path}[{index}]"
@@ -477,7 +479,7 @@ class Parts(layer.Partition):
     def _sizeof(self, context: Any, path: str) -> int:
         raise SizeofError("the size of the parts depends on their content", path=path)
 
-    def _rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
+    def _make_size_rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
         """Return a function from the parts so far to the size of the next part in bytes.
 
         The function returns 0 if there is no further part, and -1 if the struct of the part
@@ -531,7 +533,7 @@ class Parts(layer.Partition):
         parsed.append(part)
         parsed.spans.append((kind, *span))
 
-    def _kind(self, stream: Any, context: Any, path: str) -> str:
+    def _choose_kind(self, stream: Any, context: Any, path: str) -> str:
         """Return the first kind with constants that match the next bytes.
 
         Raises:

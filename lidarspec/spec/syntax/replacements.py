@@ -101,7 +101,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         obj = Container()
-        inner = self._inner(stream, context, is_parsing=True)
+        inner = self._make_inner_context(stream, context, is_parsing=True)
         marks = inner._marks
         for con in self.subcons:
             start = stream.tell()
@@ -124,7 +124,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         for con in self.subcons:
             if not con.flagbuildnone and con.name not in obj:
                 raise MismatchError(f"{path} -> {con.name}", 0, "a value", "none", "missing")
-        inner = self._inner(stream, context, is_parsing=False)
+        inner = self._make_inner_context(stream, context, is_parsing=False)
         inner.update({name: value for name, value in obj.items() if name != "_marks"})
         marks = inner._marks
         for con in self.subcons:
@@ -137,7 +137,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
             context._params["_sizes"][field] = sizing.value(inner)
         return inner
 
-    def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
+    def _make_inner_context(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
         """Return the context of the members' expressions.
 
         The entry `_marks` has (start, end) of each member by name. `_sizings` has (SizeField, path,
@@ -523,22 +523,22 @@ class SizeField(Subconstruct):  # type: ignore[misc]
             start = marks[self.since][0] if self.since else start
         except (KeyError, TypeError):
             raise SpecError(
-                f"SizeOf measures {'.'.join(self.of)!r}, but there is no such part"
+                f"SizeOf refers to {'.'.join(self.of)!r}, which does not exist"
             ) from None
         return int(end - start + self.plus)
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         value = self.subcon._parsereport(stream, context, path)
-        self._enter(context, (path, start, value))
+        self._register_size(context, (path, start, value))
         return value
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         sizes = context._params.setdefault("_sizes", {})
-        self._enter(context, (path, 0, obj))
+        self._register_size(context, (path, 0, obj))
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
-    def _enter(self, context: Any, entry: tuple[str, int, Any]) -> None:
+    def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
         """Add the value to the sizes that the struct with the part has to check.
 
         If a bit block is probed, there is no such struct.
@@ -601,21 +601,21 @@ class PaddingField(CountedBytes):
     def __init__(
         self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0"
     ) -> None:
-        super().__init__(self._missing)
+        super().__init__(self._count_missing)
         self.of = of
         self.to = to
         self.modulus = modulus
         self.pattern = pattern
         self.flagbuildnone = True
 
-    def _missing(self, context: Any) -> int:
+    def _count_missing(self, context: Any) -> int:
         start = context._marks[self.of[0]][0]
         end = context._marks[self.of[1]][1]
         number = construct.evaluate(self.modulus if self.to is None else self.to, context)
         return int((start - end) % number if self.to is None else number - (end - start))
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        length = check_bound(self._missing(context), self.limit, "length", path)
+        length = check_bound(self._count_missing(context), self.limit, "length", path)
         return super()._build(self.pattern * length if obj is None else obj, stream, context, path)
 
 
