@@ -150,10 +150,10 @@ def _frame(message: ExportedFrame) -> dict[str, Any]:
 
 def _wire_form(form: WireForm) -> dict[str, Any]:
     """Return the class of a wire form and its arguments; those that are objects as Python text."""
-    arguments = {
-        item.name: getattr(form, item.name)
-        for item in (dataclasses.fields(form) if dataclasses.is_dataclass(form) else ())
-    }
+    members: tuple[dataclasses.Field[Any], ...] = ()
+    if dataclasses.is_dataclass(form):
+        members = dataclasses.fields(form)
+    arguments: dict[str, Any] = {item.name: getattr(form, item.name) for item in members}
     return {"form": type(form).__name__} | {
         name: repr(value) if dataclasses.is_dataclass(value) else _to_json(value)
         for name, value in arguments.items()

@@ -189,7 +189,8 @@ def _compute_fletcher(algorithm: Fletcher, rows: NDArray[np.uint8], spans: Spans
     weights = np.arange(rows.shape[1], 0, -1).astype(np.uint8)
     first = rows.sum(axis=1, dtype=np.uint8)
     second = (rows * weights).sum(axis=1, dtype=np.uint8)
-    return first.astype(np.uint64) | second.astype(np.uint64) << _BYTE_BITS
+    checksums: Values = first.astype(np.uint64) | second.astype(np.uint64) << _BYTE_BITS
+    return checksums
 
 
 def _compute_fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:

@@ -859,8 +859,8 @@ class SixBits:
             or min(each.size, each.most) < 1
         ):
             raise SpecError(
-                "the mark between echoes must be one character that is not a digit, and size"
-                " and most at least 1",
+                "the mark between echoes must be one character that is not a digit; size and"
+                " most must be at least 1",
                 path="wire",
             )
 

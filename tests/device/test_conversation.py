@@ -452,7 +452,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         (
             b"HTTP/1.1 302 Found\r\nLocation: /login\r\nContent-Length: 0\r\n\r\n",
             Http(1),
-            "/status: status 302, moved to /login",
+            "/status: status 302; the redirection to /login was ignored",
         ),
         (
             b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\n" + bytes(99),

@@ -91,10 +91,11 @@ def test_every_verb_takes_a_name(folder: Path, words: tuple[str, ...]) -> None:
 
 def test_a_live_device_by_name_is_live(folder: Path) -> None:
     assert (
-        "rear is a live source: only a file can be replayed" in ran("replay", "rear", code=2).stderr
+        "only a file can be replayed, but rear is a live source"
+        in ran("replay", "rear", code=2).stderr
     )
     assert (
-        "udp://:6699 is a live source: expected bytes or a file"
+        "expected hexadecimal bytes or a file, got the live source udp://:6699"
         in ran("parse", "rear", code=2).stderr
     )
 

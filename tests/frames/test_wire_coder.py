@@ -321,7 +321,7 @@ def test_a_fault_has_its_place_on_the_wire() -> None:
     assert fault.value.path == "fcs"
 
 
-@pytest.mark.parametrize("kind", ["c", "wireshark", "ksy", "json"])
+@pytest.mark.parametrize("kind", ["c", "wireshark", "ksy"])
 def test_an_export_that_cannot_recode_says_what(kind: str) -> None:
     for each in (TOKENS, LINES, JOINED, ESCAPED):
         with pytest.raises(UsageError, match=r"Tokens|Lines|Escaped"):

@@ -530,7 +530,7 @@ class _Builder:
             scope = None if scope is None else scope.parent
         if scope not in self._measured:
             raise SpecError(
-                f"SizeOf measures {'.'.join(con.of)!r}, which is outside its frame or part",
+                f"SizeOf refers to {'.'.join(con.of)!r}, which is outside its frame or part",
                 path=place.info.path,
             )
         index = len(self.sizes)
@@ -924,7 +924,7 @@ def _find_below(node: tree.Node, names: Iterable[str]) -> tree.Node:
             found = []
         if not found:
             raise SpecError(
-                f"SizeOf measures {'.'.join(names)!r}, but there is no part {name!r}",
+                f"SizeOf refers to {'.'.join(names)!r}, but {name!r} does not exist",
                 path=getattr(body, "path", ""),
             )
         node = found[0]
