@@ -99,9 +99,9 @@ class GroupCounter:
             self._forget(group)
 
     def _count_ended(self) -> None:
-        """Count the incomplete groups that the newest packet follows."""
+        """Count the incomplete groups whose last packet has arrived or is passed."""
         for group, end in list(self._ends.items()):
-            if end < self._newest and group not in self._counted:
+            if end <= self._newest and group not in self._counted:
                 self._stats.incomplete_returns += 1
                 self._counted.add(group)
             if end < self._newest - MAX_PLACES_LATE:

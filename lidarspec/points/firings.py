@@ -74,7 +74,9 @@ def _find_changes(*keys: NDArray[Any]) -> NDArray[np.bool_]:
     return changes
 
 
-def choose_returns(cloud: PointCloud, which: Returns, names: Sequence[str] = ()) -> Any:
+def choose_returns(
+    cloud: PointCloud, which: Returns, names: Sequence[str] = ()
+) -> NDArray[np.intp]:
     """Return the index of the chosen return of each firing, (firings,).
 
     Only valid returns are chosen. A firing without a valid return keeps its return with the lowest
@@ -107,7 +109,8 @@ def choose_returns(cloud: PointCloud, which: Returns, names: Sequence[str] = ())
     ranks = np.where(cloud.valid[firings], ranks, _INVALID_RANK)
     ranks = np.where(is_missing, _MISSING_RANK, ranks)
     chosen = np.argmin(ranks, axis=1)
-    return firings[np.arange(len(firings)), chosen]
+    indices: NDArray[np.intp] = firings[np.arange(len(firings)), chosen]
+    return indices
 
 
 def take_returns(cloud: PointCloud, indices: NDArray[np.intp]) -> PointCloud:

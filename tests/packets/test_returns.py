@@ -97,6 +97,10 @@ def test_a_stream_may_begin_and_end_within_a_pair() -> None:
     assert decode([make_packet(index) for index in range(1, 11)]) == (0, 0)
 
 
+def test_a_lost_first_half_is_counted_at_the_end_of_the_input() -> None:
+    assert decode([make_packet(index) for index in range(10) if index != 8]) == (1, 1)
+
+
 def test_single_returns_are_not_paired() -> None:
     packets = PAIRS.decode([make_packet(index, mode=1) for index in range(10)])
     assert packets.returns().shape == (10, FIRINGS, CHANNELS, 1)

@@ -5,6 +5,7 @@ They cover commands and documented replies, start-up, pace and faults.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from itertools import pairwise
 from typing import Any
@@ -14,12 +15,12 @@ import pytest
 from construct import Array, Bytes, Const, Enum, Int8ul, Struct
 
 import lidarspec as ls
-from lidarspec import Sensor, UsageError
+from lidarspec import Sensor, SpecError, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, FaultyLink, parse_faults
 from lidarspec.simulation.simulator import RestingImu
-from lidarspec.spec import Command, Frame, Scaled
+from lidarspec.spec import Command, Frame, Scaled, Simulation
 from lidarspec.spec.fields import duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -404,3 +405,36 @@ def test_a_reply_matches_bytes_names_and_arrays(told: dict[str, Any]) -> None:
         },
     )
     the_simulated_sensor_answers(SensorUnderTest(sensor), "start")
+
+
+def double_speed(sweep: Any, number: int) -> Any:
+    return lambda i: {"angle": (number + 2 * i) * 3.0 % 360}
+
+
+def test_the_effect_of_a_command_changes_what_is_sent() -> None:
+    sensor = SHAPES["shape-commands"]
+    simulation = Simulation(
+        lambda i: {"angle": i * 3.0 % 360}, rate=100, effects={"speed": double_speed}
+    )
+    device = on(dataclasses.replace(sensor, simulation=simulation))
+    send_command(device, "start", 0)
+    passing(device, 0, SECOND)
+    send_command(device, "speed", SECOND, rate=5.0, trim=0)
+    angles = sensor.decode(passing(device, SECOND, 2 * SECOND))["angle"]
+    steps = (angles[1:] - angles[:-1]) % 360
+    assert (steps[0], steps[-1]) == (3, 6)
+    assert sorted(steps) == steps.tolist(), "it changes once, without a jump of the angle"
+    send_command(device, "stop", 2 * SECOND)
+    send_command(device, "start", 2 * SECOND)
+    angles = sensor.decode(passing(device, 2 * SECOND, 3 * SECOND))["angle"]
+    assert (angles[1] - angles[0]) % 360 == 6, "the effect outlasts a stop"
+    device.start(3 * SECOND)
+    send_command(device, "start", 3 * SECOND)
+    angles = sensor.decode(passing(device, 3 * SECOND, 4 * SECOND))["angle"]
+    assert (angles[1] - angles[0]) % 360 == 3, "the effect ends at power-off"
+
+
+def test_an_effect_belongs_to_a_command() -> None:
+    sensor = SHAPES["shape-commands"]
+    with pytest.raises(SpecError):
+        dataclasses.replace(sensor, simulation=Simulation(effects={"fly": double_speed}))

@@ -143,6 +143,7 @@ def test_f1_and_f2_change_speed_and_exposure(repeat: int) -> None:
     assert abs(low_turns - first - 3) <= 1  # the revolution at the beginning is not whole
     whole = [scan for scan in SENSOR.scans(data) if scan.complete]
     assert len(whole[-1]) == 299  # 5.5 * 380 points per second, at 7 Hz
+    assert {len(scan) for scan in whole} == {380, 299}  # the speed changes between revolutions
     running.send("low_exposure")
     speeds, exposures = measure(running.read(4.0))
     assert speeds[-1] == 5.5
