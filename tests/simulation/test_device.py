@@ -418,9 +418,9 @@ def test_the_effect_of_a_command_changes_what_is_sent() -> None:
     )
     device = on(dataclasses.replace(sensor, simulation=simulation))
     send_command(device, "start", 0)
-    passing(device, 0, SECOND)
-    send_command(device, "speed", SECOND, rate=5.0, trim=0)
-    angles = sensor.decode(passing(device, SECOND, 2 * SECOND))["angle"]
+    passing(device, 0, 1100 * MS)
+    send_command(device, "speed", 1100 * MS, rate=5.0, trim=0)  # within a batch of frames
+    angles = sensor.decode(passing(device, 1100 * MS, 2 * SECOND))["angle"]
     steps = (angles[1:] - angles[:-1]) % 360
     assert (steps[0], steps[-1]) == (3, 6)
     assert sorted(steps) == steps.tolist(), "it changes once, without a jump of the angle"
