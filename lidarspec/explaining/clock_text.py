@@ -29,12 +29,16 @@ def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
 
 def describe_time_source(report: ClockReport) -> str:
     """Return what a clock counts, and its state."""
-    parts = [EPOCHS[report.epoch]]
-    if not report.epoch:
-        parts = ["the manual does not say what it counts"]
+    counted = _describe_epoch(report)
     if report.state:
-        parts.append(report.state)
-    return "; ".join(parts)
+        return f"{counted}; {report.state}"
+    return counted
+
+
+def _describe_epoch(report: ClockReport) -> str:
+    if not report.epoch:
+        return "the manual does not say what it counts"
+    return EPOCHS[report.epoch]
 
 
 def describe_offset(report: ClockReport) -> str:
@@ -50,6 +54,8 @@ def describe_offset(report: ClockReport) -> str:
 def describe_clock(report: ClockReport) -> str:
     """Return a clock in one line."""
     parts = [describe_time_source(report)]
+    if report.verdict.code == "not_locked":
+        parts = [_describe_epoch(report)]  # the verdict names the state
     if not math.isnan(report.error_s):
         parts.append(describe_offset(report))
     if not math.isnan(report.drift_ppm):

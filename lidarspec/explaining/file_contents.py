@@ -24,6 +24,7 @@ from lidarspec.detect.identification import (
 )
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, printable, suggest
+from lidarspec.explaining.clock_text import describe_clock
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
 from lidarspec.sensor_operations import Sensor
@@ -89,6 +90,7 @@ class SensorContent:
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
         verb: the verb of the command line that shows the data.
         info: the facts that the sensor reports about itself in that part, by name.
+        clock: the sensor's clock in that part, in words; "" if it sends no time.
     """
 
     source: str
@@ -98,6 +100,7 @@ class SensorContent:
     reading: MeterReading | None = None
     verb: str = "view"
     info: Mapping[str, str] = field(default_factory=dict)
+    clock: str = ""
 
     @property
     def command(self) -> str:
@@ -288,9 +291,9 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
         if (declared := find_declared_sensor(contents.path)) is not None:
-            reading, info = _measure_rates(contents.path, declared)
+            measured = _measure(contents.path, declared)
             verb = verb_to_show(declared)
-            return [SensorContent(contents.path, (declared.id,), None, "", reading, verb, info)]
+            return [SensorContent(contents.path, (declared.id,), verb=verb, **measured)]
     except LidarSpecError as error:
         contents.warnings.append(str(error))
     verdicts = identify_senders(contents.path)
@@ -308,31 +311,36 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
     if not verdict.candidates:
         return SensorContent(source, tuple(list_candidates(verdict)))
     best = verdict.candidates[0]
-    reading, info = _measure_rates(source, best.sensor)
     return SensorContent(
         source,
         tuple(list_candidates(verdict)),
         best.share,
         format_sensor_options(best.sensor),
-        reading,
-        verb_to_show(best.sensor),
-        info,
+        verb=verb_to_show(best.sensor),
+        **_measure(source, best.sensor),
     )
 
 
-def _measure_rates(source: str, sensor: Sensor) -> tuple[MeterReading | None, dict[str, str]]:
-    """Return the statistics of a sensor at the beginning of a file, and the facts it reports.
+def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
+    """Return `reading`, `info` and `clock` of the beginning of a file.
 
-    Returns None and no facts if the frames cannot be decoded.
+    Returns an empty dict if the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:
             live = open_live(device)
             while not live.ended and device.stats.bytes_in < MAX_DECODED_BYTES:
                 live.read(0.0)
-            return live.meter.summary(device.stats), device.info
+            clock = ""
+            if sensor.clock is not None:
+                clock = describe_clock(live.clock.report())
+            return {
+                "reading": live.meter.summary(device.stats),
+                "info": device.info,
+                "clock": clock,
+            }
     except LidarSpecError:
-        return None, {}
+        return {}
 
 
 def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
@@ -408,6 +416,8 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
             lost = f", lost {reading.loss_rate:.3%}"
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
+    if content.clock:
+        yield "clock", printable(content.clock)
     for name, text in content.info.items():
         yield name.replace("_", " "), printable(text)
     yield "next", content.command
