@@ -249,7 +249,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
         in ran("convert", drives / "long.bin", drives / "bad.bin", out, code=2).stderr
     )
     assert (
-        "omit --jobs"
+        "--jobs cannot be combined with --dask"
         in ran(
             "convert",
             source,
@@ -268,7 +268,8 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
         in ran("convert", source, out, "--to", "csv", "--piece", "5", code=2).stderr
     )
     assert (
-        "combined with --to" in ran("convert", source, out, "--to", "csv", "-n", "5", code=2).stderr
+        "--to cannot be combined with"
+        in ran("convert", source, out, "--to", "csv", "-n", "5", code=2).stderr
     )
     assert (
         "pip install s3fs" in ran("convert", "s3://bucket/a.bin", out, "--to", "csv", code=2).stderr
