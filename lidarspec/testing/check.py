@@ -1,11 +1,12 @@
 """Check a sensor, a file or a distribution with every property and every rule.
 
-A name is resolved to a `CheckTarget`: its sensors, the errors of sensors that do not load, and the
-modules that declare them. The source of these modules is parsed for two purposes: to find mistakes
-that are valid Python but do something unintended, and to find the lines of fields, frames,
-functions, commands and sensors, so that a finding names file and line (`SourceTexts`). Then each
-sensor's declaration is checked, and its properties in the order of `properties`. Acknowledged
-findings are left out of the `Report`.
+A name is resolved to a `CheckTarget`: the sensors to check, the errors of sensors that cannot be
+loaded, and the modules that declare the sensors. The source of these modules is parsed for two
+purposes. One is to find mistakes that are valid Python but have an unintended effect
+(`check_texts`). The other is to find the lines of fields, frames, functions, commands and sensors,
+so that a finding names file and line (`SourceTexts`). Then the declaration of each sensor is
+checked, and its properties in the order of `PROPERTIES`. The `Report` has the findings that the
+declaration does not acknowledge.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"
-#: Rules about the hooks of a plugin; the path of such an error is the name of the plugin.
+#: Rules about the hooks of a plugin. The path of an error with such a rule is the plugin's name.
 HOOK_RULES = frozenset({"LS002", "LS003", "LS004"})
 
 
@@ -43,12 +44,13 @@ class CheckTarget:
     """The sensors to check.
 
     Attributes:
-        sensors: the sensors of the target that could be loaded.
+        sensors: the sensors that could be loaded.
         findings: the reasons why other sensors could not be loaded.
         files: the modules that declare the sensors.
-        vectors: the file of golden vectors, next to the modules, or in the source folder of the
-            distribution or its tests; None if there is none.
-        family: the ids of the sensors that share the vectors: all of the file or the distribution.
+        vectors: the file of golden vectors, which is next to the modules, in the source folder of
+            the distribution, or in its folder of tests; None if there is no such file.
+        family: the ids of the sensors that share the file of vectors: all sensors of the checked
+            file or distribution.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
@@ -59,7 +61,7 @@ class CheckTarget:
 
 
 def find_target(text: str | Path) -> CheckTarget:
-    """Return the target of a name.
+    """Return the sensors to check that a name refers to.
 
     The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
     distribution, or the folder of a distribution.
@@ -121,7 +123,7 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
 
 
 def _find_folder_target(folder: Path) -> CheckTarget:
-    """Return the target of the distribution with its source in a folder."""
+    """Return the target of the distribution whose source is in a folder."""
     file = folder / "pyproject.toml"
     project = read_document(file).get("project")
     if isinstance(project, dict):
@@ -137,7 +139,7 @@ def _find_folder_target(folder: Path) -> CheckTarget:
 
 
 def _find_vectors(files: Iterable[Path]) -> Path | None:
-    """Return the file of golden vectors of some modules; None if there is none."""
+    """Return the file of golden vectors of some modules; None if it does not exist."""
     beside = dict.fromkeys(file.resolve().parent for file in files)
     sources = [
         home
@@ -150,7 +152,7 @@ def _find_vectors(files: Iterable[Path]) -> Path | None:
 
 
 def _find_entry_points(distribution: str) -> list[EntryPoint]:
-    """Return the entry points of a distribution: modules with hooks, and sensors."""
+    """Return the entry points of a distribution, of modules with hooks and of sensors."""
     entries = [*entry_points(GROUP), *entry_points(SENSORS)]
     return [
         entry for entry in entries if _normalize(entry.distribution) == _normalize(distribution)
@@ -194,7 +196,7 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
 def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
     """Return a finding for each id or alias that several plugins use.
 
-    It names the plugin that owns the id.
+    The finding names the plugin whose sensor has the id.
     """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
@@ -209,7 +211,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
 
 
 def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """Return a finding for each sensor of a file with the id of an installed sensor."""
+    """Return a finding for each sensor of a file with the id of an installed one."""
     return [
         Finding(
             "LS005",
@@ -227,9 +229,9 @@ def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
 
 
 def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
-    """Return the sensors of a plugin that is loaded without other plugins.
+    """Load a plugin without other plugins, and return its sensors.
 
-    Its own hooks are applied.
+    The hooks of the plugin are applied to its sensors.
 
     Raises:
         Exception: any error of the plugin.
@@ -285,7 +287,7 @@ def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
 
 
 def _loading_rule(error: BaseException, cause: BaseException) -> str:
-    """Return the rule of a loading error."""
+    """Return the code of the rule that an error while loading violates."""
     functions = [location.name for location in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
@@ -332,9 +334,9 @@ Spot = tuple[str, int]
 
 
 class SourceTexts:
-    """The locations of declarations in the source of some modules.
+    """The locations (file, line) of declarations in the source of some modules.
 
-    Fields are found by their paths of names, all other declarations by kind and name.
+    Fields are found by the names in their paths, all other declarations by kind and name.
     """
 
     def __init__(self, trees: Mapping[str, ast.Module]) -> None:
@@ -349,7 +351,7 @@ class SourceTexts:
                 self._others.setdefault((kind, name), (file, line))
 
     def locate(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
-        """Return the finding with its file and line; unchanged if they are not found."""
+        """Return a copy of the finding with file and line; the same if they are not found."""
         if finding.file:
             return finding
         location = self._find_spot(finding.path, sensor) or (
@@ -371,7 +373,7 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Spot | None:
-        """Return the location of the field that matches the most names at the path's end."""
+        """Return the location of the field that matches most names at the end of the path."""
         fitting = [
             (len(chain), location)
             for chain, location in self._iter_fields
@@ -402,7 +404,7 @@ def _find_function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield (kind, name, line) of every possible key, frame type and sensor."""
+    """Yield (kind, name, line) of each key and of each possible frame type and sensor."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):
@@ -506,7 +508,7 @@ def _names_of_this(tree: ast.Module) -> set[str]:
 
 
 def _list_tests(node: ast.AST) -> list[ast.expr]:
-    """Return the expressions that Python tests for truth at a node."""
+    """Return the expressions whose truth value Python uses at a node."""
     match node:
         case (
             ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test)
@@ -520,7 +522,7 @@ def _list_tests(node: ast.AST) -> list[ast.expr]:
 
 
 def _is_expression(test: ast.expr, names: set[str]) -> bool:
-    """Return whether a test is an expression of construct's `this`: it is always true."""
+    """Return whether a condition is an expression of construct, which is always true."""
     return not isinstance(test, ast.BoolOp | ast.Call) and bool(_collect_names(test) & names)
 
 
@@ -539,9 +541,10 @@ def _is_silent(body: list[ast.stmt]) -> bool:
 
 
 def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
-    """Return whether a call may write only a part of its data.
+    """Return whether a call may write only a part of its data without an error.
 
-    The caller does not notice, because the source ignores the return value.
+    Args:
+        sockets: whether the module uses sockets.
     """
     match call.func:
         case ast.Attribute(value=ast.Name(id="os"), attr="write"):
@@ -551,9 +554,9 @@ def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
     return False
 
 
-#: Rules about faults that prevent all tests of properties.
+#: Rules whose violation makes it impossible to test properties.
 FATAL_RULES = frozenset({"LS213", "LS114", "LS115", "LS301"})
-#: Name in a report of all properties that are skipped after a violation of `FATAL_RULES`.
+#: Name, in a report, of all properties that are skipped after a violation of `FATAL_RULES`.
 REMAINING_PROPERTIES = "everything else"
 
 
@@ -566,9 +569,9 @@ class Report:
     """The result of a check.
 
     Attributes:
-        name: the sensor's id, or the checked name if there is no sensor.
+        name: the sensor's id, or the checked name if the report is about loading errors.
         findings: the findings.
-        held: the number of properties that hold.
+        held: number of properties that hold.
         skipped: property -> the reason why it does not apply.
         measured: measured values of frames, by description.
         picture: measured values of points, by description, to compare with the manual.
@@ -596,7 +599,7 @@ def reports(
     tested: Sequence[Sensor] = (),
     watch: Watch = lambda text, done, total: None,
 ) -> Iterator[Report]:
-    """Yield a report of each sensor of a target, and a report of any loading errors.
+    """Yield a report of each sensor, and a report of loading errors if there are any.
 
     Args:
         name: the checked name, as the user typed it.
@@ -604,7 +607,7 @@ def reports(
         strategies: "frame.field" -> a hypothesis strategy or function for its raw value, for fields
             without a valid value that can be derived.
         vectors: the file of golden vectors; by default the file of the target.
-        tested: related models that are also tested: parts that they share with a sensor are not
+        tested: related models that are tested as well. Parts that they share with a sensor are not
             tested again.
         watch: called before each step with its name, the number of finished properties and the
             total number of properties.
@@ -641,7 +644,7 @@ def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -
 
 
 def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
-    """Yield (name, value) of facts to compare with the measured values of a sensor."""
+    """Yield (name, text) of declared facts to compare with the measured values."""
     sensor = subject.sensor
     missing = lacking(subject)
     if missing:
@@ -654,7 +657,7 @@ def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]
 
 
 def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, case: str) -> None:
-    """Report the case of a property before it is tested."""
+    """Report the progress before a case of a property is tested."""
     watch(f"{sensor_id}: {case}", done)
 
 

@@ -73,7 +73,7 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
 
 
 def _reach(cloud: PointCloud) -> NDArray[np.float32]:
-    """Return the largest absolute coordinate of each point, at least 1 m, float32."""
+    """Return the largest absolute coordinate of each point, (n,), at least 1 m."""
     lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
     with np.errstate(invalid="ignore"):
         size = np.nanmax(np.abs(lengths), axis=0, initial=0).astype(np.float32)

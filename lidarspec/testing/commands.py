@@ -52,9 +52,9 @@ def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
 
 
 def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
-    """Check that a command's frame has its fixed values and its arguments.
+    """Check that parsing a command's frame returns its fixed values and arguments.
 
-    The parsed arguments may differ by half a step. The parsed values build the same frame.
+    Arguments may differ by half a step. Building the parsed values must give the same frame.
     """
     for share in (0.0, 0.37, 1.0):
         try:
@@ -99,7 +99,7 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
 
 
 def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> None:
-    """Check that arguments outside their ranges are refused."""
+    """Check that arguments outside their ranges raise an error."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind
         ends: tuple[float | str, ...]
@@ -124,7 +124,7 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
 def an_exchange_holds(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str
 ) -> None:
-    """Fail unless a command has these bytes, and `answer` is its reply.
+    """Check that a command has these bytes, and that `answer` is a reply to it.
 
     Raises:
         ViolationError: if the bytes differ, or the reply does not match.
@@ -154,7 +154,7 @@ def an_exchange_holds(
 
 
 def replies_can_match(subject: SensorUnderTest, name: str) -> None:
-    """Check that every field that identifies a reply is a field of one of the replies."""
+    """Check that each field that identifies a reply exists in a reply of the command."""
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
@@ -167,10 +167,10 @@ def replies_can_match(subject: SensorUnderTest, name: str) -> None:
 
 
 def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
-    """Check that the simulated sensor sends the documented reply in time.
+    """Check that the simulated sensor sends the documented reply before the timeout.
 
     Three sets of arguments are tried; one reply is enough. A missing reply is accepted if `answers`
-    depends on the arguments: a sensor need not support the tried values.
+    depends on the arguments, because the sensor need not support the tried values.
     """
     command = subject.sensor.commands[name]
     if command.frame is None or not command.replies:
@@ -196,7 +196,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
 
 
 def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
-    """Configure the sensor with the values that it learns from a simulated reply."""
+    """Check that the sensor can be configured with what it learns from a reply."""
     sensor = subject.sensor
     try:
         if values := learn_options(sensor, reply):
@@ -217,7 +217,7 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     """Return the reply of a simulated sensor to a command.
 
     Raises:
-        CommandError: if there is no reply, or a different reply.
+        CommandError: if there is no reply, or if the reply does not match.
     """
     command = subject.sensor.commands[name]
     sensor = subject.sensor
@@ -247,7 +247,7 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
 def _exchange(
     device: SimulatedDevice, session: Session, pending: PendingReply, name: str, now: int
 ) -> int:
-    """Run a simulated device until a command is done, and return the time of its end, ns."""
+    """Simulate a device until a command is finished; return the time of its end in ns."""
     sensor = session.sensor
     link = sensor.commands[name].link
     decoder = sensor.decoder(stream=not is_datagram(sensor.links[link]))

@@ -30,7 +30,8 @@ def assert_conformance(
 ) -> list[Report]:
     """Fail with every finding of `lidarspec check`; return the reports.
 
-    LS005, an id that another installed plugin uses, concerns the environment and is not included.
+    Findings of LS005 are not included: that another installed plugin uses the same id is a fault of
+    the environment.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
@@ -38,8 +39,8 @@ def assert_conformance(
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`, for fields without a valid value that can be derived.
         vectors: a file of golden vectors; by default the file that `check` finds.
-        tested: related models that are also tested: frames and functions that they share with the
-            sensor are not tested again.
+        tested: related models that are tested as well. Frames and functions that they share with
+            the sensor are not tested again.
     """
     __tracebackhide__ = True
     if isinstance(sensor, Sensor):
@@ -85,7 +86,7 @@ class SensorConformance:
     def test_conformance(
         self, request: pytest.FixtureRequest, record_property: Callable[[str, object], None]
     ) -> None:
-        """Check that the declaration is valid and every property holds."""
+        """Check that the declaration is valid and that every property holds."""
         __tracebackhide__ = True
         if self.vectors:
             vectors = request.path.parent / self.vectors

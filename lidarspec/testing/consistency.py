@@ -1,7 +1,7 @@
 """Checks that the parts of a declaration agree: angles, points, clock and times.
 
-Packets are made from the sensor's `sweep`. Some are far along the sweep, because the first packets
-seldom cross the full circle or the time at which the clock wraps.
+Packets are made from the sensor's `sweep`. Some have a large index, because the first packets
+seldom cross the full circle, and seldom reach the time at which the clock wraps.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import MAX_BACK_STEP_RAD, SMALL_CHANGE, make_sweep, read
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Indices along the sweep of the packets for the check of the clock; the last are far enough for
-#: the clock to wrap.
+#: Indices of the packets of the `sweep` for the check of the clock. The last ones are so large that
+#: the clock wraps before them.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
-#: Number of packets for the check of the times of points.
+#: Number of packets for the check that times of points agree with the clock.
 TIMED_PACKETS = 64
-#: Maximum spread of the times of a packet's points, as a number of clock steps between packets.
+#: Maximum number of clock steps by which the times of points may exceed those of their packets.
 MAX_SPREAD_STEPS = 30
-#: Number of parts of the full circle: a packet's angles are shifted by each multiple of a part.
+#: Number of different shifts of a packet's angles; they divide the full circle evenly.
 SHIFT_COUNT = 24
 
 
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
-    """Check that far along the sweep the clock stays below `wraps_at`."""
+    """Check that the clock stays below `wraps_at`, also in late packets of the sweep."""
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
@@ -54,7 +54,11 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
 
 
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
-    """Check that the times of a packet's points spread over few clock steps."""
+    """Check that the times of points agree with the clock.
+
+    The points of n packets may cover at most n + `MAX_SPREAD_STEPS` steps of the clock from packet
+    to packet.
+    """
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
         return
@@ -77,7 +81,7 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
 
 
 def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
-    """Check that points turn with the angles of their packet."""
+    """Check that points turn by the same angle as the angles of their packet."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return
@@ -128,7 +132,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
 def _turn_angles(
     values: Mapping[str, Any], angles: list[str], shift: float, full: float
 ) -> dict[str, Any]:
-    """Return the values of a packet with `shift` added to its angles.
+    """Return a packet's values with `shift` added to its angles.
 
     Args:
         full: the full circle, in the unit of the angles.
@@ -139,7 +143,7 @@ def _turn_angles(
 def _read_azimuths(
     subject: SensorUnderTest, name: str, values: Mapping[str, Any]
 ) -> NDArray[np.float64] | None:
-    """Return the azimuths of a packet with these values; None if it is not valid."""
+    """Return the azimuths of a packet with these values; None if it is invalid."""
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
         packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
@@ -153,9 +157,9 @@ def _read_azimuths(
 def _angles_between(
     one: NDArray[np.float64] | None, other: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
-    """Return the angles between two sets of azimuths.
+    """Return the differences of two arrays of azimuths, in radians.
 
-    Returns None if one of them is missing, or if their shapes differ.
+    Returns None if one of them is None, or if their shapes differ.
     """
     if one is None or other is None or one.shape != other.shape:
         return None

@@ -49,26 +49,26 @@ MEASURE_NAMES = frozenset(
 )
 #: Maximum share of payload offsets at which a sync pattern may match by chance.
 MAX_SYNC_SHARE = 1 / 200
-#: Number of measured lengths of examples before a frame is simulated.
+#: Number of examples whose lengths are measured before that of a simulated frame.
 FIRST_MEASURED_EXAMPLES = 3
-#: Total number of measured lengths of examples.
+#: Total number of examples whose lengths are measured.
 MEASURED_EXAMPLES = 12
 #: Default number of example payloads in which the sync pattern is counted.
 SYNC_EXAMPLES = 12
-#: A frame with at most this many bits of constants and checksums is weak: random bytes match it
-#: once in a few megabytes.
+#: A frame with at most this many bits of constants and checksums is weak: in a few megabytes of
+#: random bytes, one such frame is found by chance.
 WEAK_BITS = 24
-#: The same limit for a frame without points: a false one does not damage a point cloud.
+#: The same limit for a frame without points: a false frame does not damage a point cloud.
 WEAK_BITS_WITHOUT_POINTS = 16
 #: The same limit for frames in datagrams: UDP has its own checksum.
 WEAK_BITS_IN_DATAGRAMS = 8
 #: Maximum ratio of `max_length` to the length of the longest random frame.
 MAX_LENGTH_RATIO = 8
-#: Period in seconds from which the wrap of a clock does not matter.
+#: A clock with at least this period in seconds need not declare `wraps_at`.
 LONG_WRAP_S = 7 * 86_400
 #: Column of points -> possible units of its source fields.
 COLUMN_UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
-#: Pattern of the names of fields with the intensity of a return, and of fields with a code.
+#: Pattern of the names of fields with the intensity of a return.
 INTENSITY_NAMES = re.compile(
     r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?"
 )
@@ -116,7 +116,7 @@ def _check_sensor(sensor: Sensor) -> Findings:
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
-    """Yield findings for fields of scans, clock and counter that do not exist."""
+    """Yield findings for missing fields that scans, clock or counter need."""
     known = {
         path
         for name in sensor.main_frames
@@ -158,7 +158,7 @@ def _check_required_fields(sensor: Sensor) -> Findings:
 
 
 def _check_clock(sensor: Sensor) -> Findings:
-    """Yield a finding if a clock wraps within days and `wraps_at` is missing."""
+    """Yield a finding if a clock wraps within days, but `wraps_at` is missing."""
     clock = sensor.clock
     if (
         not isinstance(clock, Clock)
@@ -184,9 +184,10 @@ def _check_clock(sensor: Sensor) -> Findings:
 
 
 def _check_options(sensor: Sensor) -> Findings:
-    """Yield findings for options that `configure` ignores.
+    """Yield findings for options without effect.
 
-    An option is ignored if it is never read, or if all its choices give the same sensor.
+    An option has no effect if `configure` never reads it, or if all its choices give the same
+    sensor.
     """
     function = sensor.configure.function
     if isinstance(function, partial):
@@ -212,7 +213,7 @@ def _check_options(sensor: Sensor) -> Findings:
 
 
 def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
-    """Return whether `configure` accepts several values, and returns equal sensors."""
+    """Return whether `configure` returns equal sensors for several values it accepts."""
     accepted = 0
     for value in values:
         try:
@@ -266,9 +267,10 @@ def _is_reply(sensor: Sensor, name: str) -> bool:
 
 
 def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    """Yield a finding if `max_length` is far above the lengths of random frames.
+    """Yield a finding if `max_length` is much larger than random frames.
 
-    With this `max_length`, the decoder waits too long for the end of a frame with a corrupt length.
+    With too large a `max_length`, the decoder waits too long for the end of a frame with a corrupt
+    length.
     """
     sizes = list[int]()
     try:
@@ -291,7 +293,7 @@ def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Find
 def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of examples and of a simulated frame.
 
-    The simulated frame follows the first examples, because it takes long and is seldom needed.
+    The simulated frame comes after the first examples, because it takes long and is seldom needed.
     """
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_MEASURED_EXAMPLES))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
@@ -304,10 +306,10 @@ def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
 
 
 def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
-    """Yield the lengths of valid frames with one large value in a header field.
+    """Yield the lengths of valid frames with a large value in one header field.
 
-    The value is the largest that `max_length` allows. Random headers seldom have large counts, and
-    a `sweep` may have the same count in all packets.
+    The value is the largest that `max_length` allows. These frames are needed because random
+    headers seldom have large counts, and a `sweep` may have the same count in all packets.
     """
     frame = subject.sensor.frames[name]
     engine = get_codec(frame)
@@ -351,7 +353,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
 
 def _find_multiplied(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields that are multiplied with a field in metres to give ranges."""
+    """Return the fields by which a field in metres is multiplied to give ranges."""
     try:
         infos = [
             field_of(subject, name, node)
@@ -371,7 +373,7 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     These are `Scaled` fields with an empty unit.
 
     Args:
-        with_scale: include fields with a factor, e.g. the components of a direction.
+        with_scale: include fields with a scale, such as the components of a direction.
     """
     return {
         info.path
@@ -405,7 +407,8 @@ def _check_plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findi
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
     """Yield findings for fields that no checksum covers, in a frame with checksums.
 
-    Many checksums begin after the header, so that fields before all checksums are not reported.
+    Fields before the first covered byte are not reported, because many checksums begin after the
+    header.
     """
     reported: set[str] = set()
     for layout in layouts:
@@ -440,7 +443,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
 def _check_sync(
     subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCodec
 ) -> Findings:
-    """Yield a finding if the constant bytes at the start are common in payloads."""
+    """Yield a finding if the frame's first constants are frequent in payloads."""
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:
@@ -459,7 +462,7 @@ def _check_sync(
         matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
     share = float(matching.mean())
-    # With few bytes, the measured share is inexact.
+    # In few bytes, the measured share is inexact.
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
@@ -489,7 +492,7 @@ def _check_strength(
 
 
 def _find_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the number of checked bits up to which a frame is weak."""
+    """Return the maximum number of constant and checksum bits of a weak frame."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:
@@ -513,9 +516,9 @@ def _check_points(subject: SensorUnderTest, name: str) -> Findings:
 
 
 def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
-    """Yield a finding if the intensity comes from a field with an unsuitable name.
+    """Yield a finding if the intensity seems to come from the wrong field.
 
-    Applies if a field is named like an intensity and no column uses it.
+    This is the case if another field is named like an intensity and no column uses it.
     """
     own = [
         field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))

@@ -1,8 +1,8 @@
 """The findings of `lidarspec check` and the test kit, and their rules.
 
-The rules are a table, which a test compares with the reference page. A property raises `ViolationError`
-(through `require`) if it does not hold, which becomes a `Finding`; findings that a declaration
-acknowledges with a reason are removed at the end, by `list_unacknowledged`.
+The rules are a table, which a test compares with the reference page. A property that does not hold
+raises `ViolationError`, mostly by `require`; the exception becomes a `Finding`. At the end,
+`list_unacknowledged` removes the findings that a declaration acknowledges with a reason.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lidarspec.sensor_operations import Sensor
 
 
 class Rule(NamedTuple):
-    """A rule: its code, the fault in a few words, why it matters, and how to fix it."""
+    """A rule: its code, a short description of the fault, its consequence, its remedy."""
 
     code: str
     title: str
@@ -24,7 +24,7 @@ class Rule(NamedTuple):
     fix: str
 
 
-#: Code, title, reason and fix of each rule. LS0xx: loading, LS1xx: the struct, LS2xx: the
+#: Code, title, consequence and remedy of each rule. LS0xx: loading, LS1xx: the struct, LS2xx: the
 #: declaration, LS3xx: single frames, LS4xx: streams, LS5xx: points, LS6xx: commands, LS7xx: golden
 #: vectors, LS8xx: the source of modules.
 _TABLE = """
@@ -232,8 +232,8 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:
-        whole: whether all rules were checked. If they were, an acknowledgement without a finding
-            is reported as a finding.
+        whole: whether all rules were checked. If they were, each acknowledgement without a finding
+            is itself reported as a finding.
     """
     given = {
         "": sensor.acknowledged,

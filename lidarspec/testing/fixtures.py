@@ -34,13 +34,13 @@ def virtual_port(
         sensor: an id or a Sensor.
         to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; with TCP port 0, a free port
             is chosen.
-        link: the name of a symbolic link to the pseudo-terminal, which stays valid if the sensor
-            is unplugged and plugged in; by default in a temporary folder.
+        link: the name of a symbolic link to the pseudo-terminal. It stays valid if the sensor is
+            unplugged and plugged in again. The default is a link in a temporary folder.
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
-        rate: speed relative to real time; `inf` sends as fast as the reader reads.
+        rate: speed relative to real time; with `inf`, the sensor sends as fast as the reader reads.
         faults: the faults on its links.
-        virtual_time: True lets the sensor's time pass only in `advance`.
+        virtual_time: whether the sensor's time passes only in calls of `advance`.
 
     Yields:
         An object with the attributes `path` (to open) and `device` (`device.commands_received`
@@ -57,8 +57,8 @@ def virtual_port(
     device = SimulatedDevice(resolved, scene=scene, seed=seed, rate=rate, faults=faults)
     with contextlib.ExitStack() as stack:
         if to == "pty" and link is None:
-            # The system gives each pseudo-terminal a new name, and may give the old name to another
-            # process meanwhile.
+            # After an unplug, the new pseudo-terminal has a new name, and the system may have given
+            # the old name to another process.
             link = (
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-")))
                 / "port"

@@ -1,9 +1,9 @@
 """Checks of single frames: examples, round trips, edits, damage, types.
 
-construct omits bits, truncates numbers and accepts contradictory values without an error. Each of
-these faults shows if a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
-which shrinks a failure to the field at fault. A damaged frame may raise `WireError`, or it may be
-accepted if no checksum covers the changed bit. The share of these bits is measured.
+construct may omit bits, truncate numbers and accept contradictory values without an error. To find
+each of these faults, a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
+which reduces a failure to the faulty field. A damaged frame must raise `WireError`, or be accepted
+if no checksum covers the changed bit. The share of such bits is measured.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.sensor_under_test import MANY_FRAME_TYPES, SensorUnderTest
 
-#: Number of examples in which bytes are changed, for frames that plain construct reads.
+#: Number of examples in which bytes are changed, for frames that are not compiled.
 CHANGED_EXAMPLES = 3
-#: Default number of values that each of these bytes is changed to.
+#: Default number of values to which each of these bytes is changed.
 CHANGED_VALUES = 8
 #: Number of example frames that are edited.
 EDITED_EXAMPLES = 8
@@ -40,7 +40,7 @@ MAX_EDITS = 3
 MIN_CUT_OFFSETS = 12
 #: Maximum total bytes of the truncated copies of a long frame.
 MAX_CUT_BYTES = 1 << 20
-#: Maximum total bytes of the changed copies of a long frame that plain construct reads.
+#: Maximum total bytes of the changed copies of a long frame that is not compiled.
 MAX_CHANGED_BYTES = 300_000
 #: Default and minimum number of frames in which each bit is flipped in turn.
 FLIPPED_FRAMES = 3
@@ -51,7 +51,7 @@ MAX_FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
-    """Check that examples of a frame type are valid and repeatable, and differ.
+    """Check that examples of a frame type are valid, repeatable and different.
 
     No example may be longer than `max_length`.
     """
@@ -98,7 +98,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
 
 
 def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> None:
-    """Check build(parse(bytes)) == bytes for every example, reserved bits included."""
+    """Check that build(parse(data)) == data for each example, including reserved bits."""
     sensor = subject.sensor
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
@@ -113,10 +113,10 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
 
 
 def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
-    """Check that changed bytes survive parsing and building, apart from checksums.
+    """Check that parsing and building keeps changed bytes, apart from checksums.
 
-    Applies to frames that plain construct reads: they may contain functions of the author that
-    lose values.
+    Only frames that are not compiled are tested: they may contain functions of the author that lose
+    values.
     """
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
@@ -162,9 +162,9 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
 
 
 def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame is refused if a field differs from its `Rebuild`.
+    """Check that a frame is invalid if a field differs from its `Rebuild`.
 
-    Building the parsed values would give a different frame.
+    Otherwise, building the parsed values would give a different frame.
     """
     sensor = subject.sensor
     engine = get_codec(subject.sensor.frames[name])
@@ -196,7 +196,7 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
 
 
 def is_cut(before: Any, after: Any) -> bool:
-    """Return whether a number is one step lower after it was built and parsed."""
+    """Return whether a number is lower by one step after building and parsing."""
     if (
         not isinstance(before, int | float)
         or not isinstance(after, int | float)
@@ -222,7 +222,7 @@ def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) ->
 
 
 def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing without a type equals parsing as one of the matching types."""
+    """Check that parsing without a type gives the values of a type that matches."""
     data = subject.example(name, seed=1)
     fitting = [
         other for other in subject.sensor.frames if is_valid_frame(subject.sensor, data, other)
@@ -291,7 +291,7 @@ def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def acceptable(subject: SensorUnderTest, name: str, values: Any) -> bytes | None:
-    """Build the frame with these values; return None if they contradict each other."""
+    """Return the frame with these values; None if they contradict each other."""
     try:
         return subject.sensor.build(name, values)
     except UsageError:
@@ -299,7 +299,7 @@ def acceptable(subject: SensorUnderTest, name: str, values: Any) -> bytes | None
 
 
 def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> None:
-    """Check that drawn values of fields are read back as they were written."""
+    """Check that drawn values of fields are the same after building and parsing."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
     sensor = subject.sensor
@@ -353,7 +353,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
 def _check_edit(
     subject: SensorUnderTest, name: str, parsed: Any, spots: list[Any], edits: list[int]
 ) -> None:
-    """Check that the edited integers of a frame are read back."""
+    """Check that edited integers of a frame are the same after building and parsing."""
     built = acceptable(subject, name, parsed)
     if built is None:
         return
@@ -383,7 +383,7 @@ def _check_edit(
 
 
 def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
-    """Return the author's strategy for a field's raw value, or one for its range."""
+    """Return the author's strategy for a field's raw value, or one for all its values."""
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
@@ -406,7 +406,7 @@ def has_free_values(info: FieldInfo | None) -> bool:
 
 
 def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame that is cut short raises `WireError` with its offset."""
+    """Check that a truncated frame raises `WireError` with an offset up to its end."""
     data = subject.example(name, seed=2)
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CUT_BYTES
@@ -432,7 +432,7 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
 def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
     """Check that a damaged frame can be parsed or raises `WireError`.
 
-    This also applies to parsing without verification.
+    It is parsed with and without verification.
     """
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
@@ -451,7 +451,7 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str
 def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
     """Check that flipping any bit that a checksum covers makes the frame invalid.
 
-    The share of other bits that can be flipped in a valid frame is measured.
+    The share of bits that can be flipped without making the frame invalid is measured.
     """
     engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
@@ -501,7 +501,8 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
 def _choose_flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
     """Return the offsets of the bytes in which bits are flipped.
 
-    For a long frame, these are one byte of each field and some random bytes; otherwise all bytes.
+    In a long frame, bits are flipped in one byte of each field and in some random bytes, in a short
+    frame in all bytes.
     """
     number = MAX_FLIPPED_BYTES // (8 * length)
     if number >= length:

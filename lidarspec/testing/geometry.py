@@ -2,17 +2,18 @@
 
 Four kinds of frames are used:
 
-* Examples: clouds keep the conventions, and tracing `points` shows the source fields of each
-  column.
-* Packets along the sensor's `sweep`: directions are in radians, change in one sense from beam to
-  beam, cross the full circle without a jump, and exist for a single point; clock and counter
-  increase.
-* Frames with an angle that is changed by a few steps: the points turn in the sense of the vendor's
-  axes.
-* Packets simulated in a room: the decoded points lie on its walls. The walls are computed by
-  `distance_outside`, not by the simulator.
+* Examples: clouds must keep the conventions of `PointCloud`, and tracing `points` gives the source
+fields of each column.
+* Packets of the sensor's `sweep`: directions must be in radians, turn clockwise or
+counter-clockwise throughout, cross the full circle without a jump, and exist if a packet has a
+single point. Clock and counter must increase.
+* Frames with an angle that is changed by a few steps: the points must turn as the vendor's axes
+declare.
+* Packets simulated in a room: the decoded points must lie on its walls. Their distances are
+computed by `distance_outside`, not by the simulator.
 
-Measured values are reported (`SensorUnderTest.picture`), to be compared with the manual.
+Measured values are reported (`SensorUnderTest.picture`), so that the author can compare them with
+the manual.
 """
 
 from __future__ import annotations
@@ -51,48 +52,48 @@ from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Number of packets along the sweep for the check of directions.
+#: Number of packets of the `sweep` for the check of directions.
 SWEEP_PACKETS = 400
 #: Number of packets in a simulated room: for short frames, and for frames longer than
 #: `LONG_FRAME_BYTES`.
 SCENE_PACKETS = 200
 LONG_SCENE_PACKETS = 50
 LONG_FRAME_BYTES = 1500
-#: Maximum total bytes of packets along the sweep, of packets for the check of counters (which have
-#: to wrap), and of packets in the room.
+#: Maximum total bytes of packets of the `sweep`, of packets for the check of counters (so many that
+#: counters wrap), and of packets in the room.
 MAX_SWEEP_BYTES = 1 << 22
 MAX_COUNTER_BYTES = 1 << 24
 MAX_SCENE_BYTES = 1 << 21
 #: Minimum number of packets, even if they exceed the maximum total bytes.
 MIN_PACKETS = 8
-#: An azimuth along a sweep above this value in radians must be in degrees.
+#: If an azimuth of the `sweep` is larger than this value in radians, it must be in degrees.
 MAX_SWEEP_AZIMUTH_RAD = 4 * np.pi
-#: The azimuth of a random frame above this value in radians must be in degrees.
+#: If an azimuth of a random frame is larger than this value in radians, it must be in degrees.
 MAX_RANDOM_AZIMUTH_RAD = 15 * np.pi
-#: Minimum share of steps in one direction if a sensor rotates.
+#: Minimum share of steps of the azimuth in the same direction.
 MIN_ONE_WAY_SHARE = 0.8
 #: Maximum step of the azimuth against its direction, in radians.
 MAX_BACK_STEP_RAD = np.deg2rad(1.5)
-#: The same limit as a multiple of the median step; the larger limit applies.
+#: The same limit as a multiple of the median step. The larger limit applies.
 MAX_BACK_STEP_MEDIANS = 4
-#: Difference in raw units by which an angle is changed, to see if the points move with it.
+#: Number of raw units by which an angle is changed to test whether the points turn with it.
 SMALL_CHANGE = 4
 #: Default number of examples that are tried until one has points.
 TRIED_EXAMPLES = 8
-#: A sensor with a larger median step of the azimuth, in radians, rotates.
+#: A sensor rotates if the median step of its azimuth, in radians, is larger than this.
 MIN_ROTATION_STEP_RAD = 1e-5
-#: Minimum component of a direction along an axis to count as the direction of that axis.
+#: Minimum component along an axis of a direction that is taken as that axis.
 MIN_AXIS_COMPONENT = 0.9
 #: Rounding error of a point in float32, in metres.
 FLOAT32_ERROR_M = 2e-6
-#: Minimum tolerance of a distance in metres: a header or a code word may enlarge the step.
+#: Minimum tolerance of a distance in metres, because a step may be larger than the field shows.
 MIN_HALF_STEP_M = 0.004
 
 
 def make_sweep(
     subject: SensorUnderTest, name: str, packets: int, total: int = MAX_SWEEP_BYTES
 ) -> list[bytes]:
-    """Return the first packets along the sensor's `sweep`.
+    """Return the first packets of the sensor's `sweep`.
 
     Returns an empty list if there is no `sweep` or the frame type is not compiled.
 
@@ -121,7 +122,7 @@ def read(
 ) -> Packets:
     """Decode frames of one data type, with or without the sensor's clock.
 
-    If several frame types have points, the mode of this type is selected.
+    If several frame types have points, the sensor is configured for this type.
     """
     if by_clock:
         sensor = subject.sensor
@@ -133,7 +134,7 @@ def read(
 
 
 def trace_points(subject: SensorUnderTest, name: str) -> Any:
-    """Return the result of `points` for traced columns of one example.
+    """Return the result of `points` for one example with traced columns.
 
     Returns None if the frame is not compiled.
 
@@ -160,10 +161,10 @@ def _trace_points(subject: SensorUnderTest, name: str) -> Any:
 
 
 def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
-    """Return the fields that traced values come from.
+    """Return the nodes of the fields that traced values are calculated from.
 
     Args:
-        looked_up: include fields that are only used as an index of a table.
+        looked_up: include fields that are only used as indices of a table.
     """
     nodes = traverse(
         *values, into=lambda node: looked_up or not isinstance(node.function, TableLookup)
@@ -172,7 +173,7 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
 
 
 def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
-    """Return the field of a node, in this frame type or in the state."""
+    """Return the field of a node; it belongs to this frame type or to the state."""
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
     if node.kind == "state":
@@ -187,10 +188,10 @@ def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | Non
 def directions(
     subject: SensorUnderTest, name: str, packets: Packets
 ) -> list[NDArray[np.float64]] | None:
-    """Return azimuths and elevations from `points` before folding, without padding.
+    """Return the azimuths and elevations that `points` returns, without padding.
 
-    For Cartesian points, these are the directions that are declared for the simulation; None if
-    no directions are declared.
+    They are not yet folded to the full circle. For Cartesian points, the directions that the
+    simulation declares are returned instead; None if it declares none.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -227,10 +228,10 @@ def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np
 
 
 def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
-    """Check that clouds keep the conventions, and that `points` does not fail.
+    """Check that clouds keep the conventions, and that `points` raises no error.
 
-    The conventions are: metres and radians in float32, azimuth in [-pi, pi), and no coordinates of
-    points without a return.
+    The conventions are: metres and radians in float32, azimuths in [-pi, pi), and NaN coordinates
+    of points without a return.
     """
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
@@ -273,9 +274,9 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
 
 
 def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
-    """Check that frames with one point have a valid direction.
+    """Check that the point of a frame with one point has a valid direction.
 
-    Applies if the number of points is in the header.
+    Only frames with the number of points in the header are tested.
     """
     engine = get_codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
@@ -317,7 +318,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
 def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> None:
     """Check that an angle of exactly 360 degrees gives the same points as 0.
 
-    Applies if a frame with 360 degrees is plausible.
+    Nothing is tested if no frame with 360 degrees is plausible.
     """
     for path, info in _find_point_angles(subject, name).items():
         full = _find_full_circle(info)
@@ -350,10 +351,10 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
 
 
 def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
-    """Check that points turn with the angle as the vendor's axes declare.
+    """Check that points turn in the direction that the vendor's axes declare.
 
-    Golden vectors with points in two quadrants prove the sense better. The sense is always
-    reported.
+    No finding is reported if golden vectors have points in two quadrants, because they prove the
+    direction better. The direction is always part of the report.
     """
     for path, info in _find_point_angles(subject, name).items():
         zero = _find_zero(info)
@@ -382,9 +383,13 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
 
 
 def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
-    """Return the sense of angles that begin at azimuth `zero` on one axis.
+    """Return the direction in which angles grow that begin on one axis.
 
     1 is counter-clockwise, -1 clockwise, 0 unknown.
+
+    Args:
+        axes: the vendor's axes.
+        zero: the azimuth of the angle 0, in radians.
     """
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
@@ -397,9 +402,9 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
 
 
 def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
-    """Check that along the sweep the azimuths of each ring have one direction.
+    """Check that the azimuths of each ring in the sweep turn in one direction.
 
-    This includes the crossing of the full circle. Applies to sensors that rotate.
+    They must also do so where they cross the full circle. Only sensors that rotate are tested.
     """
     frames = make_sweep(
         subject,
@@ -458,7 +463,7 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that along the sweep no packet counts as lost, late or doubled.
+    """Check that no packet of the sweep is counted as lost, late or duplicate.
 
     The clock may not run backwards.
     """
@@ -499,7 +504,7 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
 
 
 def _find_zero(info: FieldInfo) -> int | None:
-    """Return the raw value nearest to a zero angle; None if it is out of range."""
+    """Return the raw value nearest to the angle 0; None if the field cannot have it."""
     if (
         info.kind != "int"
         or info.const is not None
@@ -514,10 +519,10 @@ def _find_zero(info: FieldInfo) -> int | None:
 
 
 def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
-    """Return the angles of a frame type that may turn its points, by path.
+    """Return the angle fields of a frame type that may turn its points, by path.
 
-    These are the angles that `points` uses, and optional angles, because the traced example may
-    lack them. If `points` cannot be traced, these are all angles.
+    These are the fields that `points` uses, and optional fields, which the traced example may not
+    have. If `points` cannot be traced, these are all angle fields.
     """
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
@@ -555,9 +560,9 @@ def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
 def _decode_with_values(
     subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
-    """Return the points of an example with each of these values in a field.
+    """Return the points of an example for each of these values of a field.
 
-    Returns an empty list if no example has the same number of points with all values.
+    Returns an empty list if no example has the same number of points for all values.
 
     Raises:
         SpecError: if `points` fails.
@@ -588,9 +593,10 @@ def _decode_with_values(
 
 
 def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
-    """Return the sense in which points turn with a field.
+    """Return the direction in which points turn if a field increases.
 
-    1 is counter-clockwise, -1 clockwise; 0 if they do not turn, as for a rate or an elevation.
+    1 is counter-clockwise, -1 clockwise, 0 if they do not turn. For example, they do not turn with
+    a rate or an elevation.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
@@ -617,9 +623,12 @@ def _set_value(subject: SensorUnderTest, name: str, path: str, value: int, parse
 
 
 def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances in metres, (n,), of points, (n, 3), to surfaces of a room.
+    """Return the distance of each point from the nearest surface of a room, in metres.
 
-    The geometry is independent of the simulator.
+    The calculation is independent of the simulator.
+
+    Args:
+        xyz: the coordinates of the points in metres, (n, 3).
     """
     distances = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
@@ -635,7 +644,7 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 def half_step(subject: SensorUnderTest, name: str) -> float:
     """Return half a step of the coarsest range field in metres.
 
-    It is at least `MIN_HALF_STEP_M`.
+    The result is at least `MIN_HALF_STEP_M`.
     """
     fields = subject.fields(name).values()
     metres = [
@@ -649,7 +658,7 @@ def half_step(subject: SensorUnderTest, name: str) -> float:
 
 
 def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
-    """Check that packets simulated in a room decode to points on its walls."""
+    """Check that packets simulated in a room are decoded to points on its surfaces."""
     room = make_room(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
     is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
@@ -674,7 +683,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         subject.picture[f"{name}: rate"] = "unknown"
     count = len(cloud) - 2 * len(cloud) // len(
         block.frames
-    )  # directions of the last packet may depend on the next one
+    )  # directions of the last packet may depend on the packet that follows
     valid = cloud.valid[:count]
     share = float(valid.mean()) if count else 0.0
     require(
@@ -696,7 +705,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         f"a point is {worst:.4f} m from the nearest surface of the scene",
         f"{name}.points",
     )
-    assert subject.sensor.range_limits is not None  # as of every sensor with points
+    assert subject.sensor.range_limits is not None  # every sensor with points has them
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:count][valid]
     inside = not len(ranges) or (

@@ -1,10 +1,10 @@
 """The table of properties that every sensor must have, for `lidarspec check` and for pytest.
 
-A property is a function of a `SensorUnderTest` that raises an exception if it does not hold. It
-proves the declaration, not the engine, which has tests of its own.
+A property is a function of a `SensorUnderTest` that raises an exception if the property does not
+hold. It tests the sensor's declaration; the engine has tests of its own.
 
 This module imports neither pytest nor hypothesis, so that it can be imported without the extra
-`testing`; `conformance` makes a test for pytest of it.
+`testing`. `conformance` makes a test for pytest from the table.
 """
 
 from __future__ import annotations
@@ -57,16 +57,17 @@ class Property:
     """A property that every sensor must have.
 
     Attributes:
-        function: raises an exception if the property does not hold. Its arguments are the subject,
-            and a name if the property is tested for each frame, data frame, command or vector.
-        each: the unit of a test: "sensor", "frame", "data", "command" or "vector".
-        rule: the rule that a plain `AssertionError` of the function violates.
+        function: raises an exception if the property does not hold. Its arguments are the subject
+            and, unless `each` is "sensor", the name of a frame, data frame, command or vector.
+        each: what the property is tested for: the "sensor", or each "frame", "data" frame,
+            "command" or "vector".
+        rule: the code of the rule that is violated if the function raises a plain `AssertionError`.
         lacks: returns the reason why the property does not apply to a sensor; "" if it applies.
-        unless: rules that describe the fault better; if one of them is violated, the property is
-            not tested.
-        depends_on: attributes of a sensor that decide the result. If a related model that is also
-            tested has equal attributes, the property is not tested again. If empty, it is tested
-            for each sensor.
+        unless: codes of rules that describe the fault better. If one of them is violated, the
+            property is not tested.
+        depends_on: attributes of a sensor that determine the result. If a related model that is
+            tested as well has equal attributes, the property is not tested again. If empty, the
+            property is tested for each sensor.
     """
 
     function: Callable[..., None]
@@ -120,7 +121,9 @@ class Property:
             try:
                 self.function(subject, *case)
             except ViolationError as error:
-                file = str(subject.vectors) if error.code == "LS702" else ""  # a fault of that file
+                file = (
+                    str(subject.vectors) if error.code == "LS702" else ""
+                )  # the vectors file has no source
                 findings.append(
                     Finding(error.code, error.what, error.path, subject.sensor.id, file)
                 )
@@ -138,10 +141,10 @@ class Property:
         return findings
 
 
-#: Rules that a plugin violates if it raises an exception for valid frames.
+#: Rules that a plugin violates if its functions raise an exception for valid frames.
 FAILING_RULES = ("LS213", "LS214", "LS215", "LS414")
 
-#: Attributes that decide the result of decoding a stream.
+#: Attributes of a sensor that determine the result of decoding a stream.
 DECODING_ATTRIBUTES = (
     "frames",
     "datagrams",
@@ -278,7 +281,7 @@ PROPERTIES = (
 
 
 def _find_first_line(error: BaseException) -> str:
-    """Return the first line of the message of an error that is not empty."""
+    """Return the first line of an error's message that is not empty."""
     lines = (line for line in str(error).splitlines() if line.strip())
     return next(lines, type(error).__name__)
 
@@ -286,7 +289,7 @@ def _find_first_line(error: BaseException) -> str:
 def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
     """Return the finding for an undocumented exception.
 
-    If the exception was raised in the plugin, the location is that line.
+    Its file and line are those in the plugin where the exception was raised, if any.
     """
     locations = [
         location

@@ -1,7 +1,7 @@
-"""A sensor under test, with its examples, their edits and truncated copies.
+"""A sensor under test, and its examples, edited and truncated.
 
-A `SensorUnderTest` has the sensor, its examples (drawn by the author's strategies if there are any)
-and measured values. All random values are seeded, so that a failure can be repeated.
+A `SensorUnderTest` has the sensor, its examples (with values of the author's strategies, if there
+are any) and measured values. All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
 #: Maximum length in bytes of a frame that is cut at every byte.
 MAX_SHORT_BYTES = 300
-#: Number of random offsets at which a longer frame is cut, in addition to both ends.
+#: Number of random offsets at which a longer frame is cut, besides those near its ends.
 CUT_OFFSETS = 50
 
 
@@ -35,7 +35,8 @@ def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
 def pick_offsets(length: int, source: random.Random, spots: int = CUT_OFFSETS) -> list[int]:
     """Return offsets at which a frame is cut.
 
-    These are all offsets of a short frame, or the ends and `spots` random offsets of a long frame.
+    These are all offsets of a short frame, or `count` random offsets of a long frame and those near
+    its ends.
     """
     if length <= MAX_SHORT_BYTES * spots // CUT_OFFSETS:
         return list(range(length))
@@ -69,9 +70,10 @@ def mutate(
     Bytes are changed, dropped, doubled, inserted, or overwritten.
 
     Args:
-        words: byte strings that are inserted or overwrite other bytes, e.g. values at the edge of a
-            range, or pieces of other inputs.
-        spots: offsets for half of the changes, e.g. of fields; by default all offsets are random.
+        words: byte strings that are inserted or that overwrite other bytes, such as values at the
+            edge of a range, or parts of other inputs.
+        offsets: offsets, such as those of fields, for half of the changes; by default all offsets
+            are random.
     """
     mutated = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
@@ -121,7 +123,7 @@ def integers(
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """Parse a frame with its scaled numbers in units.
+    """Parse a frame; its scaled numbers are in their units.
 
     Returns None if a number is too large for an exact float.
     """
@@ -160,21 +162,21 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     }
 
 
-#: Default number of examples of each frame type for each property. All numbers of rounds are given
-#: for this default.
+#: Default number of examples of each frame type for each property. All other numbers of rounds
+#: apply to this default.
 USUAL_EXAMPLES = 40
 #: Default number of rounds of a conversation.
 USUAL_ROUNDS = 3
 #: Minimum number of rounds of a conversation.
 MIN_ROUNDS = 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
-#: Number of frame types above which fewer examples of each are used.
+#: If a sensor has more frame types than this, fewer examples of each are used.
 MANY_FRAME_TYPES = 8
 #: Maximum total bytes of the examples of one frame type that a property uses.
 MAX_EXAMPLE_BYTES = 300_000
-#: Number of bytes after which no further round of a conversation begins.
+#: After this number of bytes, no further round of a conversation begins.
 CONVERSATION_BYTES = 500_000
-#: Number of examples that measure the length of frames.
+#: Number of examples by which the length of frames is measured.
 MEASURED_SEEDS = 3
 #: Number of values that are drawn from a hypothesis strategy.
 POOL_SIZE = 60
@@ -192,13 +194,13 @@ class SensorUnderTest:
         vectors: the file of golden vectors, None if there is none.
         family: the ids of the sensors that share that file; empty if the file belongs to this
             sensor alone.
-        tested: related models that are also tested; frame types that this sensor shares with them
-            are not tested again.
+        tested: related models that are tested as well. Frame types that this sensor shares with
+            them are not tested again.
         measured: measured values of frames as text, by description.
         picture: measured values of points as text, by description, to compare with the manual.
         traced: data frame -> the result of `points` for traced columns, if it can be traced.
-        placed: data frames with golden vectors that prove points in two quadrants.
-        swept: data frame -> packets along its `sweep` that a property has needed so far.
+        placed: the data frames whose golden vectors have points in two quadrants.
+        swept: data frame -> the packets of its `sweep` that have been made so far.
     """
 
     sensor: Sensor
@@ -219,7 +221,7 @@ class SensorUnderTest:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that no related model tests."""
+        """The frame types that are not tested for a related model."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -227,10 +229,10 @@ class SensorUnderTest:
 
     @property
     def commands(self) -> list[str]:
-        """The commands that no related model tests.
+        """The commands that are not tested for a related model.
 
-        A command is omitted if a related model that is also tested has the same command with the
-        same frames, links and answers.
+        A command is omitted if a related model in `tested` has the same command with the same
+        frames, links and answers.
         """
         return [
             name
@@ -249,8 +251,8 @@ class SensorUnderTest:
     def seeds(self, name: str, share: float = 1.0) -> range:
         """Return the seeds of the examples of a frame type that are used.
 
-        There are fewer seeds for long frames, because each field takes time, and if the sensor has
-        many frame types.
+        There are fewer seeds if the frame is long, because each field takes time, or if the sensor
+        has many frame types.
         """
         few = 8 if self.sensor.frames[name].max_length > MAX_SHORT_BYTES else 1
         few *= 2 if len(self.sensor.frames) > MANY_FRAME_TYPES else 1
@@ -269,7 +271,7 @@ class SensorUnderTest:
         return min(number, max(total // self.length(name), least))
 
     def length(self, name: str) -> int:
-        """Return the maximum length in bytes of a few examples of a type."""
+        """Return the length in bytes of the longest of a few examples of a type."""
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
@@ -279,7 +281,7 @@ class SensorUnderTest:
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """Return the bytes of a valid frame with seeded content.
 
-        It has values of the author's strategies if there are any.
+        Values for which the author gives a strategy are drawn from it.
         """
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)
@@ -308,7 +310,7 @@ class SensorUnderTest:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Return frames of all incoming types in a possible order, as (type, bytes).
 
-        Before each frame are the frames without which the decoder would not accept it.
+        Each frame follows the frames without which the decoder would not accept it.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0
@@ -325,7 +327,7 @@ class SensorUnderTest:
                     number = 1
                 first = (
                     seed * 1000 + turn * number
-                )  # the lowest seeds, because other properties use the same examples
+                )  # the lowest seeds, because other properties have made these examples already
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
                 frames += [

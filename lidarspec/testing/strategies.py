@@ -6,14 +6,15 @@
     @given(values("acme-x1", "data"))
     def test_distances_are_positive(value): ...
 
-Each field is drawn separately, so that a failure is reported with the smallest value of each
-field. Fields that decide the layout (counts, lengths, keys of a `Switch`) are drawn first, then the
-other fields of the layout, within the ranges that the struct and `plausible` accept
-(`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. A long array is
-filled with one drawn value and has a few exceptions.
+Each field is drawn separately, so that a failure is reported with the smallest value of each field.
+First, the fields are drawn that determine the layout (counts, lengths, keys of a `Switch`). Then
+the other fields of the layout are drawn, within the ranges that the struct and `plausible` accept
+(`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. In a long array,
+all elements have the same drawn value except a few.
 
-Frames without layouts, which only construct can read, and frames with parts are drawn by walking
-their struct. If values are seldom valid together, the frame is one of a few examples.
+Frames without layouts (which only construct can parse) and frames with parts are drawn value by
+value, in the order of their struct. If such values are seldom valid together, one of a few examples
+is drawn instead.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ __all__ = ["commands", "frames", "scans", "streams", "values"]
 
 #: Field path -> a strategy of its raw value.
 Fields = Mapping[str, SearchStrategy[Any]]
-#: Maximum number of elements of an array that are drawn separately; a longer array is filled with
-#: one value and has at most `MAX_EXCEPTIONS` exceptions.
+#: Maximum number of elements of an array that are drawn separately. In a longer array, all elements
+#: have one value except at most `MAX_EXCEPTIONS` elements.
 MAX_SINGLE_DRAWS = 12
 MAX_EXCEPTIONS = 6
 #: Number of tries to draw a frame without a layout in one example.
@@ -72,7 +73,7 @@ MAX_OCTETS = 16
 #: Maximum number of runs of frames in a stream, and maximum length of the noise between two runs.
 MAX_RUNS = 6
 MAX_NOISE_BYTES = 16
-#: Number of packets in which a complete scan is searched: at first, and the maximum.
+#: Number of packets in which a complete scan is searched: initial number, and maximum.
 FIRST_PACKETS = 16
 MAX_PACKETS = 8192
 #: Limits of a scan: distance of a wall in metres, number of boxes, number of scans since power-on.
@@ -206,15 +207,15 @@ def streams(
 ) -> SearchStrategy[Any]:
     """Return a strategy for input that `Sensor.decode`, `split` and `scans` accept.
 
-    It consists of valid frames of all incoming types: bytes, or a list of datagrams if the sensor
-    sends datagrams. A frame that is only valid after another frame follows that frame, and weak
-    frames are in runs that are long enough to be accepted. Without noise, every byte belongs to a
-    frame.
+    The input consists of valid frames of all incoming types. It is bytes, or a list of datagrams if
+    the sensor sends datagrams. If a frame type is only valid after another type (`after`), that
+    type comes first. If a frame type needs several frames in a row (`confirm`), there are as many.
+    Without noise, every byte belongs to a frame.
 
     Args:
         sensor: an id or a Sensor.
-        noise: True inserts random bytes and truncated frames, as datagrams if the sensor sends
-            datagrams. A strategy inserts the bytes that it draws.
+        noise: with True, random bytes and truncated frames are inserted, as datagrams if the sensor
+            sends datagrams. With a strategy, the bytes that it draws are inserted.
     """
     resolved = _resolve(sensor)
     runs = [_run(resolved, name) for name in resolved.incoming]
@@ -265,7 +266,8 @@ def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
 
     Raises:
         UsageError: for a sensor that declares no `sweep`.
-        SpecError: if its ranges cannot be traced back to fields, or it sends no complete scan.
+        SpecError: if the sensor's ranges cannot be traced back to fields, or if it sends no
+            complete scan.
     """
     resolved = _resolve(sensor)
     return _scans(resolved, _packets_per_scan(resolved), lost)
@@ -343,7 +345,7 @@ def _to_plain(parsed: Any) -> Any:
 
 @st.composite
 def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw the header, then the values of the fields of its layout."""
+    """Draw the header, then values of the other fields of the layout."""
     ranges = ranges_of(sensor, frame, draw(_headers(sensor, frame, fields)))
     if ranges is None:
         # No plausible frame has this header.
@@ -378,7 +380,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
             else:
                 header[asked] = draw(_header_values(sensor, frame, info))
         except (TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
-            # The last value is at fault: the values before it led to a further field.
+            # The last drawn value is invalid: with the values before it, there was a next field.
             if not header.get(asked):
                 return draw(st.sampled_from(known_headers(sensor, frame)))
             header[asked] = int(header[asked] / 2)
@@ -439,7 +441,7 @@ def _draw_leaf(draw: DrawFn, leaf: Leaf, element: SearchStrategy[Any]) -> NDArra
 def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[Any]:
     """Draw the elements of an array.
 
-    A long array is filled with one value and has a few exceptions.
+    In a long array, all elements have one value except a few.
     """
     if count <= MAX_SINGLE_DRAWS:
         return [draw_one() for _ in range(count)]
@@ -450,13 +452,13 @@ def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[A
 
 
 class _DrawnNumbers(random.Random):
-    """A source of random numbers that are drawn by Hypothesis, and so shrink."""
+    """A source of random numbers that Hypothesis draws, so that it can reduce failures."""
 
     def __init__(self, draw: DrawFn, ranges: Mapping[str, tuple[int, int]]) -> None:
         super().__init__(0)
         self._draw = draw
         self._ranges = ranges
-        #: elements of the arrays around the one that is drawn, multiplied.
+        #: product of the numbers of elements of the arrays around the current value
         self._elements = 1
 
     def draw(self, strategy: SearchStrategy[Any]) -> Any:
@@ -512,7 +514,7 @@ class _DrawnNumbers(random.Random):
 
 @functools.lru_cache(maxsize=1024)
 def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
-    """Return a strategy for numbers that may be counts: low numbers are more frequent."""
+    """Return a strategy for numbers that may be counts: mostly low numbers."""
     low_numbers = [st.integers(max(low, 0), min(high, top)) for top in LOW_NUMBERS]
     return st.one_of(*low_numbers, st.integers(low, high))
 

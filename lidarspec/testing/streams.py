@@ -1,8 +1,8 @@
 """Properties of a sensor's streams: no lost frame, repeatable results, equal scans in batches.
 
-A frame of one type may be mistaken for another type. The functions of a sensor (`plausible`,
-`points`, `clock`) may depend on more than their arguments: on memory, on chance, or on the other
-packets of a batch. The tests of lidarspec prove the engine itself.
+The following faults are found: a frame of one type is mistaken for another type, and functions of
+the sensor (`plausible`, `points`, `clock`) depend on more than their arguments, such as earlier
+calls, random numbers, or the other packets of a batch. The engine itself is tested elsewhere.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from lidarspec.testing.cloud_assertions import assert_same_places, assert_well_f
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
-#: Number of rounds of a conversation if a shorter conversation has no scan: few random frames of
-#: some sensors have points.
+#: Number of rounds of a conversation if a shorter conversation has no scan, because few random
+#: frames of some sensors have points.
 MORE_ROUNDS = 12
-#: Numbers of packets that arrive at a time if scans are cut again.
+#: Numbers of packets in a batch, for the comparison with scans from a single batch.
 BATCH_SIZES = (1, 3)
 
 
 def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
-    """Check that frames without gaps are found unchanged, and that no byte is left."""
+    """Check that all frames of a clean input are found, and that no byte is left over."""
     sent = subject.conversation()
     data = material.make_input(subject.sensor, sent)
     received = [(item.frame, item.data) for item in subject.sensor.split(data)]
@@ -61,7 +61,7 @@ def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> V
 def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
     """Check that decoding the same bytes twice gives the same points.
 
-    `points` is called in both runs: the plan of a traced function would not call it again.
+    `points` is evaluated without tracing, so that the function is called in both runs.
     """
     data = material.make_input(subject.sensor, subject.conversation(rounds=1))
     one = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
@@ -77,7 +77,7 @@ def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
 
 
 def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
-    """Check that scans do not depend on the number of packets that arrive at a time."""
+    """Check that scans do not depend on how many packets arrive in one batch."""
     for rounds in (None, MORE_ROUNDS):
         data = material.make_input(subject.sensor, subject.conversation(rounds=rounds))
         frames = subject.sensor.split(data)
@@ -98,7 +98,7 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
 
 
 def _scans_in_batches(sensor: Sensor, frames: list[Found], size: int) -> list[Scan]:
-    """Return the scans of frames that arrive `size` at a time."""
+    """Return the scans of frames that arrive in batches of `size` frames."""
     stats = Decoder(sensor, stream=True).stats
     stream = PacketStream(sensor, sensor.data_frame, stats)
     starts = range(0, len(frames), size)

@@ -1,10 +1,10 @@
 """The valid values of the fields of one layout, for strategies that draw them field by field.
 
-Frames can violate the conditions of a struct and the sensor's `plausible`. Both are functions that
-accept or refuse a whole frame. Therefore one valid frame, the *base*, is searched first. Then each
-field is varied alone in the base: the range of a field extends from its base value to the first
-value that is refused, found by bisection. Values from these ranges are mostly valid together. If
-they are not, `LayoutRanges.repair` keeps as many of them as the base allows.
+Conditions of the struct and the sensor's `plausible` accept or reject a whole frame. Therefore, one
+valid frame, the *base*, is searched first. Then each field is varied alone in the base: its range
+extends from its value in the base to the last value that is accepted, which is found by bisection.
+Values from these ranges are mostly valid together. If they are not, `LayoutRanges.repair` replaces
+some of them by values of the base.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class LayoutRanges:
 
     Attributes:
         layout: the layout.
-        free: the fields to draw: all fields that the header, constants, lengths and checksums do
-            not determine.
+        free: the fields to draw. These are all fields except those of the header, constants,
+            lengths and checksums.
     """
 
     def __init__(
@@ -76,9 +76,9 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return the struct with these values; values that are not valid are replaced.
+        """Return the struct with these values; invalid values are replaced by valid ones.
 
-        Returns None if no valid struct has the values of the fixed fields.
+        Returns None if no valid struct with the values of the fixed fields is found.
 
         Args:
             fixed: the fields that keep their values.
@@ -93,7 +93,7 @@ class LayoutRanges:
         return self._make_rows([self.repair(values, kept)]).tobytes()
 
     def _rebase(self, values: Mapping[str, Values]) -> LayoutRanges | None:
-        """Return ranges with a base that has these values; None if none is found."""
+        """Return ranges whose base has these values; None if no such base is found."""
         fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
         for path, value in values.items():
             elements = itertools.cycle(value.flat)
@@ -106,10 +106,10 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and all other values that are valid together with them.
+        """Return the fixed values, and those other values that are valid together with them.
 
-        Fields without a value in the result keep the value of the base. A field in an array keeps
-        its valid elements.
+        Fields that are missing in the result have their value of the base. Of a field in an array,
+        the valid elements are kept.
         """
         kept = dict(fixed)
         for leaf in self.free:
@@ -125,7 +125,7 @@ class LayoutRanges:
         return kept
 
     def _mix(self, kept: Mapping[str, Values], leaf: Leaf, values: Values) -> Values:
-        """Replace each element of an array that is not valid by the element of the base."""
+        """Replace each invalid element of an array by the element of the base."""
         base = leaf.load(self._base)
         mixed = base.copy()
         tried = []
@@ -140,7 +140,7 @@ class LayoutRanges:
 
     @functools.cached_property
     def ranges(self) -> Mapping[str, tuple[int, int]]:
-        """Path of each free field of integers or bytes -> its lowest and highest raw value."""
+        """Path of each free integer or bytes field -> its lowest and highest raw value."""
         if not self._has_rules:
             return {
                 leaf.info.path: _find_limits(leaf)
@@ -153,7 +153,7 @@ class LayoutRanges:
             if leaf.info.kind in ("int", "bytes") and leaf.info.allowed is None
         ]
         # A small value may only be valid together with small values of other fields, and a large
-        # value with large values. Therefore two bases are varied: the found base, and a base with
+        # value with large values. Therefore two bases are varied: the first base, and a base with
         # small values.
         ends = [self._find_ranges(bounded)]
         if self._shrink_base(bounded):
@@ -178,7 +178,7 @@ class LayoutRanges:
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Bring each field of the base as near to 0 as possible; return if any changed."""
+        """Set each field of the base as near to 0 as is valid; return whether any changed."""
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
@@ -192,7 +192,7 @@ class LayoutRanges:
 
     @property
     def _has_rules(self) -> bool:
-        """Whether any values of these fields are refused."""
+        """Whether any values of these fields may be invalid."""
         declared = self._sensor.frames[self._frame]
         return bool(
             declared.plausible is not None or declared.wire is not None or self.layout.conditions
@@ -267,8 +267,7 @@ def find_ends(
                 refused[path] = middle
 
 
-#: Number of random frames from which valid headers are collected, and of valid frames without
-#: layouts that are collected.
+#: Number of random frames whose headers are collected.
 KNOWN_HEADERS = 16
 KNOWN_FRAMES = 4
 #: Number of tries for each frame without layouts.
@@ -281,7 +280,7 @@ SINGLE_WALKS = 10
 def ranges_of(
     sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
 ) -> LayoutRanges | None:
-    """Return the ranges of the frames with a header; None if no valid frame is found.
+    """Return the ranges of frames with this header; None if no valid frame is found.
 
     Args:
         frame: a type with layouts and without parts.
@@ -381,10 +380,11 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
-    """Return the lowest and highest raw value of integer fields, without layouts.
+    """Return the lowest and highest raw value of integer fields of a frame.
 
-    They are found by changing one valid frame. Fields that decide the following fields, such as
-    counts, and fields that have only one valid value in that frame are omitted.
+    The frame need not have layouts. The values are found by changing one valid frame. Fields that
+    decide the following fields, such as counts, and fields that have only one valid value in that
+    frame are omitted.
     """
     if sensor.frames[frame].plausible is None:
         return {}

@@ -7,12 +7,13 @@
 
 `values` are raw integers, `units` physical values in the fields' units, `points` columns of single
 points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further column). All
-three may be omitted: then the bytes must be a frame of this type, and building the parsed values
-must give the same bytes. `sensor` is the id, or a list of ids, of the sensors of an entry; it may
-be omitted if the file belongs to one sensor alone. An entry with `command` is the frame of a
-command with `args`, by name in units; `reply` is its reply.
+three may be omitted. In any case, the bytes must be a frame of this type, and building the parsed
+values must give the same bytes. `sensor` is the id or a list of ids of the sensors that an entry
+belongs to; it may be omitted if the file belongs to a single sensor. An entry with `command` has
+the frame of that command with the arguments `args`, in their units; `reply` is its reply.
 
-Gaps in the vectors are checked as well: a status without vectors, and data fields without a value.
+It is also checked that a sensor with the status "vectors" has vectors, and that they have a value
+of each data field.
 """
 
 from __future__ import annotations
@@ -42,18 +43,18 @@ from lidarspec.trusted_files import read_document
 
 #: Tolerance of points in metres and radians: manuals print rounded values.
 POINT_TOLERANCE = 2e-4
-#: Number of examples with layouts that are searched for fields with checksums.
+#: Number of examples whose layouts are searched for fields with checksums.
 LAYOUT_EXAMPLES = 8
 #: Pattern of the names of fields that store a checksum.
 CHECKSUM_NAMES = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
 )
-#: Beginning of the remark on a checksum that cannot be checked, because it is not documented.
+#: Beginning of the docs of a checksum field that is not verified, as it is not documented.
 NOT_CHECKED = "not checked"
-#: Bits of evidence from which a field with any name must be a checksum: one of 4096 wrong guesses
-#: reaches this limit.
+#: Bits of evidence above which a field with any name is taken as a checksum. By chance, one of 4096
+#: fields reaches this limit.
 PROOF_BITS = 12
-#: Pattern of the names of fields without a meaning, which need no vector.
+#: Pattern of the names of fields without a meaning, which need no value in a vector.
 SPARE_NAMES = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
 #: A number larger than any field.
 _HUGE = 1 << 65
@@ -99,10 +100,10 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
-    """Check that each golden vector has its values and points, and can be built again.
+    """Check that golden vectors have their values and points, and can be built again.
 
     Args:
-        only: the key of one vector; by default all vectors are checked, up to the first failure.
+        only: the key of the vector to check; by default all vectors are checked until one fails.
     """
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
@@ -138,9 +139,9 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
 
 
 def lacking(subject: SensorUnderTest) -> str:
-    """Return the reason why there are no vectors of this sensor.
+    """Return the reason why the sensor has no vectors.
 
-    Returns "" if there are any, or if `vectors_hold` reports their faults.
+    Returns "" if it has vectors, or if the file is invalid (`vectors_hold` reports that).
     """
     if subject.vectors is None:
         return "no file of golden vectors"
@@ -166,8 +167,8 @@ def places(subject: SensorUnderTest) -> list[str]:
 def the_status_is_proven(subject: SensorUnderTest) -> None:
     """Check that a sensor with the status "vectors" has golden vectors.
 
-    A capture may be too large, or its license may not allow publication: then the `source` of the
-    sensor names it.
+    If a capture is too large or its license does not allow publication, the sensor has another
+    status, and its `source` names the capture.
     """
     missing = lacking(subject)
     status = subject.sensor.status
@@ -175,7 +176,7 @@ def the_status_is_proven(subject: SensorUnderTest) -> None:
 
 
 def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:
-    """Check that each field of a data frame has a nonzero value in a vector, if any."""
+    """Check that each data field has a value other than 0 in some vector."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     if not vectors:
         return
@@ -203,7 +204,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
 
 
 def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
-    """Check that the vectors have points in two quadrants and within the range."""
+    """Check that vectors have points in two quadrants, within the declared range."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     placed = [
         point
@@ -227,7 +228,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     subject.picture[f"{name}: vectors"] = (
         f"{seen} in {len(vectors)} vectors, with x and y in {number}"
     )
-    assert subject.sensor.range_limits is not None  # as of every sensor with points
+    assert subject.sensor.range_limits is not None  # every sensor with points has them
     far = subject.sensor.range_limits[1]
     require(
         not len(ranges) or ranges.max() <= far * (1 + POINT_TOLERANCE),
@@ -243,10 +244,10 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 
 
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
-    """Check that no field outside a `Checksummed` is a checksum.
+    """Check that each checksum is verified by a `Checksummed`.
 
-    A checksum is recognized by its name, or by a search in the vectors. A field with a remark that
-    it is not checked is accepted, unless the search finds its algorithm.
+    A checksum is recognized by its name, or by a search in the vectors. If the docs of a field say
+    that it is not checked, it is accepted, unless the search finds its algorithm.
     """
     sealing = _sealing_fields(subject, name)
     free = [
@@ -284,9 +285,9 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
 
 
 def _sealing_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields that store a checksum in any of several examples.
+    """Return the fields that store a verified checksum in any of several examples.
 
-    A header may remove a part together with its checksum.
+    One example is not enough, because a header may omit a part with its checksum.
     """
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
@@ -303,8 +304,8 @@ def _find_matches(
 ) -> list[ChecksumMatch]:
     """Return the checksums that match frames and lie in the field at `path`.
 
-    If a checksum of the library matches, checksums that need a new class are omitted: they match
-    only because the other matches.
+    If a checksum of `lidarspec.spec` matches, checksums that need a new class are omitted, because
+    they match only as a consequence.
     """
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
@@ -331,7 +332,7 @@ def _needs_class(match: ChecksumMatch) -> bool:
 
 
 def _describe_match(match: ChecksumMatch, length: int) -> str:
-    """Describe a checksum, its coverage, and the byte order of its field."""
+    """Describe a checksum, the bytes that it covers, and the byte order of its field."""
     if match.place.size > 1:
         order = f", in a field that is {match.order}-endian,"
     else:
@@ -346,7 +347,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
 def _find_common_matches(frames: list[bytes]) -> list[ChecksumMatch]:
     """Return the checksums that match all frames.
 
-    Long frames are searched separately, at the usual offsets only.
+    Long frames are searched one by one, and only at the usual offsets.
     """
     if max(map(len, frames), default=0) <= MAX_SHORT_BYTES:
         return search(frames)
@@ -549,7 +550,7 @@ def _compare_values(
 
 
 def _find_value_rule(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
-    """Return the rule that a wrong integer violates: byte order, sign, or value."""
+    """Return the rule that a wrong value violates: byte order, sign, or value."""
     if info is None or info.kind != "int" or not isinstance(wanted, int) or not info.bits:
         return "LS706"
     top = 1 << info.bits
