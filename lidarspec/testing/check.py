@@ -86,10 +86,10 @@ def find_target(text: str | Path) -> CheckTarget:
         file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])
     ]
     family = [
-        one
+        sensor_id
         for plugin in registry().plugins
         if plugin.distribution in {home.distribution for home in homes}
-        for one in plugin.sensors
+        for sensor_id in plugin.sensors
     ]
     return CheckTarget(
         [sensor], _check_rivals([sensor]), files, _find_vectors(files), tuple(family)
@@ -97,14 +97,12 @@ def find_target(text: str | Path) -> CheckTarget:
 
 
 def _find_file_target(file: Path, wanted: str) -> CheckTarget:
-    found_target = CheckTarget(files=[file], vectors=_find_vectors([file]))
+    target = CheckTarget(files=[file], vectors=_find_vectors([file]))
     try:
-        found_target.sensors = _load_sensors(import_file(file), str(file))
-        found_target.family = tuple(
-            sensor.id for sensor in found_target.sensors[1:] and found_target.sensors
-        )
-        found_target.findings += _check_taken_ids(found_target.sensors, file)
-        if not found_target.sensors:
+        target.sensors = _load_sensors(import_file(file), str(file))
+        target.family = tuple(sensor.id for sensor in target.sensors[1:] and target.sensors)
+        target.findings += _check_taken_ids(target.sensors, file)
+        if not target.sensors:
             raise SpecError(
                 "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
                 rule="LS006",
@@ -112,14 +110,14 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
-        found_target.findings.append(describe_loading_error(error, [file]))
-        found_target.files = found_target.files if _is_readable(file) else []
-        return found_target
-    ids = [sensor.id for sensor in found_target.sensors]
-    found_target.sensors = [sensor for sensor in found_target.sensors if wanted in ("", sensor.id)]
-    if not found_target.sensors:
+        target.findings.append(describe_loading_error(error, [file]))
+        target.files = target.files if _is_readable(file) else []
+        return target
+    ids = [sensor.id for sensor in target.sensors]
+    target.sensors = [sensor for sensor in target.sensors if wanted in ("", sensor.id)]
+    if not target.sensors:
         raise UnknownSensor(wanted, ids, place=str(file))
-    return found_target
+    return target
 
 
 def _find_folder_target(folder: Path) -> CheckTarget:
@@ -160,37 +158,31 @@ def _find_entry_points(distribution: str) -> list[EntryPoint]:
 
 
 def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
-    found_target = CheckTarget()
+    target = CheckTarget()
     for entry in entries:
         try:
             sensors = _load_sensors(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
             finding = describe_loading_error(error, module_files(entry.value))
-            found_target.findings.append(
+            target.findings.append(
                 replace(finding, path=finding.path or f"{entry.name} = {entry.value}")
             )
             continue
-        found_target.files += [
-            file for file in module_files(entry.value) if file not in found_target.files
+        target.files += [file for file in module_files(entry.value) if file not in target.files]
+        target.sensors += [
+            sensor for sensor in sensors if sensor.id not in {other.id for other in target.sensors}
         ]
-        found_target.sensors += [
-            sensor
-            for sensor in sensors
-            if sensor.id not in {one.id for one in found_target.sensors}
-        ]
-    found_target.vectors = _find_vectors(found_target.files)
-    found_target.family = tuple(sensor.id for sensor in found_target.sensors)
+    target.vectors = _find_vectors(target.files)
+    target.family = tuple(sensor.id for sensor in target.sensors)
     names = {_normalize(entry.distribution) for entry in entries}
     failing = [
         plugin
         for plugin in registry().plugins
         if _normalize(plugin.distribution) in names and plugin.rule == "LS010"
     ]
-    found_target.findings += [
-        Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing
-    ]
-    found_target.findings += _check_rivals(found_target.sensors)
-    return found_target
+    target.findings += [Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing]
+    target.findings += _check_rivals(target.sensors)
+    return target
 
 
 def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
@@ -240,7 +232,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
         return [registry().apply_hooks(plugin)]
     local = Registry()
     ids = local.add(plugin, name=name)
-    sensors = [local.sensor(one) for one in ids]
+    sensors = [local.sensor(sensor_id) for sensor_id in ids]
     hook: Any = getattr(plugin, "lidarspec_checksum", None)
     for sensor in sensors if callable(hook) else []:
         for frame in sensor.frames.values():
@@ -330,7 +322,7 @@ def _normalize(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-Spot = tuple[str, int]
+Location = tuple[str, int]
 
 
 class SourceTexts:
@@ -345,7 +337,7 @@ class SourceTexts:
             for file, tree in trees.items()
             for chain, line in _iter_fields(tree, ())
         ]
-        self._others: dict[tuple[str, str], Spot] = {}
+        self._others: dict[tuple[str, str], Location] = {}
         for file, tree in trees.items():
             for kind, name, line in _iter_names(tree):
                 self._others.setdefault((kind, name), (file, line))
@@ -354,14 +346,14 @@ class SourceTexts:
         """Return a copy of the finding with file and line; the same if they are not found."""
         if finding.file:
             return finding
-        location = self._find_spot(finding.path, sensor) or (
+        location = self._find_location(finding.path, sensor) or (
             self._others.get(("sensor", sensor.id)) if sensor else None
         )
         if location:
             return replace(finding, file=location[0], line=location[1])
         return finding
 
-    def _find_spot(self, path: str, sensor: Sensor | None) -> Spot | None:
+    def _find_location(self, path: str, sensor: Sensor | None) -> Location | None:
         path = re.sub(r"\[\d*\]", "", path.rpartition(" ")[2])
         frame, _, below = path.partition(".")
         if frame == "commands":
@@ -372,7 +364,7 @@ class SourceTexts:
             or self._others.get(("frame", frame))
         )
 
-    def _find_field(self, parts: tuple[str, ...]) -> Spot | None:
+    def _find_field(self, parts: tuple[str, ...]) -> Location | None:
         """Return the location of the field that matches most names at the end of the path."""
         fitting = [
             (len(chain), location)
@@ -380,11 +372,11 @@ class SourceTexts:
             if parts[-len(chain) :] == chain
         ]
         if fitting:
-            return max(fitting, key=lambda found: found[0])[1]
+            return max(fitting, key=lambda match: match[0])[1]
         return None
 
 
-def _find_function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
+def _find_function(frame: str, name: str, sensor: Sensor | None) -> Location | None:
     """Return the location of a function of a frame type."""
     if sensor is None or frame not in sensor.frames:
         return None
@@ -557,7 +549,7 @@ def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
 #: Rules whose violation makes it impossible to test properties.
 FATAL_RULES = frozenset({"LS213", "LS114", "LS115", "LS301"})
 #: Name, in a report, of all properties that are skipped after a violation of `FATAL_RULES`.
-REMAINING_PROPERTIES = "everything else"
+REMAINING_PROPERTIES = "all other properties"
 
 
 #: Called with the current step, the number of finished properties and their total.
@@ -615,10 +607,11 @@ def reports(
     trees = {
         str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files
     }
-    places = SourceTexts(trees)
-    known = {sensor.id: sensor for sensor in target.sensors}
+    source_texts = SourceTexts(trees)
+    sensors_by_id = {sensor.id: sensor for sensor in target.sensors}
     mistakes = [
-        places.locate(finding, known.get(finding.sensor)) for finding in target.findings
+        source_texts.locate(finding, sensors_by_id.get(finding.sensor))
+        for finding in target.findings
     ] + check_texts(trees)
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
@@ -632,7 +625,7 @@ def reports(
         before = len(PROPERTIES) * index
         yield _make_report(
             subject,
-            places,
+            source_texts,
             mistakes if single else [],
             functools.partial(_watch_sensor, watch, before, total),
         )
@@ -663,7 +656,7 @@ def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, ca
 
 def _make_report(
     subject: SensorUnderTest,
-    places: SourceTexts,
+    source_texts: SourceTexts,
     mistakes: list[Finding],
     watch: Callable[[str, int], None],
 ) -> Report:
@@ -676,16 +669,20 @@ def _make_report(
         return report
     watch(f"{sensor.id}: declaration", 0)
     report.findings += check_declaration(subject)
-    for done, one in enumerate(PROPERTIES):
-        known = sorted(
+    for done, tested_property in enumerate(PROPERTIES):
+        violated = sorted(
             {finding.code for finding in list_unacknowledged(report.findings, sensor, whole=False)}
-            & set(one.unless)
+            & set(tested_property.unless)
         )
-        reason = one.lacks(subject) or (f"{', '.join(known)} was found" if known else "")
+        reason = tested_property.lacks(subject) or (
+            f"{', '.join(violated)} was found" if violated else ""
+        )
         if reason:
-            report.skipped[one.name] = reason
+            report.skipped[tested_property.name] = reason
             continue
-        findings = one.findings(subject, functools.partial(_watch_case, watch, sensor.id, done))
+        findings = tested_property.findings(
+            subject, functools.partial(_watch_case, watch, sensor.id, done)
+        )
         report.held += not findings
         report.findings += findings
         if any(finding.code in FATAL_RULES for finding in report.findings):
@@ -697,7 +694,7 @@ def _make_report(
     left = list_unacknowledged(
         distinct, sensor, whole=REMAINING_PROPERTIES not in report.skipped and not subject.tested
     )
-    report.findings = [places.locate(finding, sensor) for finding in left]
+    report.findings = [source_texts.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {
         **dict(sorted(subject.picture.items())),

@@ -34,11 +34,11 @@ def assert_well_formed(cloud: PointCloud) -> None:
     assert np.isfinite(cloud.range[valid]).all()
     assert np.isnan(cloud.xyz[~valid]).all()
     assert (cloud.range[valid] >= 0).all()
-    known = cloud.azimuth[np.isfinite(cloud.azimuth)]
-    assert ((known >= -np.pi) & (known < np.pi)).all()
+    finite = cloud.azimuth[np.isfinite(cloud.azimuth)]
+    assert ((finite >= -np.pi) & (finite < np.pi)).all()
 
 
-def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
+def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
     """Fail unless both clouds have the same columns, masks, positions and times.
 
     Coordinates are compared at the size of the range, azimuths on the circle, times to a
@@ -47,10 +47,10 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
     Args:
         ulps: tolerance of coordinates and angles in units in the last place.
     """
-    assert one.columns.keys() == other.columns.keys()
-    assert same(one.valid, other.valid)
-    reach = _reach(one)
-    range_tolerance = ulps * np.spacing(np.minimum(reach, np.abs(one.range)))
+    assert cloud.columns.keys() == other.columns.keys()
+    assert same(cloud.valid, other.valid)
+    reach = _reach(cloud)
+    range_tolerance = ulps * np.spacing(np.minimum(reach, np.abs(cloud.range)))
     tolerances: dict[str, tuple[Any, float]] = {
         **dict.fromkeys("xyz", (ulps * np.spacing(reach), 0.0)),
         "range": (range_tolerance, 0.0),
@@ -58,18 +58,18 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
             ("azimuth", "elevation"), (ulps * np.spacing(np.float32(np.pi)), 2 * np.pi)
         ),
     }
-    for name in one.columns.keys() - {"time"}:
-        first = one.columns[name]
+    for name in cloud.columns.keys() - {"time"}:
+        first = cloud.columns[name]
         second = other.columns[name]
         if name in tolerances:
             tolerance, full_circle = tolerances[name]
             assert _is_close(first, second, tolerance, full_circle), f"{name} differs"
         else:
             assert same(first, second), f"{name} differs"
-    assert one.time.shape == other.time.shape
-    assert np.allclose(one.time, other.time, rtol=1e-12, atol=TIME_TOLERANCE_S, equal_nan=True)
-    assert abs(one.stamp_ns - other.stamp_ns) <= STAMP_TOLERANCE_NS
-    assert one.shape == other.shape
+    assert cloud.time.shape == other.time.shape
+    assert np.allclose(cloud.time, other.time, rtol=1e-12, atol=TIME_TOLERANCE_S, equal_nan=True)
+    assert abs(cloud.stamp_ns - other.stamp_ns) <= STAMP_TOLERANCE_NS
+    assert cloud.shape == other.shape
 
 
 def _reach(cloud: PointCloud) -> NDArray[np.float32]:
@@ -81,7 +81,7 @@ def _reach(cloud: PointCloud) -> NDArray[np.float32]:
 
 
 def _is_close(
-    one: NDArray[Any], other: NDArray[Any], tolerance: Any, full_circle: float = 0.0
+    first: NDArray[Any], second: NDArray[Any], tolerance: Any, full_circle: float = 0.0
 ) -> bool:
     """Return whether two arrays differ by no more than a tolerance.
 
@@ -90,20 +90,20 @@ def _is_close(
     Args:
         full_circle: the period of angles; 0 compares plain numbers.
     """
-    if one.dtype != other.dtype or one.shape != other.shape:
+    if first.dtype != second.dtype or first.shape != second.shape:
         return False
     with np.errstate(invalid="ignore"):
-        apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
+        apart = np.abs(first.astype(np.float64) - second.astype(np.float64))
         if full_circle:
             apart = np.minimum(apart, np.abs(full_circle - apart))
-        both_nan = np.isnan(one) & np.isnan(other)
-        return bool(((apart <= tolerance) | (one == other) | both_nan).all())
+        both_nan = np.isnan(first) & np.isnan(second)
+        return bool(((apart <= tolerance) | (first == second) | both_nan).all())
 
 
-def same(one: NDArray[Any], other: NDArray[Any]) -> bool:
+def same(first: NDArray[Any], second: NDArray[Any]) -> bool:
     """Return whether two arrays are equal in shape, type and value; NaN equals NaN."""
     return (
-        one.dtype == other.dtype
-        and one.shape == other.shape
-        and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+        first.dtype == second.dtype
+        and first.shape == second.shape
+        and np.array_equal(first, second, equal_nan=first.dtype.kind == "f")
     )

@@ -71,7 +71,9 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
         assert data == b"", "a command without a frame has bytes"
         return
     parsed = sensor.parse(data, frame=command.frame)
-    assert sensor.build(command.frame, parsed) == data, "building it gives other bytes"
+    assert sensor.build(command.frame, parsed) == data, (
+        "building the parsed values gives different bytes"
+    )
     fields = make_schema(sensor.frames[command.frame].tree).fields
     for path, value in command.fixed.items():
         expected = find_code(fields[path], value) if path in fields else value
@@ -122,7 +124,7 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
 
 
 def an_exchange_holds(
-    sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str
+    sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, path: str
 ) -> None:
     """Check that a command has these bytes, and that `answer` is a reply to it.
 
@@ -136,13 +138,11 @@ def an_exchange_holds(
             built == data,
             "LS605",
             f"sends {built.hex(' ')}, expected {data.hex(' ')}",
-            place,
+            path,
         )
         if answer is None:
             return
-        require(
-            command.replies, "LS605", "it has a reply, but the command declares no reply", place
-        )
+        require(command.replies, "LS605", "it has a reply, but the command declares no reply", path)
         session = Session(sensor)
         pending = session.request(name, 0, **given)
         kind = identify(sensor, answer)
@@ -150,7 +150,7 @@ def an_exchange_holds(
         session.tick(math.ceil(1e9 * (1 + command.timeout) * (2 + command.retries)))
         pending.result()
     except LidarSpecError as error:
-        raise ViolationError("LS605", str(error), place) from error
+        raise ViolationError("LS605", str(error), path) from error
 
 
 def replies_can_match(subject: SensorUnderTest, name: str) -> None:
@@ -226,8 +226,8 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     device.start(0)
     stops = next(
         (
-            one
-            for one, other in sensor.commands.items()
+            command_name
+            for command_name, other in sensor.commands.items()
             if other.stops and other.frame is not None and not other.args
         ),
         "",

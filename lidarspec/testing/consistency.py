@@ -88,12 +88,12 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
     values = sweep(1)
     following = sweep(2)
     fields = get_codec(subject.sensor.frames[name]).schema.fields
-    known = [
+    candidates = [
         path
         for path in values
         if path in fields and path in following and fields[path].unit in FULL_TURNS
     ]
-    angles = [path for path in known if not np.array_equal(values[path], following[path])]
+    angles = [path for path in candidates if not np.array_equal(values[path], following[path])]
     if not angles or len({(fields[path].unit, fields[path].scale) for path in angles}) > 1:
         return
     info = fields[angles[0]]
@@ -155,16 +155,16 @@ def _read_azimuths(
 
 
 def _angles_between(
-    one: NDArray[np.float64] | None, other: NDArray[np.float64] | None
+    first: NDArray[np.float64] | None, second: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
     """Return the differences of two arrays of azimuths, in radians.
 
     Returns None if one of them is None, or if their shapes differ.
     """
-    if one is None or other is None or one.shape != other.shape:
+    if first is None or second is None or first.shape != second.shape:
         return None
-    finite = np.isfinite(one) & np.isfinite(other)
-    return _fold(one[finite] - other[finite])
+    finite = np.isfinite(first) & np.isfinite(second)
+    return _fold(first[finite] - second[finite])
 
 
 def _fold(angles: NDArray[np.float64]) -> NDArray[np.float64]:

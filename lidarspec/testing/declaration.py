@@ -117,15 +117,15 @@ def _check_sensor(sensor: Sensor) -> Findings:
 
 def _check_required_fields(sensor: Sensor) -> Findings:
     """Yield findings for missing fields that scans, clock or counter need."""
-    known = {
+    field_paths = {
         path
         for name in sensor.main_frames
         for path in get_codec(sensor.frames[name]).schema.scan_names
     }
     if isinstance(sensor.scan, OnWrap):
-        cut_by = known | set(TYPES)
+        cut_by = field_paths | set(TYPES)
     else:
-        cut_by = known
+        cut_by = field_paths
     if sensor.clock is not None:
         clock = sensor.clock.source
     else:
@@ -143,18 +143,18 @@ def _check_required_fields(sensor: Sensor) -> Findings:
     ]
     status = sensor.clock.status if sensor.clock is not None else None
     if status is not None and status.frame:
-        known_status = set(get_codec(sensor.frames[status.frame]).schema.scan_names)
+        status_paths = set(get_codec(sensor.frames[status.frame]).schema.scan_names)
     else:
-        known_status = known
+        status_paths = field_paths
     if status is not None and isinstance(status.source, str):
         path = without_indices(status.source)[0]
-        if path not in known_status:
-            what = f"no field {status.source!r}{did_you_mean(path, known_status)}"
+        if path not in status_paths:
+            what = f"no field {status.source!r}{did_you_mean(path, status_paths)}"
             yield "LS216", what, "clock.status"
-    for place, path in given:
-        there = cut_by if place == "scan" else known
-        if path and without_indices(path)[0] not in there:
-            yield "LS216", f"no field {path!r}{did_you_mean(path, there)}", place
+    for purpose, path in given:
+        allowed = cut_by if purpose == "scan" else field_paths
+        if path and without_indices(path)[0] not in allowed:
+            yield "LS216", f"no field {path!r}{did_you_mean(path, allowed)}", purpose
 
 
 def _check_clock(sensor: Sensor) -> Findings:
@@ -179,7 +179,7 @@ def _check_clock(sensor: Sensor) -> Findings:
         for info in infos
     ]
     if 0 < sum(spans) < LONG_WRAP_S:
-        what = f"it wraps after {sum(spans):g} s, but wraps_at is not declared"
+        what = f"the clock wraps after {sum(spans):g} s, but wraps_at is not declared"
         yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
 
 
@@ -223,9 +223,9 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
         accepted += 1
         same = replace(configured, options=sensor.options, configure=sensor.configure.function)
         if any(
-            getattr(same, one.name) != getattr(sensor, one.name)
-            for one in fields(sensor)
-            if one.name != "configure"
+            getattr(same, attribute.name) != getattr(sensor, attribute.name)
+            for attribute in fields(sensor)
+            if attribute.name != "configure"
         ):
             return False
     return accepted > 1
@@ -399,9 +399,13 @@ def _check_plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findi
         yield getattr(error, "rule", "") or "LS414", text, f"{name}.plausible"
         return
     if is_expression(answer):
-        yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
+        yield (
+            "LS207",
+            f"plausible returns {answer!r}, an expression of construct",
+            f"{name}.plausible",
+        )
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
-        yield "LS207", f"it returns {answer!r} for every frame", f"{name}.plausible"
+        yield "LS207", f"plausible returns {answer!r} for every frame", f"{name}.plausible"
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
@@ -447,7 +451,7 @@ def _check_sync(
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:
-        yield "LS204", "it has no constant bytes, so that every offset is a candidate", name
+        yield "LS204", "the frame has no constant bytes, so that every offset is a candidate", name
         return
     seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
     data = np.frombuffer(
@@ -525,7 +529,7 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
     ]
     if not own or any(info is None or INTENSITY_NAMES.search(info.path) for info in own):
         return
-    columns = [getattr(result, one.name) for one in fields(result)]
+    columns = [getattr(result, column.name) for column in fields(result)]
     taken = {
         info.path
         for value in columns
@@ -543,7 +547,7 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
             others = ", ".join(info.path for info in own if info is not None)
             yield (
                 "LS218",
-                f"it comes from {others}; no column uses this field",
+                f"it comes from {others}, and no column uses this field",
                 f"{name}.{path}",
             )
             return
@@ -581,7 +585,7 @@ def _check_range_limit(subject: SensorUnderTest) -> Findings:
     if limits[1] > furthest * 1.001:
         yield (
             "LS210",
-            f"it ends at {furthest:g} m, but range_limits at {limits[1]:g} m",
+            f"its largest value is {furthest:g} m, but range_limits end at {limits[1]:g} m",
             path,
         )
 
@@ -595,7 +599,7 @@ def _check_column(
     if column == "range" and measured and all(CODE_NAMES.fullmatch(info.name) for info in measured):
         yield (
             "LS219",
-            "the range of points comes from it, but by its name it is a code",
+            "the range of points comes from this field, but its name is that of a code",
             f"{name}.{measured[0].path}",
         )
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
@@ -619,6 +623,6 @@ def _check_column(
                 problem = f"it has no unit, expected {' or '.join(units)}"
             yield (
                 "LS201",
-                f"the {column} of points comes from it, but {problem}",
+                f"the {column} of points comes from this field, but {problem}",
                 f"{name}.{first.path}",
             )

@@ -185,7 +185,7 @@ class Finding:
         }
 
     def __str__(self) -> str:
-        place = " ".join(part for part in (self.sensor, self.path) if part)
+        subject = " ".join(part for part in (self.sensor, self.path) if part)
         file = Path(self.file)
         if file.is_relative_to(Path.cwd()):
             file = file.relative_to(Path.cwd())
@@ -195,10 +195,10 @@ class Finding:
             where = str(file)
         else:
             where = ""
-        if place and where:
-            where = f"{place} ({where})"
+        if subject and where:
+            where = f"{subject} ({where})"
         else:
-            where = place or where
+            where = subject or where
         rule = self.rule
         return (
             f"{self.code} {rule.title}\n  where  {where}\n  what   {self.what}\n"
@@ -244,23 +244,27 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
     for finding in findings:
         frame, _, field = finding.path.partition(".")
         keys = [
-            (place, key)
-            for place in (frame, "")
-            for key in (finding.code, f"{finding.code} {field if place else finding.path}")
+            (frame_name, key)
+            for frame_name in (frame, "")
+            for key in (finding.code, f"{finding.code} {field if frame_name else finding.path}")
         ]
         acknowledging = [
-            (place, key) for place, key in keys if given.get(place, {}).get(key, "").strip()
+            (frame_name, key)
+            for frame_name, key in keys
+            if given.get(frame_name, {}).get(key, "").strip()
         ]
         used.update(acknowledging)
         left += [] if acknowledging else [finding]
-    for place, entries in given.items() if whole else ():
+    for frame_name, entries in given.items() if whole else ():
         for key, reason in entries.items():
-            if (place, key) not in used:
+            if (frame_name, key) not in used:
                 if not reason.strip():
                     problem = "has no reason"
                 else:
                     problem = "does not occur"
                 left.append(
-                    Finding("LS209", f"{key!r} is acknowledged, but {problem}", place, sensor.id)
+                    Finding(
+                        "LS209", f"{key!r} is acknowledged, but {problem}", frame_name, sensor.id
+                    )
                 )
     return left

@@ -108,7 +108,10 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
                 _raise_changed_bytes(subject, name, data, built, "LS302")
             again = sensor.parse(built, frame=name)
             require(
-                same(parsed, again), "LS302", "parsing the built frame gives another value", name
+                same(parsed, again),
+                "LS302",
+                "parsing the built frame gives a different value",
+                name,
             )
 
 
@@ -230,21 +233,23 @@ def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     require(name in fitting, "LS306", "its own example is not parsed as a frame of this type", name)
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(
-        any(same(subject.sensor.parse(data), one) for one in read),
+        any(same(subject.sensor.parse(data), values) for values in read),
         "LS306",
         "parsing without a type gives the wrong type",
         name,
     )
 
 
-def same(one: Any, other: Any) -> bool:
+def same(first: Any, second: Any) -> bool:
     """Return whether two parsed frames are equal; NaNs are compared bit by bit."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other) or (
-        one != one and other != other and getattr(one, "raw", 0) == getattr(other, "raw", 0)
+    if isinstance(first, dict) and isinstance(second, dict):
+        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
+    if isinstance(first, list) and isinstance(second, list):
+        return len(first) == len(second) and all(map(same, first, second))
+    return bool(first == second) or (
+        first != first
+        and second != second
+        and getattr(first, "raw", 0) == getattr(second, "raw", 0)
     )
 
 
@@ -256,11 +261,11 @@ def _raise_changed_bytes(
         (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
         min(len(data), len(built)),
     )
-    one, other = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
+    before, after = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
     difference = next(
         (
             (path, a, b)
-            for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False)
+            for (path, a), (_, b) in zip(leaves(before), leaves(after), strict=False)
             if a != b
         ),
         None,
@@ -333,25 +338,25 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
     @given(st.data())
     def check_edited(data: Any) -> None:
         parsed = copy.deepcopy(bases[data.draw(st.integers(0, len(bases) - 1))])
-        spots = list(material.integers(parsed))
-        places = [place for place, (_, _, path) in enumerate(spots) if path in values]
+        integers = list(material.integers(parsed))
+        candidates = [index for index, (_, _, path) in enumerate(integers) if path in values]
         edits = []
-        for _ in range(data.draw(st.integers(1, MAX_EDITS)) if places else 0):
-            place = places[data.draw(st.integers(0, len(places) - 1))]
-            holder, key, path = spots[place]
+        for _ in range(data.draw(st.integers(1, MAX_EDITS)) if candidates else 0):
+            index = candidates[data.draw(st.integers(0, len(candidates) - 1))]
+            holder, key, path = integers[index]
             holder[key] = data.draw(values[path])
-            edits.append(place)
+            edits.append(index)
         if edits:
-            _check_edit(subject, name, parsed, spots, edits)
+            _check_edit(subject, name, parsed, integers, edits)
 
     try:
         check_edited()
-    except ViolationError as found:
-        raise ViolationError(found.code, found.what, found.path) from None
+    except ViolationError as violation:
+        raise ViolationError(violation.code, violation.what, violation.path) from None
 
 
 def _check_edit(
-    subject: SensorUnderTest, name: str, parsed: Any, spots: list[Any], edits: list[int]
+    subject: SensorUnderTest, name: str, parsed: Any, integers: list[Any], edits: list[int]
 ) -> None:
     """Check that edited integers of a frame are the same after building and parsing."""
     built = acceptable(subject, name, parsed)
@@ -359,25 +364,25 @@ def _check_edit(
         return
     again = subject.sensor.parse(built, frame=name)
     read = list(material.integers(again))
-    if len(read) != len(spots):
+    if len(read) != len(integers):
         return
     sealed = material.seals(subject.sensor, name, built)
-    for place in edits:
-        (holder, key, path) = spots[place]
-        (target, found, _) = read[place]
+    for index in edits:
+        (holder, key, path) = integers[index]
+        (target, read_key, _) = read[index]
         wanted = holder[key]
-        got = target[found]
+        got = target[read_key]
         require(
             got == wanted or path in sealed,
             "LS305",
             f"{wanted} is written, but {got} is read",
             f"{name}.{path}",
         )
-    path = spots[edits[0]][2]
+    path = integers[edits[0]][2]
     require(
         subject.sensor.build(name, again) == built,
         "LS302",
-        f"after an edit of {path}, building it again gives other bytes",
+        f"after an edit of {path}, building the frame again gives different bytes",
         f"{name}.{path}",
     )
 
@@ -484,12 +489,12 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
             field = next(
                 (path for path, (start, end) in layout.places.items() if start <= byte < end), ""
             )
-            place = f"{name}.{field}".rstrip(".")
+            path = f"{name}.{field}".rstrip(".")
             require(
                 byte not in covered,
                 "LS310",
                 f"accepted although bit {bit} of byte {byte} is flipped",
-                place,
+                path,
             )
     if tried:
         kind = "with a checksum" if sealed else "without a checksum"

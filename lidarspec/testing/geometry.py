@@ -304,13 +304,13 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
             ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
             continue
-        known = read(
+        examples = read(
             subject, name, [subject.example(name, seed=seed) for seed in range(12)]
         ).points()
         require(
-            np.isnan(known.azimuth).all(),
+            np.isnan(examples.azimuth).all(),
             "LS503",
-            f"with {path} = 1 every azimuth is nan",
+            f"with {path} = 1, all azimuths are NaN",
             f"{name}.{path}",
         )
 

@@ -89,7 +89,7 @@ class Property:
         if self.each == "sensor":
             return [()]
         if self.each == "vector":
-            return [(place,) for place in vectors.places(subject)]
+            return [(key,) for key in vectors.places(subject)]
         names = {
             "frame": subject.frames,
             "data": subject.sensor.data_frames,
@@ -131,8 +131,8 @@ class Property:
                 what = _find_first_line(error)
                 findings.append(Finding(self.rule, what, ".".join(case), subject.sensor.id))
             except SpecError as error:
-                place = ".".join(case)
-                path = error.path if error.path.startswith(place) else place
+                case_path = ".".join(case)
+                path = error.path if error.path.startswith(case_path) else case_path
                 findings.append(
                     Finding(error.rule or "LS414", error.reason, path, subject.sensor.id)
                 )

@@ -32,16 +32,16 @@ def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     return b"".join(parts)
 
 
-def pick_offsets(length: int, source: random.Random, spots: int = CUT_OFFSETS) -> list[int]:
+def pick_offsets(length: int, source: random.Random, count: int = CUT_OFFSETS) -> list[int]:
     """Return offsets at which a frame is cut.
 
     These are all offsets of a short frame, or `count` random offsets of a long frame and those near
     its ends.
     """
-    if length <= MAX_SHORT_BYTES * spots // CUT_OFFSETS:
+    if length <= MAX_SHORT_BYTES * count // CUT_OFFSETS:
         return list(range(length))
     ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
-    return sorted({*ends, *source.sample(range(length), min(spots, length))})
+    return sorted({*ends, *source.sample(range(length), min(count, length))})
 
 
 #: Sizes in bytes of the chunks that a stream is cut into, and their mean.
@@ -63,7 +63,7 @@ def cut_randomly(data: bytes, source: random.Random, scale: int = 1) -> Iterator
 
 
 def mutate(
-    data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()
+    data: bytes, source: random.Random, words: Sequence[bytes] = (), offsets: Sequence[int] = ()
 ) -> bytes:
     """Return a copy of the bytes with a few random changes.
 
@@ -77,8 +77,8 @@ def mutate(
     """
     mutated = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
-        if spots and source.random() < 0.5:
-            offset = source.choice(spots)
+        if offsets and source.random() < 0.5:
+            offset = source.choice(offsets)
         else:
             offset = source.randrange(len(mutated) + 1)
         kind = source.randrange(6 if words else 5)
@@ -341,17 +341,17 @@ class SensorUnderTest:
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
 
 
-def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
+def _has_same_exchange(sensor: Sensor, other: Sensor, name: str) -> bool:
     """Return whether a command and its reply are equal in two sensors."""
-    command = one.commands[name]
+    command = sensor.commands[name]
     if other.commands.get(name) != command:
         return False
     types = [command.frame, *command.replies] if command.frame else command.replies
     return (
-        all(one.frames[kind] is other.frames.get(kind) for kind in types)
-        and one.simulation.answers.get(name) == other.simulation.answers.get(name)
-        and one.links.get(command.link) == other.links.get(command.link)
-        and one.datagrams == other.datagrams
+        all(sensor.frames[kind] is other.frames.get(kind) for kind in types)
+        and sensor.simulation.answers.get(name) == other.simulation.answers.get(name)
+        and sensor.links.get(command.link) == other.links.get(command.link)
+        and sensor.datagrams == other.datagrams
     )
 
 

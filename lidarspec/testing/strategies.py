@@ -297,11 +297,11 @@ def _scans(draw: DrawFn, sensor: Sensor, packets: int, lost: int) -> Scan:
     sent = simulate(sensor, packets, start=start, scene=room)
     for index in sorted(draw(st.sets(st.integers(0, packets - 1), max_size=lost)), reverse=True):
         del sent[index]
-    found = list(sensor.scans(_delivery(sensor, sent)))
-    complete = [scan for scan in found if scan.complete]
-    if not found:
+    all_scans = list(sensor.scans(_delivery(sensor, sent)))
+    complete = [scan for scan in all_scans if scan.complete]
+    if not all_scans:
         reject()
-    return max(complete or found, key=len)
+    return max(complete or all_scans, key=len)
 
 
 @st.composite
@@ -311,8 +311,8 @@ def _boxes(draw: DrawFn) -> Box:
     size = [draw(st.integers(1, 10)) / 10 for _ in range(2)]
     sides = [draw(st.sampled_from((1, -1))) for _ in range(2)]
     x, y = (
-        [side * end for end in (at, at + wide)]
-        for at, wide, side in zip(low, size, sides, strict=True)
+        [side * end for end in (start, start + width)]
+        for start, width, side in zip(low, size, sides, strict=True)
     )
     return Box((min(x), min(y), -1.0), (max(x), max(y), draw(st.integers(-9, 10)) / 10))
 
@@ -452,7 +452,7 @@ def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[A
 
 
 class _DrawnNumbers(random.Random):
-    """A source of random numbers that Hypothesis draws, so that it can reduce failures."""
+    """A source of random numbers that are drawn by Hypothesis."""
 
     def __init__(self, draw: DrawFn, ranges: Mapping[str, tuple[int, int]]) -> None:
         super().__init__(0)
@@ -529,10 +529,10 @@ def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> b
     except SpecError:
         if fields or is_often_valid(sensor, frame):
             reject()
-        known = known_frames(sensor, frame)
-        if not known:
+        examples = known_frames(sensor, frame)
+        if not examples:
             reject()
-        return draw(st.sampled_from(known))
+        return draw(st.sampled_from(examples))
 
 
 def _draw_own(strategy: SearchStrategy[Any], source: random.Random) -> Any:

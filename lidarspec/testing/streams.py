@@ -45,8 +45,8 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
 def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> ViolationError:
     """Return the violation for the first frame that is lost or changed."""
     equal = 0
-    for one, other in zip(sent, received, strict=False):
-        if one != other:
+    for sent_frame, received_frame in zip(sent, received, strict=False):
+        if sent_frame != received_frame:
             break
         equal += 1
     name = sent[min(equal, len(sent) - 1)][0]
@@ -64,12 +64,12 @@ def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
     `points` is evaluated without tracing, so that the function is called in both runs.
     """
     data = material.make_input(subject.sensor, subject.conversation(rounds=1))
-    one = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
-    other = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
-    require(len(one) == len(other), "LS415", "two runs give different numbers of points")
-    for name, column in one.columns.items():
+    first = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
+    second = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
+    require(len(first) == len(second), "LS415", "two runs give different numbers of points")
+    for name, column in first.columns.items():
         require(
-            column.tobytes() == other.columns[name].tobytes(),
+            column.tobytes() == second.columns[name].tobytes(),
             "LS415",
             f"two runs give different values of {name}",
             f"{subject.sensor.data_frame}.points",
@@ -90,7 +90,7 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
         require(
             [_cut(scan) for scan in parts] == [_cut(scan) for scan in whole],
             "LS404",
-            f"batches of {size} packets give other scans than a single batch",
+            f"batches of {size} packets give different scans than a single batch",
         )
         for part, other in zip(parts, whole, strict=True):
             assert_well_formed(part.points)

@@ -106,7 +106,7 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and those other values that are valid together with them.
+        """Return the fixed values and all other values that are valid with them.
 
         Fields that are missing in the result have their value of the base. Of a field in an array,
         the valid elements are kept.
@@ -130,9 +130,9 @@ class LayoutRanges:
         mixed = base.copy()
         tried = []
         for index in range(values.size):
-            one = base.copy()
-            one.flat[index] = values.flat[index]
-            tried.append({**kept, leaf.info.path: one})
+            trial = base.copy()
+            trial.flat[index] = values.flat[index]
+            tried.append({**kept, leaf.info.path: trial})
         for index, is_valid in enumerate(self._iter_valid(tried)):
             if is_valid:
                 mixed.flat[index] = values.flat[index]
@@ -160,7 +160,7 @@ class LayoutRanges:
             ends.append(self._find_ranges(bounded))
         ranges = {}
         for leaf in bounded:
-            own = [found[leaf.info.path] for found in ends]
+            own = [limits[leaf.info.path] for limits in ends]
             ranges[leaf.info.path] = min(low for low, _ in own), max(high for _, high in own)
         return ranges
 
@@ -183,10 +183,10 @@ class LayoutRanges:
         for leaf in leaves:
             path = leaf.info.path
             start = int(leaf.load(self._base).flat[0])
-            found = find_ends({path: (start, 0)}, self._accept)[path]
-            (is_valid,) = self._accept([(path, found)])
+            end = find_ends({path: (start, 0)}, self._accept)[path]
+            (is_valid,) = self._accept([(path, end)])
             if is_valid:
-                values = np.broadcast_to(np.array(found, leaf.info.dtype), (1, *leaf.shape))
+                values = np.broadcast_to(np.array(end, leaf.info.dtype), (1, *leaf.shape))
                 self._base = self._make_rows([{path: values}])
         return bool((self._base != before).any())
 
@@ -357,11 +357,11 @@ def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
 
     Returns an empty list if none is found.
     """
-    found: set[bytes] = set()
+    frames: set[bytes] = set()
     with contextlib.suppress(SpecError):
         for seed in range(KNOWN_FRAMES):
-            found.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=MAX_WALKS))
-    return sorted(found, key=lambda data: (len(data), data))
+            frames.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=MAX_WALKS))
+    return sorted(frames, key=lambda data: (len(data), data))
 
 
 @functools.lru_cache(maxsize=1024)
@@ -388,11 +388,11 @@ def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]
     """
     if sensor.frames[frame].plausible is None:
         return {}
-    known = known_frames(sensor, frame)
-    if not known:
+    examples = known_frames(sensor, frame)
+    if not examples:
         return {}
     engine = get_codec(sensor.frames[frame])
-    base = parse(sensor, known[0], frame=frame)
+    base = parse(sensor, examples[0], frame=frame)
     rules = [formula for node in nodes(engine.frame.tree) for formula in formulas(node)]
     deciding = {ref.path for rule in rules for ref in refs(rule)}
     bounded = {

@@ -68,12 +68,12 @@ def _is_value(value: object) -> bool:
     return isinstance(value, str) or _is_number(value)
 
 
-def _is_table(value: object, one: Callable[[object], bool]) -> bool:
-    return isinstance(value, dict) and all(map(one, value.values()))
+def _is_table(value: object, is_valid: Callable[[object], bool]) -> bool:
+    return isinstance(value, dict) and all(map(is_valid, value.values()))
 
 
 def _are_points(value: object) -> bool:
-    return _is_table(value, lambda one: _is_table(one, _is_number)) and all(
+    return _is_table(value, lambda value: _is_table(value, _is_number)) and all(
         re.fullmatch(r"-?\d{1,9}", index) for index in cast(Any, value)
     )
 
@@ -86,15 +86,15 @@ def _is_text(value: object) -> bool:
 KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "sensor": (
         "an id or a list of ids",
-        lambda one: _is_text(one) or (isinstance(one, list) and all(map(_is_text, one))),
+        lambda value: _is_text(value) or (isinstance(value, list) and all(map(_is_text, value))),
     ),
     **dict.fromkeys(("command", "reply", "source", "frame", "hex"), ("a string", _is_text)),
-    "note": ("anything", lambda one: True),
+    "note": ("anything", lambda value: True),
     **dict.fromkeys(
         ("args", "values"),
-        ("an object of numbers and strings", lambda one: _is_table(one, _is_value)),
+        ("an object of numbers and strings", lambda value: _is_table(value, _is_value)),
     ),
-    "units": ("an object of numbers", lambda one: _is_table(one, _is_number)),
+    "units": ("an object of numbers", lambda value: _is_table(value, _is_number)),
     "points": ("an object of points by number, each an object of numbers", _are_points),
 }
 
@@ -107,19 +107,19 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
     """
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
-    for place, vector in chosen.items():
+    for key, vector in chosen.items():
         if isinstance(vector, ViolationError):
             raise vector
-        require(str(vector.get("source", "")).strip(), "LS701", "source missing", place)
+        require(str(vector.get("source", "")).strip(), "LS701", "source missing", key)
         data = parse_hex(vector["hex"])
         name = vector["frame"]
-        parsed = _parse_vector(subject, name, data, place)
-        _compare_values(subject, name, data, parsed, vector, place)
+        parsed = _parse_vector(subject, name, data, key)
+        _compare_values(subject, name, data, parsed, vector, key)
         require(
             subject.sensor.build(name, parsed) == data,
             "LS302",
-            "parsing and building gives other bytes",
-            f"{place} {name}",
+            "parsing and building gives different bytes",
+            f"{key} {name}",
         )
         if "command" in vector:
             if "reply" in vector:
@@ -132,10 +132,10 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
                 vector.get("args", {}),
                 data,
                 answer,
-                f"{place} {vector['command']}",
+                f"{key} {vector['command']}",
             )
         if vector.get("points"):
-            _compare_points(subject, name, data, vector["points"], place)
+            _compare_points(subject, name, data, vector["points"], key)
 
 
 def lacking(subject: SensorUnderTest) -> str:
@@ -279,7 +279,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     require(
         not unsaid,
         "LS212",
-        "by its name it is a checksum, but no Checksummed verifies it",
+        "its name is that of a checksum, but no Checksummed verifies it",
         f"{name}.{''.join(unsaid[:1])}",
     )
 
@@ -390,8 +390,8 @@ def entries(subject: SensorUnderTest) -> dict[str, Any]:
         ViolationError: if the file cannot be read.
     """
     return {
-        place: vector
-        for place, vector in _read_entries(subject).items()
+        key: vector
+        for key, vector in _read_entries(subject).items()
         if not isinstance(vector, ViolationError)
     }
 
@@ -411,49 +411,51 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
         raise ViolationError("LS702", "the file is not a list of vectors", str(subject.vectors))
     own_entries: dict[str, Any] = {}
     for index, vector in enumerate(content):
-        place = f"vectors[{index}]"
+        entry_key = f"vectors[{index}]"
         try:
-            if _check_entry(subject, vector, place):
-                own_entries[place] = vector
+            if _check_entry(subject, vector, entry_key):
+                own_entries[entry_key] = vector
         except ViolationError as error:
-            own_entries[place] = error
+            own_entries[entry_key] = error
     return own_entries
 
 
-def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
+def _check_entry(subject: SensorUnderTest, vector: Any, entry_key: str) -> bool:
     """Return whether an entry belongs to the sensor; set the frame of a command.
 
     Raises:
         ViolationError: for an invalid entry.
     """
-    require(isinstance(vector, dict), "LS702", "not an object", place)
+    require(isinstance(vector, dict), "LS702", "not an object", entry_key)
     unknown = sorted(vector.keys() - KEYS.keys())
-    require(not unknown, "LS702", f"unknown keys {unknown}; expected {sorted(KEYS)}", place)
+    require(not unknown, "LS702", f"unknown keys {unknown}; expected {sorted(KEYS)}", entry_key)
     for key, value in vector.items():
         expected, fits = KEYS[key]
-        require(fits(value), "LS702", f"{key}: expected {expected}, got {shown(value)}", place)
-    if not _belongs_to(subject, vector, place):
+        require(fits(value), "LS702", f"{key}: expected {expected}, got {shown(value)}", entry_key)
+    if not _belongs_to(subject, vector, entry_key):
         return False
     if "command" in vector:
         command = subject.sensor.commands.get(vector["command"])
         vector.setdefault("frame", command.frame if command is not None else None)
         sends = command is not None and command.frame == vector["frame"]
-        require(sends, "LS702", f"no command {vector['command']!r} sends this frame", place)
+        require(sends, "LS702", f"no command {vector['command']!r} sends this frame", entry_key)
     require(
         vector.get("frame") in subject.sensor.frames,
         "LS702",
         f"no frame {vector.get('frame')!r}",
-        place,
+        entry_key,
     )
     try:
         parse_hex(vector.get("hex", "-"))
         parse_hex(vector.get("reply", ""))
     except ValueError:
-        raise ViolationError("LS702", "`hex` or `reply` is not hexadecimal text", place) from None
+        raise ViolationError(
+            "LS702", "`hex` or `reply` is not hexadecimal text", entry_key
+        ) from None
     return True
 
 
-def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> bool:
+def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: str) -> bool:
     """Return whether an entry belongs to the sensor.
 
     Raises:
@@ -467,18 +469,18 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], place: str)
         f'sensor missing, such as "sensor": "{subject.sensor.id}"; the file is shared by'
         f" {', '.join(family)}"
     )
-    require(ids or len(family) < 2, "LS702", message, place)
-    nobody = [one for one in ids if family and one not in family]
+    require(ids or len(family) < 2, "LS702", message, entry_key)
+    unknown_ids = [name for name in ids if family and name not in family]
     require(
-        not nobody,
+        not unknown_ids,
         "LS702",
-        f"no sensor {', '.join(map(repr, nobody))}; the file is shared by {', '.join(family)}",
-        place,
+        f"no sensor {', '.join(map(repr, unknown_ids))}; the file is shared by {', '.join(family)}",
+        entry_key,
     )
     return not ids or subject.sensor.id in ids
 
 
-def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) -> Any:
+def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: str) -> Any:
     """Return the parsed vector.
 
     Raises:
@@ -488,18 +490,22 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) 
         return subject.sensor.parse(data, frame=name)
     except WireError as error:
         if ": checksum " not in error.reason:
-            raise ViolationError("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [parse_hex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
+            raise ViolationError(
+                "LS707", error.reason, f"{entry_key} {name}.{error.path}"
+            ) from error
+        same = [
+            parse_hex(entry["hex"]) for entry in entries(subject).values() if entry["frame"] == name
+        ]
         fitting = [
             _describe_match(match, len(data))
             for match in _find_matches(subject, name, error.path, same, data)[:2]
         ]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
         raise ViolationError(
-            "LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}"
+            "LS703", f"{error.reason}{fits}", f"{entry_key} {name}.{error.path}"
         ) from error
     except LidarSpecError as error:
-        raise ViolationError("LS707", str(error), f"{place} {name}") from error
+        raise ViolationError("LS707", str(error), f"{entry_key} {name}") from error
 
 
 def _compare_values(
@@ -508,7 +514,7 @@ def _compare_values(
     data: bytes,
     parsed: Any,
     vector: Mapping[str, Any],
-    place: str,
+    entry_key: str,
 ) -> None:
     """Compare the fields of a vector with its raw and physical values."""
     fields = subject.fields(name)
@@ -517,7 +523,7 @@ def _compare_values(
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:
         require(
-            path in parsed_values, "LS702", f"no field {path!r} in the frame", f"{place} {name}"
+            path in parsed_values, "LS702", f"no field {path!r} in the frame", f"{entry_key} {name}"
         )
         info = fields.get(re.sub(r"\[\d+\]", "", path))
         raw = parsed_values[path]
@@ -545,7 +551,7 @@ def _compare_values(
         raise ViolationError(
             _find_value_rule(info, raw, expected),
             f"parsed {plain}, expected {value}",
-            f"{place} {name}.{path}",
+            f"{entry_key} {name}.{path}",
         )
 
 
@@ -568,7 +574,7 @@ def _compare_points(
     name: str,
     data: bytes,
     wanted: Mapping[str, Mapping[str, float]],
-    place: str,
+    entry_key: str,
 ) -> None:
     """Compare single points of a vector's frame with their expected columns."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
@@ -579,7 +585,7 @@ def _compare_points(
             -len(cloud) <= number < len(cloud),
             "LS708",
             f"no point {number}: the frame has {len(cloud)} points",
-            f"{place} {name}",
+            f"{entry_key} {name}",
         )
         got = {}
         for column in columns:
@@ -587,7 +593,7 @@ def _compare_points(
                 column in columns_of_points,
                 "LS702",
                 f"points have no column {column!r}",
-                f"{place} {name}",
+                f"{entry_key} {name}",
             )
             got[column] = float(cloud.columns[column][number])
         wrong = [
@@ -607,5 +613,5 @@ def _compare_points(
             not wrong,
             "LS709" if mirrored else "LS708",
             f"point {number}: {message}",
-            f"{place} {name}.points",
+            f"{entry_key} {name}.points",
         )
