@@ -40,6 +40,8 @@ from lidarspec.spec.tree import FieldInfo, to_exact
 
 Times = NDArray[np.int64]
 DAY_NS = 86_400_000_000_000
+#: First date of a clock that was set, ns since 1970: 2001.
+FIRST_DATE_NS = 10**18
 #: Numbers of days in a year. The next constant is the numbers of days in a month.
 YEAR_DAYS = (365, 366)
 MONTH_DAYS = (28, 29, 30, 31)
@@ -357,6 +359,8 @@ class FrameClock:
         if self._writer is not None:
             readings = timeline.shift(self._writer.read(table), times, self._first_reading)
             self._writer.write(table, readings)
+            if timeline.faults.follows:
+                self._write_dates(table, readings)
         if timeline.faults.sets_status:
             try:
                 status = self._status
@@ -366,6 +370,26 @@ class FrameClock:
                 status = None
             if status is not None:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
+
+    def _write_dates(self, table: CompiledTable, readings: Times) -> None:
+        """Write the dates of readings, (n,) ns since 1970, beside the clock.
+
+        Frames after a restart have no date, and keep their values.
+        """
+        date = self._sensor.frames[self._frame].simulation.date
+        if date is None:
+            return
+        dated = np.flatnonzero(readings >= FIRST_DATE_NS)
+        with plugin_errors(f"date of {self._frame}", self._sensor.id, date):
+            values = {row: date(readings.item(row) / 1e9) for row in dated.tolist()}
+        for group in table.groups:
+            rows = [row for row in range(len(group.where)) if group.where[row] in values]
+            own = [values[group.where.item(row)] for row in rows]
+            part = group.rows[rows]
+            for path in own[0] if own else ():
+                leaf = group.layout.leaves[path]
+                leaf.store(part, leaf.raw([one[path] for one in own]))
+            group.rows[rows] = part
 
 
 def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:

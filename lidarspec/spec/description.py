@@ -101,6 +101,9 @@ class Simulation:
         effects: command -> a function that returns the sweep from the command on. Its arguments are
             the sweep so far and the number of the next frame; the new sweep counts from 0. Only for
             a sensor, not for a frame type.
+        date: a function of seconds since 1970 that returns the physical values, by path, of the
+            fields in which the frame has this date beside its clock, such as an NMEA sentence. It
+            is used if the simulated clock follows UTC.
     """
 
     sweep: Sweep | None = None
@@ -109,6 +112,7 @@ class Simulation:
     answers: Mapping[str, Answers] = field(default_factory=dict)
     directions: Callable[[int], tuple[Any, Any]] | None = None
     effects: Mapping[str, Callable[[Sweep, int], Sweep]] = field(default_factory=dict)
+    date: Callable[[float], Mapping[str, Any]] | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "answers", "effects")

@@ -160,6 +160,7 @@ def is_plausible_position(f: Fields) -> Any:
 #: Time, validity and date of a sentence, with position and movement in between.
 _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 PPS_LOCKED = 2
+SIMULATED_START_S = 1_704_067_200  # 2024-01-01
 #: The state of the clock in position packets (VLP-16 user manual, PPS status). Without a pulse the
 #: clock counts from power-up, modulo an hour.
 CLOCK_STATUS = ClockStatus(
@@ -203,27 +204,33 @@ def _parse_nmea(nmea: bytes) -> float:
     return moment.replace(tzinfo=datetime.UTC).timestamp() if moment else float("nan")
 
 
+def make_sentence(seconds: float) -> dict[str, Any]:
+    """Return the field with the NMEA sentence of a time, seconds since 1970.
+
+    The GPS receiver sends only the time, no position.
+    """
+    moment = datetime.datetime.fromtimestamp(int(seconds), datetime.UTC)
+    text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()
+    sentence = b"$%s*%02X\r\n" % (text, np.bitwise_xor.reduce(np.frombuffer(text, np.uint8)))
+    return {"nmea": np.frombuffer(sentence.ljust(NMEA_BYTES, b"\0"), np.uint8)}
+
+
 def sweep_position(i: int) -> dict[str, Any]:
     """Return the values of simulated position packet i.
 
-    The sensor was switched on at the beginning of 2024; its GPS receiver sends only the time.
+    The sensor was switched on at the beginning of 2024.
     """
-    moment = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(
-        seconds=i // POSITION_RATE_HZ
-    )
-    text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()
-    sentence = b"$%s*%02X\r\n" % (text, np.bitwise_xor.reduce(np.frombuffer(text, np.uint8)))
     return {
         "timestamp": i / POSITION_RATE_HZ % CLOCK_WRAP_S,
         "pps": PPS_LOCKED,
-        "nmea": np.frombuffer(sentence.ljust(NMEA_BYTES, b"\0"), np.uint8),
+        **make_sentence(SIMULATED_START_S + i // POSITION_RATE_HZ),
     }
 
 
 POSITION_FRAME = Frame(
     POSITION,
     plausible=is_plausible_position,
-    simulation=Simulation(sweep_position, rate=POSITION_RATE_HZ),
+    simulation=Simulation(sweep_position, rate=POSITION_RATE_HZ, date=make_sentence),
 )
 FLAG = Const(b"\xff\xee")
 PUCK_FRAMES = {
