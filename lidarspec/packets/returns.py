@@ -81,8 +81,9 @@ class GroupCounter:
         if self._first is None:
             self._first = int(index.min())
         self._newest = max(self._newest, int(index.max()))
-        for row in _find_incomplete(groups, places, sizes).tolist():
-            self._add(int(groups[row]), int(places[row]), int(sizes[row]))
+        if int(sizes.max()) > 1:
+            for row in _find_incomplete(groups, places, sizes).tolist():
+                self._add(int(groups[row]), int(places[row]), int(sizes[row]))
         self._count_ended()
 
     def _add(self, group: int, place: int, size: int) -> None:
