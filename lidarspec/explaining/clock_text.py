@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from datetime import UTC, datetime
 
 from lidarspec.packets.clock_monitor import ClockReport
+from lidarspec.scans.selection import format_date
 from lidarspec.spec.timing import EPOCHS
 
 
@@ -21,7 +21,8 @@ def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
         late = f"{report.late} of {report.packets} packets late"
         yield "jitter", f"{report.jitter_ms:.2f} ms, {late}"
     for event in report.events:
-        yield "event", f"{format_moment(event.host_ns)} {event.text}".lstrip()
+        moment = f"{format_date(event.host_ns)} " if event.host_ns else ""
+        yield "event", f"{moment}{event.text}"
     yield "verdict", report.verdict.text
     if report.verdict.advice:
         yield "next", report.verdict.advice
@@ -63,11 +64,3 @@ def describe_clock(report: ClockReport) -> str:
     if report.verdict.is_fault:
         parts.append(report.verdict.text)
     return ", ".join(parts)
-
-
-def format_moment(host_ns: int) -> str:
-    """Return a time in UTC with milliseconds; "" for 0, an unknown time."""
-    if not host_ns:
-        return ""
-    moment = datetime.fromtimestamp(host_ns / 1e9, UTC)
-    return moment.strftime("%Y-%m-%d %H:%M:%S.") + f"{moment.microsecond // 1000:03d}"

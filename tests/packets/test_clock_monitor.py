@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarspec.explaining.clock_text import iter_clock_rows
 from lidarspec.packets.clock_findings import FINDING_TYPES, ClockFinding
 from lidarspec.packets.clock_monitor import ClockMonitor
 from tests.clock_runs import RATE_HZ, SYNCED, TAI_S, Run, make_run, watch
@@ -182,6 +184,20 @@ def test_every_fault_has_advice_and_every_text_its_values() -> None:
         finding = ClockFinding(code, value=1.0, state="a state", epoch="tai")
         assert "{" not in finding.text
         assert bool(kind.advice) or not kind.is_fault
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_impossible_times_do_not_raise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    packets = make_run(1).packets()
+    packets.host_ns = random.integers(0, 2**63 - 1, len(packets))
+    packets.time_ns = random.integers(-9 * 10**18, 9 * 10**18, len(packets))
+    monitor = ClockMonitor(SYNCED)
+    for start in range(0, len(packets), 37):
+        monitor.add(packets.take(slice(start, start + 37)))
+    report = monitor.report()
+    json.dumps(report.to_dict(), allow_nan=False)
+    assert all("{" not in text for _, text in iter_clock_rows(report))
 
 
 @pytest.mark.slow
