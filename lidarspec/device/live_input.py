@@ -138,7 +138,7 @@ class LiveInput(DeviceInput):
 
     @property
     def state(self) -> str:
-        """The state of `LinkState`, or "closed"."""
+        """The state of the link, as in `LinkState`; "closed" after `close`."""
         if self._closed:
             return "closed"
         return self._link_state.name

@@ -5,7 +5,7 @@ are at equal distances in a capture or an array. If all of them are frames of on
 earlier type matches at their first bytes, the search would accept the same frames. They are
 therefore checked as rows, which takes a few calls of NumPy. In a stream, the search continues at
 the first invalid row. Datagrams are either all checked as rows, or none of them. Rows of a weak
-type continue a run.
+type are accepted only if they continue a run of frames of this type.
 """
 
 from __future__ import annotations

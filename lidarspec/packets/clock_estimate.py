@@ -7,11 +7,12 @@ arrival minus sensor's time, lie above a line, and many lie close to it. The lin
 without delay: its height is the offset between the clocks, its slope the drift.
 
 The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
-computes their lower convex hull. The line is the highest that lies below all of them at their
-middle: the edge of the hull there. If the slopes of the hull shortly before and after the middle
-include the previous slope, it is kept, because the delays do not determine a better one. Stamps
-approach the line smoothly. The clock was set if several consecutive packets are too early, or if
-for a second all packets are late, by much more than their delays differ from each other.
+computes their lower convex hull. The line continues the edge of the hull at the middle of the
+samples; of all lines below the samples, it is the highest there. If the previous slope lies between
+the slopes of the hull shortly before and after the middle, the previous slope is kept, because the
+delays do not determine a better one. Stamps approach the line smoothly. The clock was set if
+several consecutive packets are too early, or if for a second all packets are late, by much more
+than their delays differ from each other.
 
 Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
 measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
@@ -88,8 +89,8 @@ class ClockJump(NamedTuple):
 class DeviceClock:
     """Conversion of the times of a sensor to those of the host.
 
-    A constant delay looks the same as an offset: the time on the line, and the time that the sensor
-    needs before it sends, remain in the result.
+    A constant delay looks the same as an offset. The results are therefore late by the shortest
+    time that a packet needs in the sensor and on the line to the host.
 
     Args:
         parts: the number of parts, of a quarter of a second each, that determine the line. More

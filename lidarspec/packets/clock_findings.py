@@ -112,7 +112,7 @@ class ClockFinding:
 
     @property
     def text(self) -> str:
-        """A few words on what was found, without a subject."""
+        """A few words on what was found, to be put after the name of the sensor."""
         value = abs(self.value) if self.code == "behind_utc" else self.value
         text = FINDING_TYPES[self.code].text
         days = abs(value) / 86_400
@@ -120,7 +120,7 @@ class ClockFinding:
 
     @property
     def advice(self) -> str:
-        """What to do about it; "" if nothing is wrong."""
+        """What to do about the finding; "" if nothing is wrong."""
         return FINDING_TYPES[self.code].advice
 
     @property

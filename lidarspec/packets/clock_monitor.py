@@ -273,7 +273,7 @@ class ClockMonitor:
         return jumps
 
     def _name_jump(self, jump: ClockJump) -> ClockFinding:
-        """Return the event that a jump of the clock shows."""
+        """Return the event that caused a jump of the clock."""
         change_s = jump.change_ns / 1e9
         event = ClockFinding("jump", jump.host_ns, change_s)
         if self._began_again(jump):
@@ -322,7 +322,7 @@ class ClockMonitor:
         }
 
     def _judge(self) -> Iterator[ClockFinding]:
-        """Yield findings about the present state; the last one says that nothing else is known."""
+        """Yield one or more findings about the present state of the clock."""
         if self._sensor.clock is None:
             yield ClockFinding("no_clock")
             return
@@ -385,7 +385,7 @@ def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
 
 
 def _is_at_month_end(host_ns: int) -> bool:
-    """Return whether a time is near the end of a month in UTC, where leap seconds are."""
+    """Return whether a time is near the end of a month in UTC, when leap seconds are inserted."""
     moment = np.datetime64(host_ns, "ns")
     nearest_day = (moment + np.timedelta64(DAY_S // 2, "s")).astype("datetime64[D]")
     is_first = nearest_day == nearest_day.astype("datetime64[M]")

@@ -1,9 +1,9 @@
 """Returns of one firing in consecutive packets (`PacketCounter.returns`), and in one packet.
 
 Some sensors send each return of their firings in a packet of its own. These packets form a group
-with consecutive counters. A group is incomplete if some of its packets are lost: the points of the
-others then lack the other return. `GroupCounter` counts incomplete groups, and `arrange_returns`
-puts the returns of each firing next to each other.
+with consecutive counters. A group is incomplete if some of its packets are lost: then the firings
+of the others lack a return. `GroupCounter` counts incomplete groups, and `arrange_returns` puts the
+returns of each firing next to each other.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class GroupCounter:
             self._forget(group)
 
     def _count_ended(self) -> None:
-        """Count the incomplete groups whose last packet has arrived or is passed."""
+        """Count the incomplete groups whose last packet, or a later packet, has arrived."""
         for group, end in list(self._ends.items()):
             if end <= self._newest and group not in self._counted:
                 self._stats.incomplete_returns += 1

@@ -83,7 +83,7 @@ class UtcChange:
     Attributes:
         utc_ns: the UTC from which on the source applies, ns since 1970.
         source: the new source.
-        is_first: whether it is the source of the first time.
+        is_first: whether it is the first source, and not a change.
     """
 
     utc_ns: int

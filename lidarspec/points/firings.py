@@ -1,9 +1,9 @@
 """Group the returns of each firing, and choose one of them.
 
 Returns belong to one firing if they have the same column and ring. The points of most sensors have
-no column; their returns have the same time and ring. Points that agree in these are firings one
-after another: the first point with return index 0 and the first with return index 1 are the first
-firing.
+no column; their returns have the same time and ring. Several points with one return index, time and
+ring belong to successive firings: the first point with return index 0 and the first with return
+index 1 are the first firing.
 
 A firing may lack a return: it was not sent, or its packet is lost.
 """
