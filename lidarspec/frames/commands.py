@@ -150,7 +150,8 @@ def _template_slot(
     """Return the slot of an argument that is a part of a template."""
     if argument not in template.names or not isinstance(declared.kind, Range | Text):
         raise SpecError(
-            f"{template.text!r} requires {{{argument}}}, with a range or Text(size)",
+            f"the argument {argument!r} must be in the text {template.text!r}, and have a range or"
+            " Text(size)",
             path=place,
             sensor=sensor.id,
         )

@@ -215,9 +215,7 @@ class PointCloud:
                 occurs twice or is too large.
         """
         if self.shape is None or self.column is None:
-            raise UsageError(
-                "an image requires organised points with column numbers, and this cloud has none"
-            )
+            raise UsageError("an image requires organised points with column numbers")
         column_size = grid_of(self).column
         numbers, counts = np.unique(self.column[::column_size], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]

@@ -219,7 +219,8 @@ class Clock:
         _check_epoch(self.epoch, "clock.epoch")
         if self.epoch == "hour" and self.wraps_at != HOUR_S:
             raise SpecError(
-                f"a clock that counts from the full hour wraps at {HOUR_S} s", path="clock.wraps_at"
+                f"a clock that counts from the full hour must wrap at {HOUR_S} s",
+                path="clock.wraps_at",
             )
         if self.wraps_at is None:
             return

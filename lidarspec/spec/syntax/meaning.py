@@ -966,12 +966,9 @@ _OPAQUE_REASONS = {
     "VarInt": "VarInt has no fixed offset: use a WireForm for numbers of variable size",
     "ZigZag": "ZigZag has no fixed offset: use a WireForm for numbers of variable size",
     "FocusedSeq": (
-        "PrefixedArray is only compiled as a named member of a Struct: Struct('points' /"
-        " PrefixedArray(...))"
+        "PrefixedArray must be a named member of a Struct: Struct('points' / PrefixedArray(...))"
     ),
-    "Prefixed": (
-        "Prefixed is only compiled as a named member of a Struct: Struct('part' / Prefixed(...))"
-    ),
+    "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",
     "GreedyBytes": "it reads the rest of a datagram: use Bytes(n) after its length",
     "GreedyRange": ("it reads the rest of a datagram: use PrefixedArray or Prefixed(GreedyRange)"),
