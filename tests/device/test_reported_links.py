@@ -212,7 +212,10 @@ def test_a_command_without_an_address_is_an_error() -> None:
 
 @pytest.mark.parametrize("option", ["control", "src"])
 def test_commands_over_the_data_link_go_to_the_declared_port(option: str) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lidar:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as lidar,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other_port,
+    ):
         lidar.bind(("127.0.0.1", 0))
         lidar.settimeout(TIMEOUT_S)
         sensor = over_data(Udp(lidar.getsockname()[1]))
@@ -222,6 +225,10 @@ def test_commands_over_the_data_link_go_to_the_declared_port(option: str) -> Non
             data, sender = lidar.recvfrom(100)
             assert data == sensor.command("hello")
             assert sender[1] == int(source.partition("?")[0].rpartition(":")[2])
+            other_port.sendto(sensor.example("data"), sender)
+            read_until(device, lambda: device.stats.frames)
+            device.write(sensor.command("hello"))
+            assert lidar.recv(100) == sensor.command("hello"), "data may come from another port"
 
 
 @pytest.mark.skipif(

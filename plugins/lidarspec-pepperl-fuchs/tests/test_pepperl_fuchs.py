@@ -86,6 +86,19 @@ def test_a_gap_of_the_clock_is_a_loss() -> None:
     assert R2000.decode(masked).stats.lost == 0
 
 
+def test_a_shorter_last_packet_is_no_loss() -> None:
+    packets = ls.simulate(R2000, 40)
+    shorter = []
+    for number, data in enumerate(packets):
+        values = {**R2000.parse(data), "num_points_scan": 7 * 180 + 20}
+        if number % 8 == 7:
+            values |= {"num_points_packet": 20, "samples": values["samples"][:20]}
+        values["packet_size"] = 60 + 4 * values["num_points_packet"]
+        shorter.append(R2000.build("packet_c", values))
+    assert R2000.decode(shorter).stats.lost == 0
+    assert R2000.decode(shorter[:7] + shorter[8:]).stats.lost == 1
+
+
 def test_an_error_of_the_scanner_is_reported() -> None:
     refusal = b'{"error_code": 120, "error_text": "Invalid handle"}'
     answers = {**R2000.simulation.answers, "start": [("reply", {"status": 400, "body": refusal})]}
