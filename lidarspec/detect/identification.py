@@ -45,6 +45,7 @@ from lidarspec.plugins import registry, sensor as named_sensor, sensors
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.description import Relative, Reported
+from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
@@ -349,6 +350,8 @@ def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
     meaning = _describe_value(value, info)
     if meaning:
         return meaning
+    if info.labels and isinstance(value, int):
+        return format_code(value, UNKNOWN_CODE)
     if isinstance(value, int | float):
         return f"{info.physical(value):g} {info.unit}".rstrip()
     return f"{value}"

@@ -80,7 +80,8 @@ def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     for raw, label in info.labels.items():
         if text == label:
             return raw
-    number, unit = _parse_number(text, info.unit, f"{place}: {path}", "a number")
+    expected = " or ".join([*info.labels.values(), "a number"])
+    number, unit = _parse_number(text, info.unit, f"{place}: {path}", expected)
     if unit:
         return _to_raw(info, number, path, place)
     if number.denominator == 1 and info.kind != "float":

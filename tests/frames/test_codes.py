@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pickle
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -29,6 +32,7 @@ from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.formatting import describe_argument
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
+from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Command, EnumValue, Frame, Serial
 
 MODE = Enum(Int8ul, idle=1, strongest=0x37, **{"last and strongest": 0x39})
@@ -70,6 +74,10 @@ def make_sensor(**more: object) -> Sensor:
 
 
 SENSOR = make_sensor()
+#: without the frame that only construct can read.
+COMPILED = dataclasses.replace(
+    SENSOR, frames={name: frame for name, frame in FRAMES.items() if name != "text"}
+)
 
 
 def test_a_code_is_its_number_with_a_name() -> None:
@@ -126,6 +134,19 @@ def test_build_on_the_command_line_takes_a_name_or_a_number() -> None:
         assert parse_values(schema, [text], "x") == {"mode": 0x39}
 
 
+def test_build_on_the_command_line_lists_the_names() -> None:
+    schema = make_schema(FRAMES["report"].tree)
+    with pytest.raises(UsageError, match="expected idle or strongest or last and strongest or a"):
+        parse_values(schema, ["mode=strongst"], "x")
+
+
+def test_a_simulated_device_takes_names() -> None:
+    made = FrameMaker(SENSOR, "report").frame({"mode": "strongest", "flags.level": "high"})
+    assert (made[1], made[2]) == (0x37, 0b100)
+    with ls.open("sim:", SENSOR) as device:
+        assert device.send("idle").values.mode.name == "idle"
+
+
 def test_arguments_take_names_within_their_range() -> None:
     assert SENSOR.command("set_mode", mode="strongest") == b"\xc3\x37"
     assert SENSOR.command("set_mode", mode=0x37) == b"\xc3\x37"
@@ -156,6 +177,44 @@ def test_info_gives_names(tmp_path: Path) -> None:
         list(device.packets("report"))
         assert device.info == {"model": "ACME X1"}
         assert not device.warnings
+
+
+def test_info_reports_an_unknown_code(tmp_path: Path) -> None:
+    path = tmp_path / "some.bin"
+    path.write_bytes(DATA[:-2] + b"\x63\0")
+    with ls.open(path, SENSOR) as device:
+        list(device.packets("report"))
+        assert device.info == {"model": "unknown code (0x63)"}
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="gcc is not installed")
+def test_c_has_a_function_for_the_names_of_a_code(tmp_path: Path) -> None:
+    (tmp_path / "codes.h").write_text(ls.export(COMPILED, "c"))
+    program = """
+        #include <stdio.h>
+        #include "codes.h"
+        int main(void) {
+            puts(acme_codes_report_model_name(ACME_CODES_REPORT_MODEL_ACME_X2));
+            puts(acme_codes_report_mode_name(0x39));
+            return acme_codes_report_mode_name(99) != NULL;
+        }
+    """
+    (tmp_path / "main.c").write_text(program)
+    command = ["gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "main.c", "-o", "main"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["ACME X2", "last and strongest"]
+
+
+def test_other_exports_have_the_names() -> None:
+    assert "1: idle" in ls.export(COMPILED, "ksy")
+    assert "id: last_and_strongest" in ls.export(COMPILED, "ksy")
+    assert '"24": "ACME X1"' in ls.export(COMPILED, "json")
+    assert '[24] = "ACME X1"' in ls.export(COMPILED, "wireshark")
+    assert "ACME X1 (0x18), ACME X2 (0x1f)" in ls.export(COMPILED, "md")
+    stub = ls.export(COMPILED, "pyi")
+    assert "model: EnumValue" in stub
+    assert "mode: float | Literal['idle', 'strongest']" in stub
 
 
 def test_unknown_codes_are_a_warning_once(tmp_path: Path) -> None:
