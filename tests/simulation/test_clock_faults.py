@@ -161,6 +161,12 @@ def test_times_within_a_packet_stay_the_same() -> None:
         np.testing.assert_allclose(faulty.time, clean.time, atol=1e-9)
 
 
+def test_fields_that_add_up_wrap_together() -> None:
+    paced = SHAPES["shape-paced"]  # its seconds count to 59
+    packets = paced.decode(simulate(paced, 40, clock=parse_clock_faults("step=59.9s")))
+    assert packets["seconds"].tolist() == [59.0] * 20 + [0.0] * 20
+
+
 def test_a_date_is_carried_into_the_next_month() -> None:
     dated = make_dated()
     packets = dated.decode(simulate(dated, 2, clock=parse_clock_faults("step=61s")))
@@ -243,6 +249,9 @@ def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:
     found = vlp16.split([data for _, data in device.outgoing(SECOND // 10)])
     first = next(vlp16.parse(item.data) for item in found if item.frame == "data")
     assert first.timestamp == 5_000_000
+    # 1,785,283,205 s since 1970 are 29 July 2026, 00:00:05.
+    position = next(vlp16.parse(item.data) for item in found if item.frame == "position")
+    assert bytes(position.nmea).startswith(b"$GPRMC,000005,A,,,,,,,290726,")
     with pytest.raises(UsageError, match="does not divide a day"):
         simulate(SHAPES["shape-columns"], 1, clock=parse_clock_faults("utc"))
 
