@@ -18,6 +18,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
+from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.outlets import LOCALHOST, Outlet
 from lidarspec.transports.protocol import POLL_S, Chunk, ClosingContext, Sender
 
@@ -142,7 +143,7 @@ def serve(
     while patient and not outlet.has_listener and not stop.is_set():
         early_commands += outlet.receive(POLL_S)
     start_ns = get_now()
-    device.utc_offset_ns = time.time_ns() - start_ns
+    device.utc_offset_ns = HostClock().now() - start_ns
     device.start(start_ns)
     device.serve_at(outlet.data.port)
     for link, data in early_commands:

@@ -71,7 +71,7 @@ class SimulatedTransport(LiveTransport):
         if data is None:
             self._changed = threading.Condition()
             self._unread = {}
-            device.utc_offset_ns = time.time_ns() - time.monotonic_ns()
+            device.utc_offset_ns = self._clock.now() - time.monotonic_ns()
             device.start(time.monotonic_ns())
         else:
             self._changed = data._changed
