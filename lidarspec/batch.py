@@ -174,7 +174,7 @@ class FilePiece:
                 break
         scans.add_warnings(sieve.warnings)
         if sieve.is_empty:
-            raise sieve.missing()
+            raise sieve.make_missing_error()
 
 
 @functools.lru_cache(maxsize=64)

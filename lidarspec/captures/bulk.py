@@ -287,7 +287,7 @@ class CapturedDatagrams:
             )
             start = stop
 
-    def sent(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
+    def iter_frame_senders(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
         """Yield (frame type, sender) of the frames that were found in these datagrams.
 
         A type is yielded again each time its sender changes.

@@ -59,7 +59,7 @@ class BufferedInput:
         self._data = memoryview(b"")
         self._bytes_dropped = 0  # bytes of the file before `storage`
         self.record = self.at = 0
-        self._adopt(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
+        self._use_buffer(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the arguments for pickling; the copy continues at the same offset."""
@@ -85,7 +85,7 @@ class BufferedInput:
         """Continue at an offset of a seekable file."""
         self._file.seek(offset)
         self._last_view = None  # the new buffer has no view
-        self._adopt(np.empty_like(self.storage), 0)
+        self._use_buffer(np.empty_like(self.storage), 0)
         self.record = self._bytes_dropped = offset
 
     @property
@@ -190,12 +190,12 @@ class BufferedInput:
                 *self._viewed_buffers[1 - MAX_VIEWED_BUFFERS :],
                 (self.storage, self._last_view),
             ]
-        spare = self._spare(size)
+        spare = self._find_spare_buffer(size)
         spare[:have] = tail
         self._bytes_dropped += at
-        self._adopt(spare, have)
+        self._use_buffer(spare, have)
 
-    def _spare(self, size: int) -> NDArray[np.uint8]:
+    def _find_spare_buffer(self, size: int) -> NDArray[np.uint8]:
         if self._last_view is None and len(self.storage) - SLACK_BYTES == size:
             return self.storage
         self._last_view = None
@@ -205,7 +205,7 @@ class BufferedInput:
                 return storage
         return np.empty(size + SLACK_BYTES, np.uint8)
 
-    def _adopt(self, storage: NDArray[np.uint8], have: int) -> None:
+    def _use_buffer(self, storage: NDArray[np.uint8], have: int) -> None:
         self.storage = storage
         self._view = storage.data
         self._data = self._view[:have]

@@ -113,7 +113,7 @@ def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         return text
-    if sensor.configure.takes(name, value):
+    if sensor.configure.accepts_value(name, value):
         return value
     return text
 

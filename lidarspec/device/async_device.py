@@ -98,7 +98,7 @@ class AsyncDevice:
             if sieve.ended:
                 break
         if sieve.is_empty:
-            raise sieve.missing()
+            raise sieve.make_missing_error()
 
     async def imu(self) -> AsyncIterator[ImuSamples]:
         """Yield the samples of the sensor's IMU; see `Device.imu`."""

@@ -347,7 +347,7 @@ class Device(ClosingContext):
         """
         deadline = time.monotonic() + wait
         mark = self._input.mark()
-        while not (self._unseen_scans and self._input.caught_up(mark)):
+        while not (self._unseen_scans and self._input.has_decoded_until(mark)):
             if self._input.ended:
                 raise SourceError(
                     f"{self.source}: no further scan, because the input is {self._input.state}"
@@ -355,7 +355,7 @@ class Device(ClosingContext):
             batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
             if batch is not None:
                 self._find_whole_scans(batch)
-            has_no_more = batch is None or self._input.caught_up(mark)
+            has_no_more = batch is None or self._input.has_decoded_until(mark)
             if not self._unseen_scans and has_no_more and time.monotonic() >= deadline:
                 return None
         if not self.is_live:

@@ -176,7 +176,7 @@ class DeviceInput(Protocol):
         """Return a count of the data that has arrived, as an argument for `caught_up`."""
         return 0
 
-    def caught_up(self, mark: int) -> bool:
+    def has_decoded_until(self, mark: int) -> bool:
         """Return whether all data that arrived before a mark has been decoded.
 
         Always True for a file.
@@ -409,7 +409,7 @@ class FileInput(DeviceInput):
                     frames = self.decoder.decode_placed(
                         part.buffer, part.starts, part.sizes, part.at
                     )
-                    self.senders.check(part.sent(frames))
+                    self.senders.check(part.iter_frame_senders(frames))
                     yield FrameBatch([frames])
             yield FrameBatch(self.decoder.take_pending())
             return

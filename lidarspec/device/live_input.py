@@ -257,7 +257,7 @@ class LiveInput(DeviceInput):
     def mark(self) -> int:
         return self.queue.produced
 
-    def caught_up(self, mark: int) -> bool:
+    def has_decoded_until(self, mark: int) -> bool:
         return not self._ready and self.queue.consumed + self.queue.dropped >= mark
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:

@@ -471,7 +471,7 @@ def align(
                 named[at].get(place, "").rpartition(".")[2]
                 for place in range(min(named[at]), depth)
             )
-            arrays.append(value.lined_up(names))
+            arrays.append(value.align(names))
         else:
             arrays.append(_reshape_to_axes(np.asarray(value), axes, lengths, batch.table))
     if not len(batch):

@@ -216,7 +216,7 @@ def _iter_condition_faults(
     for condition in layout.conditions:
         if condition.formula is None:
             continue  # `_find_value_fault` checks the allowed values of a field
-        if layout.meets_condition(condition, row)[0]:
+        if layout.meet_condition(condition, row)[0]:
             continue
         leaves = [layout.leaves[info.path] for info in condition.fields]
         end = examined.start + max((leaf.byte_span[1] for leaf in leaves), default=0)

@@ -410,7 +410,7 @@ class _Encoder:
                     f"{self._place}: {self._make_shown_path(axis)}: expected {count} parts, got"
                     f" {len(parts[axis])}"
                 )
-            _, walked = region.in_rows(row)
+            _, walked = region.find_parts(row)
             if walked.status[0] != FOUND or walked.sizes[0] != region.size:
                 raise UsageError(
                     f"{self._place}: {self._make_shown_path(axis)}:"
@@ -418,7 +418,7 @@ class _Encoder:
                     " the header"
                 )
         for condition in layout.conditions:
-            if not layout.meets_condition(condition, row)[0]:
+            if not layout.meet_condition(condition, row)[0]:
                 named = ", ".join(info.path for info in condition.fields)
                 raise UsageError(f"{self._place}: the condition on {named} is false")
 

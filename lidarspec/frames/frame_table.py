@@ -219,7 +219,7 @@ class CompiledTable:
         if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
             self._walks[axis] = [
-                (group, *region.in_rows(group.rows))
+                (group, *region.find_parts(group.rows))
                 for group, region in regions
                 if region is not None
             ]

@@ -484,7 +484,7 @@ class Seal:
             leaf.store(rows, part)
             shift += leaf.info.bits
 
-    def sound(self, frame: bytes) -> bool:
+    def is_valid(self, frame: bytes) -> bool:
         """Return whether the checksum of one frame is correct.
 
         A stored value in `absent` counts as correct.
@@ -510,7 +510,7 @@ class Seal:
     def _single(self) -> Single:
         return single(self.algorithm)
 
-    def intact(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
+    def are_valid(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Return whether the checksum of each frame is correct, (n,).
 
         A stored value in `absent` counts as correct.
@@ -711,7 +711,7 @@ class Layout:
         assert found is not None
         return found.load(rows)
 
-    def sound(self, frame: bytes) -> bool:
+    def is_valid(self, frame: bytes) -> bool:
         """Return whether one frame is valid.
 
         This checks its size, constants, checksums and conditions.
@@ -719,21 +719,21 @@ class Layout:
         return (
             len(frame) == self.size
             and int.from_bytes(frame, "little") & self._mask == self._value
-            and all(part.sound(frame) for part in (*self.seals, *self.regions.values()))
+            and all(part.is_valid(frame) for part in (*self.seals, *self.regions.values()))
             and (
                 not self.conditions
-                or self.meets(np.frombuffer(frame, np.uint8).reshape(1, -1)).item()
+                or self.meet_conditions(np.frombuffer(frame, np.uint8).reshape(1, -1)).item()
             )
         )
 
-    def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
+    def meet_conditions(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Return whether each frame, given as a row of bytes, meets all conditions, (n,)."""
         met = np.ones(len(rows), np.bool_)
         for condition in self.conditions:
-            met &= self.meets_condition(condition, rows)
+            met &= self.meet_condition(condition, rows)
         return met
 
-    def meets_condition(self, condition: Condition, rows: Bytes2D) -> NDArray[np.bool_]:
+    def meet_condition(self, condition: Condition, rows: Bytes2D) -> NDArray[np.bool_]:
         """Return whether each frame, given as a row of bytes, meets a condition, (n,)."""
         return find_passing(condition, self.leaves, rows)
 

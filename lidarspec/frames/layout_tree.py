@@ -763,7 +763,7 @@ class _CandidateSet:
         self._limit = limit
         self.refuted: list[NDArray[np.intp]] = []
 
-    def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
+    def cut_longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
         """Return the available bytes of the longest candidate, at most `limit`."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
@@ -791,14 +791,14 @@ class _CandidateSet:
     def cut_off(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
         """Add the candidates with a wrong constant before this node to `refuted`."""
         if node.constants:
-            self.refuted.append(which[self.wrong(node.constants, which)])
+            self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
 
-    def wrong(
+    def have_wrong_constants(
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
         """Return whether each candidate has a wrong constant in its available bytes, (n,)."""
         if len(which) == 1:  # the usual case for random headers, which differ
-            data = self.longest(which)
+            data = self.cut_longest(which)
             return np.array([_is_refuted(constants, data)])
         offsets = self._offsets[which]
         stops = len(self._buffer) if self.stops is None else self.stops[which]
@@ -861,7 +861,7 @@ class HeaderTree:
         for result, which in self.group_by_layout(len(offsets), places.read, places):
             groups.append((result, which))
             if isinstance(result, LayoutRefusal) and result.constants:
-                wrong = places.wrong(result.constants, which)
+                wrong = places.have_wrong_constants(result.constants, which)
                 groups[-1] = result, which[~wrong]
                 places.refuted.append(which[wrong])
         return groups + [
@@ -885,9 +885,11 @@ class HeaderTree:
         while stack:
             node, which = stack.pop()
             if len(which) == 1 and places is not None:
-                node = self._find_end(places.longest(which), node, is_all=places.stops is not None)
+                node = self._find_end(
+                    places.cut_longest(which), node, is_all=places.stops is not None
+                )
             elif node.leaf is None and node.result is None:
-                data: bytes | memoryview = b"" if places is None else places.longest(which)
+                data: bytes | memoryview = b"" if places is None else places.cut_longest(which)
                 self._explore(node, data, is_all=places is not None and places.stops is not None)
             if node.result is not None:
                 groups.append((node.result, which))

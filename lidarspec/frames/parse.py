@@ -134,7 +134,7 @@ def _try_parse(frame: Frame, data: bytes) -> tuple[Any] | None:
     if decoded.problem is not None:
         return None
     layout = layouts.layout(decoded.struct)
-    if isinstance(layout, Layout) and layout.sound(decoded.struct):
+    if isinstance(layout, Layout) and layout.is_valid(decoded.struct):
         values = unpack(frame.tree, layout, decoded.struct)
         return (coder.keep_spelling(values, decoded.struct, data),)
     return None

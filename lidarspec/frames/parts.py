@@ -105,7 +105,7 @@ class PartKind:
             for node in tree.nodes(self.node.root)
         )
 
-    def further(self, layout: Layout) -> tuple[Word, ...]:
+    def find_further_constants(self, layout: Layout) -> tuple[Word, ...]:
         """Return the constants of a layout that are not in `prefix`."""
         cached = layout.notes.get(PartKind)
         if cached is None:
@@ -213,22 +213,22 @@ class Region:
         """
         return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
-    def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
+    def find_parts(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
         """Find the parts of frames given as rows of bytes; return a buffer and the parts in it."""
         return view_span(rows), self.walk(view_span(rows), np.arange(len(rows)) * rows.strides[0])
 
-    def sound(self, frame: bytes) -> bool:
+    def is_valid(self, frame: bytes) -> bool:
         """Return whether all parts of one frame are valid and fill the region exactly."""
-        _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
+        _, walked = self.find_parts(np.frombuffer(frame, np.uint8).reshape(1, -1))
         return (
             not walked.status[0]
             and walked.sizes[0] == self.size
-            and all(layout.sound(data) for _, layout, data in self.list_parts(frame))
+            and all(layout.is_valid(data) for _, layout, data in self.list_parts(frame))
         )
 
     def list_parts(self, frame: bytes) -> list[tuple[PartKind, Layout, bytes]]:
         """Return kind, layout and bytes of each part of one frame."""
-        _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
+        _, walked = self.find_parts(np.frombuffer(frame, np.uint8).reshape(1, -1))
         pieces = ((piece, int(piece.offsets[0])) for pieces in walked.rounds for piece in pieces)
         return [
             (self.kinds[piece.kind], piece.layout, frame[offset : offset + piece.layout.size])
@@ -317,7 +317,7 @@ class _PartWalk:
                     self._set_refusal(layout, own[which])
                     continue
                 owners = own[which]
-                matches = self._match_constants(owners, kind.further(layout))
+                matches = self._match_constants(owners, kind.find_further_constants(layout))
                 if matches is not None:
                     others.append(owners[~matches])
                     owners = owners[matches]
@@ -511,5 +511,5 @@ class PartsSize:
 
         If not all parts were found, the size is the negative status.
         """
-        walked = self.region.in_rows(rows)[1]
+        walked = self.region.find_parts(rows)[1]
         return np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))

@@ -105,7 +105,7 @@ class FragmentAssembler:
         self._stats = stats
         layouts = frame_layouts(Frame(rule.struct, max_length=MAX_DATAGRAM_BYTES))
         if isinstance(layouts, NotCompilableError):
-            raise rule.wrong(str(layouts))
+            raise rule.make_error(str(layouts))
         self._layouts = layouts
         self._waiting: dict[Hashable, _PartialMessage] = {}
         self._done: deque[Hashable] = deque(maxlen=MAX_WAITING_MESSAGES)
@@ -179,7 +179,7 @@ class FragmentAssembler:
         """Return the fragment in a datagram; None if the datagram is not a fragment."""
         rule = self._rule
         layout = self._layouts.layout(datagram)
-        if not isinstance(layout, Layout) or not layout.sound(datagram[: layout.size]):
+        if not isinstance(layout, Layout) or not layout.is_valid(datagram[: layout.size]):
             return None
         if rule.payload:
             leaf = layout.leaves[rule.payload]

@@ -309,7 +309,7 @@ def valid_mask(
     """
     declared = sensor.frames[frame]
     if layout.conditions:
-        mask = layout.meets(rows)
+        mask = layout.meet_conditions(rows)
     else:
         mask = np.ones(len(rows), np.bool_)
     if declared.plausible is None:

@@ -186,7 +186,7 @@ def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
     """Check the parts of each frame, and return its status, (n,)."""
-    buffer, walked = region.in_rows(rows)
+    buffer, walked = region.find_parts(rows)
     status = OF_PARTS[walked.status]
     errors += walked.errors
     for piece in (piece for pieces in walked.rounds for piece in pieces):
@@ -196,7 +196,7 @@ def _check_parts(
         for seal in piece.layout.seals:
             _check_valid(verdicts, parts, functools.partial(check_seal, seal, errors, sums))
         if piece.layout.conditions:
-            verdicts[(verdicts == VALID) & ~piece.layout.meets(parts)] = IMPLAUSIBLE
+            verdicts[(verdicts == VALID) & ~piece.layout.meet_conditions(parts)] = IMPLAUSIBLE
         bad = (verdicts != VALID) & (status[piece.owners] == VALID)
         status[piece.owners[bad]] = verdicts[bad]
     return status
@@ -207,7 +207,7 @@ def check_seal(
 ) -> NDArray[np.uint8]:
     """Check one checksum of each frame; return `VALID`, `CHECKSUM` or `PLUGIN`, (n,)."""
     try:
-        wrong = ~seal.intact(rows, sums)
+        wrong = ~seal.are_valid(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
     except Exception as error:
         errors.append(PluginError.of(error, "checksum"))

@@ -289,4 +289,4 @@ def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) ->
         moved[:, size - tail :] = gather_rows(
             rows.reshape(-1), np.arange(len(rows)) * size + stops, tail
         )
-    return seal.intact(moved, sums)
+    return seal.are_valid(moved, sums)

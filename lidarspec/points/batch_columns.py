@@ -255,7 +255,7 @@ class BatchColumns(ColumnSource):
         share = self._shares[0]
         packets, places = np.divmod(indices, self._plan.width)
         if isinstance(self._plan.parts["time"], Node):
-            few = share.some(packets).plain("time")
+            few = share.take(packets).plain("time")
         else:
             few = share.plain("time")[packets]
         offsets = seconds_since(self._packets.time_ns[packets], self.base)

@@ -49,7 +49,7 @@ class PlainValues:
                 compute(node, self._arrays, self._load)
         return self._arrays[node]  # type: ignore[no-any-return]
 
-    def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
+    def read_raw(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
         """Return the integers of a field as they were sent, (n, ...).
 
         The integers are those of packets `first` to `stop - 1`. Returns None unless the node is an
@@ -143,7 +143,7 @@ class GroupPoints:
         part = self.plan.parts[name]
         shape = (stop - first, *self.plan.shape)
         if isinstance(part, Node) and name in self.plan.extra:
-            array = self.plain_values.sent(part, first, stop)
+            array = self.plain_values.read_raw(part, first, stop)
         else:
             array = None
         if array is None:
@@ -178,7 +178,7 @@ class GroupPoints:
             share.plain_values.set_value(node, Column(array[corner], node.sample.axes, own))
         return share
 
-    def some(self, which: NDArray[np.intp]) -> GroupPoints:
+    def take(self, which: NDArray[np.intp]) -> GroupPoints:
         """Return a group for some of the packets, with the values that are already computed.
 
         Args:

@@ -85,13 +85,13 @@ class RecordFile:
                         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                     written += more
         except OSError:
-            self.size += self._whole(records, written)
+            self.size += self._count_whole_bytes(records, written)
             with contextlib.suppress(OSError):
                 self._file.truncate(self.size)
             raise
         self.size += written
 
-    def _whole(self, records: bytes | bytearray, limit: int) -> int:
+    def _count_whole_bytes(self, records: bytes | bytearray, limit: int) -> int:
         """Return the total size of the records that end within the first `limit` bytes."""
         if self._size_at is None:
             return limit
@@ -197,7 +197,9 @@ class BackgroundWriter:
         self._records_requested = 0
         self._records_synced = 0
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
-        self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._write_records, name=f"recorder of {path}", daemon=True
+        )
         self._thread.start()
         atexit.register(self._finish)
 
@@ -315,7 +317,7 @@ class BackgroundWriter:
         self._thread.join(DISK_TIMEOUT_S)
         atexit.unregister(self._finish)
 
-    def _work(self) -> None:
+    def _write_records(self) -> None:
         """Write the waiting records until the recorder is closed or an error occurs.
 
         This runs in the thread.

@@ -393,7 +393,7 @@ class Recording(ClosingContext):
                 continue
             self.damaged += 1
             if not self.salvage:
-                self.leftover += self._rest()
+                self.leftover += self._count_remaining_bytes()
                 return
             self.leftover += self._next_mark()
 
@@ -441,7 +441,7 @@ class Recording(ClosingContext):
         self._skip(position - self._place)
         return self.offset - before
 
-    def _rest(self) -> int:
+    def _count_remaining_bytes(self) -> int:
         """Return the number of bytes from the current offset to the end of the file."""
         if self._file.seekable():
             return self._file.seek(0, os.SEEK_END) - self.offset

@@ -343,7 +343,7 @@ class ScanSelector:
             if self.ended:
                 break
         if self.is_empty:
-            raise self.missing()
+            raise self.make_missing_error()
 
     def select(self, scan: Scan) -> Scan | None:
         """Return the selected parts of the next scan; None if it is not selected.
@@ -378,7 +378,7 @@ class ScanSelector:
         """Whether there were scans, but none was selected."""
         return self._seen > 0 and not self._selected
 
-    def missing(self) -> UsageError:
+    def make_missing_error(self) -> UsageError:
         """Return the error to raise if no scan was selected.
 
         The error states the number or the times of the scans of the source.

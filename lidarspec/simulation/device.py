@@ -179,9 +179,9 @@ class ReplyMaker:
         """Apply the faults of a clock to the periodic frames from now on."""
         self._frames.use_timeline(timeline)
 
-    def unasked_frame(self, name: str, number: int) -> bytes:
+    def make_periodic_frame(self, name: str, number: int) -> bytes:
         """Return frame number `number` of a type that the sensor sends periodically."""
-        return self._frames.numbered(name, number)
+        return self._frames.make_frame(name, number)
 
     def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
         if isinstance(answer, bytes):
@@ -355,7 +355,7 @@ class _FrameStream:
         taken: list[tuple[float, bytes]] = []
         while self.due <= upto:
             if self._position == len(self._frames):
-                self._more()
+                self._make_batch()
             first = self._position
             self._position = bisect.bisect_right(self._times, upto)
             taken += zip(
@@ -369,7 +369,7 @@ class _FrameStream:
                 self.due = self._end
         return taken
 
-    def _more(self) -> None:
+    def _make_batch(self) -> None:
         """Make the next batch of frames."""
         count = max(min(int(MAX_BATCH_NS / max(self._made.interval, 1)), MAX_BATCH_PACKETS), 1)
         block = self._made.block(
@@ -534,7 +534,7 @@ class SimulatedDevice:
             return []
         self._time = self._clock(now) + (MAX_BATCH_NS if math.isinf(self.rate) else 0)
         packets: dict[str, list[Packet]] = {}
-        for link, frame, data in self._due(self._time):
+        for link, frame, data in self._take_due(self._time):
             packets.setdefault(link, []).append((frame, data))
         out: list[tuple[str, str, bytes]] = []
         for link, link_packets in packets.items():
@@ -585,7 +585,7 @@ class SimulatedDevice:
         self._powered += max(late, 0)
         return (now - self._powered) * self.rate
 
-    def _due(self, upto: float) -> list[tuple[str, str, bytes]]:
+    def _take_due(self, upto: float) -> list[tuple[str, str, bytes]]:
         """Return the data that is due until a time, in order, as (link, type, bytes)."""
         sendings: list[tuple[float, str, str, bytes]] = []
         while self._plan and self._plan[0].at <= upto:
@@ -613,7 +613,7 @@ class SimulatedDevice:
                 due.at + SECOND / rate,
                 due.link,
                 due.frame,
-                self._replies.unasked_frame(due.frame, number),
+                self._replies.make_periodic_frame(due.frame, number),
             )
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
@@ -679,7 +679,7 @@ class SimulatedDevice:
         """Plan the first frame of each type without points that is sent periodically."""
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
-                self._put(at, "data", name, self._replies.unasked_frame(name, 0))
+                self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
         """Plan the fillers that are sent in a pause, and return the end of the pause."""

@@ -159,14 +159,16 @@ class Room:
                     )
             bodies: tuple[Box | Mover, ...] = (*self.boxes, *self.movers)
             for body in bodies:
-                _meet(ranges, body, beams, origin, time)
+                _shorten_ranges(ranges, body, beams, origin, time)
         return ranges
 
 
-def _meet(ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
+def _shorten_ranges(
+    ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value
+) -> None:
     """Shorten the ranges of the beams that hit a body from outside, in place."""
     low, high = body.at(time)
-    near = _near(body, low, high, beams, origin)
+    near = _may_hit(body, low, high, beams, origin)
     where = np.flatnonzero(np.broadcast_to(near, ranges.shape))
     if not len(where):
         return
@@ -188,7 +190,7 @@ def _meet(ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time
     flat[where[hit]] = np.minimum(flat[where[hit]], enter[hit])
 
 
-def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
+def _may_hit(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
     """Return a mask of the beams that may hit a body.
 
     All other beams miss the sphere around the body.

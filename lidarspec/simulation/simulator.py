@@ -285,11 +285,11 @@ class Measurement:
             with np.errstate(all="ignore"):
                 raw = round_raw(info, (part - zero) / step)
             raw_values[target.path] = np.where(
-                (part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0
+                (part > 0) & (raw > 0) & (raw <= self._find_max_raw(table, target.path)), raw, 0
             )
         return raw_values
 
-    def _most(self, table: CompiledTable, path: str) -> float:
+    def _find_max_raw(self, table: CompiledTable, path: str) -> float:
         """Return the maximum raw value of a field that its wire form can represent."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
@@ -320,7 +320,7 @@ class Measurement:
                 else:
                     step = None
                 targets += [RangeField(path, inner, step, info.offset)] if near.size else []
-        targets = targets or self._linear(table)
+        targets = targets or self._find_linear_fields(table)
         if not targets:
             reason = (
                 "cannot set the range of a point, because no field in metres determines it:"
@@ -329,7 +329,7 @@ class Measurement:
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
 
-    def _linear(self, table: CompiledTable) -> list[RangeField]:
+    def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
         """Return the fields that ranges depend on linearly, but not by the declared scale.
 
         These are fields in metres to which `points` applies a correction, and array elements
@@ -962,7 +962,7 @@ class FramesWithoutPoints:
         """Return a frame with these physical values."""
         return self._get_maker(name).seal(self._fill(name, range(1), values))[0]
 
-    def numbered(self, name: str, number: int) -> bytes:
+    def make_frame(self, name: str, number: int) -> bytes:
         """Return frame number `number` of a type.
 
         Frames are made in batches, because a batch takes hardly longer than a single frame.
@@ -981,7 +981,7 @@ class FramesWithoutPoints:
             if frame.simulation.rate and not frame.data
         }
         due = heapq.merge(*(_iter_due(name, rate) for name, rate in rates.items()))
-        return (self.numbered(name, number) for _, name, number in due)
+        return (self.make_frame(name, number) for _, name, number in due)
 
     def _make_batch(self, name: str, numbers: range) -> list[bytes]:
         """Return consecutive frames of a type that is sent periodically."""

@@ -119,7 +119,7 @@ class Crc(Checksum):
             return start
         return mirrored_bytes(start)
 
-    def left(self, register: int) -> int:
+    def finish(self, register: int) -> int:
         """Return the checksum, given the register in wire order after the last byte."""
         if not self.refin:
             size = REGISTER_BYTES[self.width]
@@ -469,7 +469,7 @@ def _narrow_crc(table: tuple[int, ...], register: int, leaving: bytes, data: byt
 def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes) -> int:
     for byte in data:
         register = table[(register ^ byte) & 0xFF] ^ register >> 8
-    return algorithm.left(register)
+    return algorithm.finish(register)
 
 
 @lru_cache(maxsize=256)

@@ -83,7 +83,7 @@ class Assembled:
     def __post_init__(self) -> None:
         for path in (*self.keys, self.index, self.count, *filter(None, (self.payload,))):
             if not has_member(self.struct, path):
-                raise self.wrong(f"the fragment has no field {path!r}")
+                raise self.make_error(f"the fragment has no field {path!r}")
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -92,7 +92,7 @@ class Assembled:
             return (self.key,)
         return tuple(self.key)
 
-    def wrong(self, reason: str) -> SpecError:
+    def make_error(self, reason: str) -> SpecError:
         """Return the error for a mistake in this declaration."""
         return SpecError(reason, path="links.data.assembled")
 

@@ -542,7 +542,7 @@ class Configure:
         """The names of the sensor's own options that accept a path."""
         return tuple(name for name, option in self.types.items() if option.is_file)
 
-    def takes(self, name: str, value: object) -> bool:
+    def accepts_value(self, name: str, value: object) -> bool:
         """Return whether an option accepts a value; True if the option is unknown."""
         return self.types.get(name, OptionType()).accepts(value)
 

@@ -84,7 +84,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         ):
             axes.setdefault(name.rpartition(".")[2], name)
         arrays = [
-            value.lined_up(tuple(axes)) if isinstance(value, AlongAxis) else np.asarray(value)
+            value.align(tuple(axes)) if isinstance(value, AlongAxis) else np.asarray(value)
             for value in values
         ]
         array = np.asarray(function(*arrays))
@@ -95,7 +95,7 @@ class AlongAxis(NDArrayOperatorsMixin):
             )
         return AlongAxis(tuple(axes.values()), array)
 
-    def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
+    def align(self, names: tuple[str, ...]) -> NDArray[Any]:
         """Return the numbers with one axis for each name.
 
         Axes that the numbers do not have get the length 1.

@@ -149,7 +149,7 @@ def _make_control_line(link: Link) -> OutletLine | None:
             if isinstance(link, Tcp):
                 return TcpLine(LOCALHOST, port)
             if isinstance(link, Udp):
-                return UdpLine.replying(LOCALHOST, port)
+                return UdpLine.make_reply_line(LOCALHOST, port)
             if isinstance(link, Http):
                 from lidarspec.transports.http_server import HttpLine
 

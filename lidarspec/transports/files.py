@@ -108,7 +108,7 @@ class RecordingTransport(Transport):
             damaged = self._recording.damaged
             self._has_skipped = False
             if record.direction == "event":
-                interrupted = self._interrupts(record) or interrupted
+                interrupted = self._is_interruption(record) or interrupted
             elif record.direction == "in" and self._accepts(record):
                 yield Chunk(
                     record.data,
@@ -147,7 +147,7 @@ class RecordingTransport(Transport):
         self.foreign += 1
         return False
 
-    def _interrupts(self, record: Record) -> bool:
+    def _is_interruption(self, record: Record) -> bool:
         """Return whether an event interrupts the stream.
 
         Also counts disconnections and invalid events, and adds a warning if the clock was set.

@@ -257,7 +257,7 @@ class UdpLine(OutletLine):
         return line
 
     @classmethod
-    def replying(cls, host: str, port: int) -> UdpLine:
+    def make_reply_line(cls, host: str, port: int) -> UdpLine:
         """Return a line that replies to the sender of the last command.
 
         The line also receives broadcasts that are sent on this computer.

@@ -191,7 +191,7 @@ class LiveScans:
         if not self._sieve.ended:
             self._store_scans(self._stream.finish())
         if self._sieve.is_empty:
-            raise self._sieve.missing()
+            raise self._sieve.make_missing_error()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
         """Adjust the size of a read so that it contains `ahead` seconds of recorded data."""

@@ -77,7 +77,7 @@ def unpack_by_layout(frame: Frame, data: bytes) -> Any:
     layout = layouts.layout(data)
     return (
         unpack(frame.tree, layout, data)
-        if isinstance(layout, Layout) and layout.sound(data)
+        if isinstance(layout, Layout) and layout.is_valid(data)
         else None
     )
 

@@ -144,7 +144,7 @@ class Expressions(KernelWriter):
         """Return an expression in float64, or a condition."""
         if not isinstance(value, Node):
             return self.constant(value, depth)
-        return self.once(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
+        return self.get_or_make(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
 
     def _write_double(self, node: Node) -> KernelValue:
         if node.kind == "field":
@@ -172,7 +172,7 @@ class Expressions(KernelWriter):
         index = node.args[0]
         table = node.args[1] if table is None else table
         row = self.double(index)
-        start = self.once(
+        start = self.get_or_make(
             ("row", index, table.shape),
             lambda: self.let(
                 row.level,
@@ -186,7 +186,9 @@ class Expressions(KernelWriter):
             )
         )
         name = self.array(
-            self.once(("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table))[0]
+            self.get_or_make(
+                ("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table)
+            )[0]
         )
         return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
@@ -195,7 +197,7 @@ class Expressions(KernelWriter):
 
         NumPy computes such an expression, usually once for all packets.
         """
-        return self.once(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
+        return self.get_or_make(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
 
     def _is_shared(self, node: Node) -> bool:
         if node.kind in ("state", "on"):
@@ -290,7 +292,7 @@ class Expressions(KernelWriter):
         """
         if not isinstance(value, Node):
             return self.constant(value, len(self.shape), "float32")
-        return self.once(
+        return self.get_or_make(
             ("single", value, exact), lambda: self._write_single(value, exact=exact, root=root)
         )
 
@@ -332,7 +334,7 @@ class Expressions(KernelWriter):
             or self.is_shared(beam.start.args[0])
         ):
             return None
-        high, low, _ = self.once(
+        high, low, _ = self.get_or_make(
             ("halves", id(table), beam.step), lambda: (*_split_halves(table * beam.step), table)
         )
         first, second = (self._write_row(beam.direction, "float32", half) for half in (high, low))
@@ -376,7 +378,7 @@ class Expressions(KernelWriter):
             return None
         if node.function is not returned_range and not is_nan_where(node):
             return None
-        made = self.once(
+        made = self.get_or_make(
             ("marked", node.args[-1], raw), lambda: self._write_distance(node.args[-1], raw=raw)
         )
         if made is None or node.function is returned_range:
@@ -423,7 +425,7 @@ class Expressions(KernelWriter):
             self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
             return len(self.angles) - 1
 
-        return int(self.once(("angle", node), make))
+        return int(self.get_or_make(("angle", node), make))
 
     def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
         """Return an angle in half turns, in float64.
@@ -544,7 +546,7 @@ class KernelAssembly:
         else:
             self.flat.append(f"put(out_{name}, o, {self.text(value)})")
 
-    def together(self, values: Mapping[str, Any]) -> None:
+    def store_coordinates(self, values: Mapping[str, Any]) -> None:
         """Add the lines that store x, y and z; if one of them is nan, all become nan."""
         if all(isinstance(value, KernelValue) for value in values.values()):
             lines = self.writer.lines[-1]
@@ -608,7 +610,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
         # a nan in one coordinate makes all of them nan
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:
-        assembly.together(places)
+        assembly.store_coordinates(places)
     for name, value in made.items():
         if name not in places:
             assembly.column(name, value)

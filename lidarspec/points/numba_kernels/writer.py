@@ -316,7 +316,7 @@ class KernelWriter:
         self.wanted.numbers.append(value)
         return f"n{len(self.wanted.numbers) - 1}"
 
-    def once(self, name: Any, make: Callable[[], Any]) -> Any:
+    def get_or_make(self, name: Any, make: Callable[[], Any]) -> Any:
         """Return the value that is stored under a key; make it on first use."""
         if name not in self._known:
             self._known[name] = make()
@@ -346,7 +346,9 @@ class KernelWriter:
     def array(self, values: NDArray[Any]) -> str:
         """Add a constant array to the arguments, flattened, and return its name."""
         flat = np.ascontiguousarray(values).reshape(-1)
-        return str(self.once(("array", id(values)), lambda: (self._add_array(flat), values))[0])
+        return str(
+            self.get_or_make(("array", id(values)), lambda: (self._add_array(flat), values))[0]
+        )
 
     def _add_array(self, flat: NDArray[Any]) -> str:
         self.wanted.arrays.append(flat)
@@ -362,9 +364,9 @@ class KernelWriter:
             return KernelValue(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
         shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
         name = self.array(
-            self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0]
+            self.get_or_make(("cast", id(value), kind), lambda: (array.astype(kind), value))[0]
         )
-        element: KernelValue = self.once(
+        element: KernelValue = self.get_or_make(
             ("element", name, shape),
             lambda: self.let(1 + last_axis(shape), f"at({name}, {self.index_text(shape)})"),
         )
@@ -379,7 +381,7 @@ class KernelWriter:
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)
-        found = self.once(
+        found = self.get_or_make(
             ("given", node),
             lambda: self.let(
                 1 + last_axis(node.shape),
@@ -388,7 +390,10 @@ class KernelWriter:
         )
         if node.sample.array.dtype.kind != "b":
             return found  # type: ignore[no-any-return]
-        return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
+        flag: KernelValue = self.get_or_make(
+            ("given flag", node), lambda: self.let(found.level, f"{found.text} != 0")
+        )
+        return flag
 
     def raw(self, leaf: Leaf) -> KernelValue | None:
         """Return the text of a field's raw value; None if only NumPy can read the field."""
@@ -432,7 +437,7 @@ class KernelWriter:
         """
         shape = leaf.shape[: len(leaf.strides)]
         level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
-        steps = self.once(
+        steps = self.get_or_make(
             ("element", shape, leaf.strides),
             lambda: self.let(level, f"base + {self.format_index(shape, self._strides(leaf))}"),
         )
@@ -440,7 +445,7 @@ class KernelWriter:
             place = str(offset)
         else:
             place = self.number(offset)
-        return self.once(  # type: ignore[no-any-return]
+        return self.get_or_make(  # type: ignore[no-any-return]
             (reader, shape, leaf.strides, offset),
             lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})"),
         )
@@ -521,7 +526,9 @@ class KernelWriter:
                 np.float32
             )
         table = self.array(self._tables[name])
-        index = self.once(("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1"))
+        index = self.get_or_make(
+            ("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1")
+        )
         return self.let(
             self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})"
         )

@@ -154,7 +154,7 @@ class _Context:
     #: formula. The offset of parts is never known.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
-    def inside(self, **changes: Any) -> _Context:
+    def with_changes(self, **changes: Any) -> _Context:
         """Return the context with some facts of the field changed."""
         return replace(self, info=replace(self.info, **changes))
 
@@ -202,7 +202,7 @@ class _Builder:
         if isinstance(inner, Array):
             axis = axis_path(info)
             count = self._formula(inner.count, place)
-            inside = place.inside(axes=(*info.axes, axis), default=None)
+            inside = place.with_changes(axes=(*info.axes, axis), default=None)
             if inside.offset is not None:
                 inside = replace(inside, offset=_return_no_offset)
             return tree.Repeat(name, axis, count, self.node(inner.subcon, inside), info.default)
@@ -211,7 +211,7 @@ class _Builder:
         if isinstance(inner, construct.IfThenElse):
             condition = self._formula(inner.condfunc, place)
             branches = (
-                self.node(branch, place.inside(optional=True))
+                self.node(branch, place.with_changes(optional=True))
                 for branch in (inner.thensubcon, inner.elsesubcon)
             )
             return tree.When(name, condition, *branches)
@@ -330,13 +330,13 @@ class _Builder:
         while True:
             if isinstance(con, construct.Renamed):
                 if con.docs:
-                    place = place.inside(docs=con.docs)
+                    place = place.with_changes(docs=con.docs)
             elif isinstance(con, DescribedField):
                 place = replace(place, info=con.describe(place.info))
             elif (adapter := self._adapter(con, place.info)) is not None:
-                place = place.inside(adapter=adapter, allowed=adapter.allowed)
+                place = place.with_changes(adapter=adapter, allowed=adapter.allowed)
             elif isinstance(con, construct.Enum):
-                place = place.inside(
+                place = place.with_changes(
                     labels={
                         int(value): str(name)
                         for value, name in con.ksymapping.items()
@@ -344,22 +344,22 @@ class _Builder:
                     }
                 )
             elif isinstance(con, Const):
-                place = place.inside(const=_find_constant(con))
+                place = place.with_changes(const=_find_constant(con))
             elif isinstance(con, LimitedNumber):
-                place = place.inside(allowed=con.allowed)
+                place = place.with_changes(allowed=con.allowed)
             elif isinstance(con, CountField):
-                place = place.inside(held=True)
+                place = place.with_changes(held=True)
             elif isinstance(con, SizeField):
-                place = place.inside(rebuilt=self._measure_part(con, place), held=True)
+                place = place.with_changes(rebuilt=self._measure_part(con, place), held=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
                 if place.scope is None:
                     known = None
                 else:
                     known = self._known.get(place.scope.path)
-                place = place.inside(rebuilt=self._formula(con.func, place, known))
+                place = place.with_changes(rebuilt=self._formula(con.func, place, known))
             elif isinstance(con, construct.Default):
-                place = place.inside(default=self._default(con.value, place))
+                place = place.with_changes(default=self._default(con.value, place))
             else:
                 return con, place
             con = con.subcon
@@ -451,7 +451,7 @@ class _Builder:
         return tree.Select(place.name, key, cases, self._branch(con.default, place))
 
     def _branch(self, con: Construct, place: _Context) -> tree.Node:
-        return self.node(con, place.inside(optional=True))
+        return self.node(con, place.with_changes(optional=True))
 
     def _struct(self, con: Struct, place: _Context) -> tree.Struct:
         info = place.info
@@ -554,7 +554,7 @@ class _Builder:
         element = self.node(
             con.subcon,
             replace(
-                place.inside(axes=(*place.info.axes, axis)),
+                place.with_changes(axes=(*place.info.axes, axis)),
                 room=None,
                 offset=None if place.offset is None else _return_no_offset,
             ),
@@ -574,7 +574,7 @@ class _Builder:
         axis = axis_path(place.info)
         assert scope is not None  # because parts are a member of a struct
         elements = [
-            self.node(case, replace(place.inside(axes=(*info.axes, axis)), offset=None))
+            self.node(case, replace(place.with_changes(axes=(*info.axes, axis)), offset=None))
             for case in con.cases.values()
         ]
         kinds = list[tree.Kind]()
@@ -691,7 +691,7 @@ class _Builder:
         name = place.name
         info = _add_type(con, place.info)
         if name and place.scope is not None:
-            place.scope.add(name, _seen_value(info))
+            place.scope.add(name, _to_scope_value(info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
             node: tree.Node = _make_number(info, con.length, is_big=big)
@@ -710,7 +710,7 @@ class _Builder:
         elif not place.in_bits and (blob := self._encoded_blob(con, place)) is not None:
             node = blob
             if name and place.scope is not None:
-                place.scope.names[name] = _seen_value(blob.info)
+                place.scope.names[name] = _to_scope_value(blob.info)
         else:
             kind = author_class(con)
             if isinstance(con, construct.FixedSized):
@@ -803,7 +803,7 @@ class _Builder:
         return tree.Block(place.name, place.info, size, tuple(parts))
 
 
-def _seen_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
+def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
     """Return a field in the form that later expressions read."""
     ref = tree.Ref(info.path, info)
     if info.adapter is None:

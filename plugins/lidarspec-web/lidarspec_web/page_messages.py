@@ -42,7 +42,7 @@ class PageMessages:
     def __init__(self, broadcast: Broadcast, *, control: bool) -> None:
         self.broadcast = broadcast
         self.duration = _duration(broadcast)
-        self.why_no_control = _why_no_control(broadcast, control=control)
+        self.why_no_control = _describe_no_control(broadcast, control=control)
         # Several pages show the same frame, and each lists the same damaged pieces.
         self._explain = functools.lru_cache(maxsize=KEPT_EXPLANATIONS)(self._make_explanation)
         self._verdict = functools.lru_cache(maxsize=MAX_DAMAGED)(self._make_verdict)
@@ -261,7 +261,7 @@ def _duration(broadcast: Broadcast) -> float | None:
         return None
 
 
-def _why_no_control(broadcast: Broadcast, *, control: bool) -> str:
+def _describe_no_control(broadcast: Broadcast, *, control: bool) -> str:
     """Return the reason why no commands are sent, "" if they are."""
     sensor = broadcast.device.sensor
     if not sensor.commands:
