@@ -36,8 +36,6 @@ STAMPED = {
     ("unfinished_files.py", "time.time"),
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
-    ("transports/serving.py", "time.time_ns"),
-    ("transports/simulated.py", "time.time_ns"),
     ("transports/simulated_files.py", "time.time_ns"),
 }
 
