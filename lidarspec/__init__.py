@@ -5,12 +5,12 @@
     s = ls.sensor("vendor-model")
     s.parse(frame), s.build("data", ...), s.decode(data).points(), s.scans(data), ls.open(source, s)
 
-This module has the names for reading a lidar. Names for describing a sensor are in
-`lidarspec.spec`, errors in `lidarspec.errors`. All are imported on first use, so that
+This module has the functions and classes for reading a lidar. Those for describing a sensor are in
+`lidarspec.spec`, and exceptions are in `lidarspec.errors`. All are imported on first use, so that
 ``lidarspec --help`` starts quickly.
 
-The packages follow the path of the data, and import each other in one direction. Each `__init__`
-lists its input and its output:
+The packages are listed in the order in which data passes through them, and import each other in one
+direction only. The docstring of each package says what it takes and returns:
 
     spec        description of a sensor        packets     frames of one type as columns
     frames      parsing and building a frame   points      packets as point clouds
@@ -25,7 +25,8 @@ lists its input and its output:
     plugins     installed sensors and hooks    testing     test kit for sensors
     cli         command line
 
-`Sensor` is in `sensor_operations`: a description from `spec` with methods that call these engines.
+The class `Sensor` is in `sensor_operations`. It is a description from `spec` with methods that call
+these packages.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Convert many files, large files in pieces, in several processes or on a cluster.
 
-In: captures by path, pattern or URL. Out: a file of points for each capture, or several files for
-a capture that is larger than a piece, and a manifest; or a Dask dataframe with a partition for each
-piece. Tasks are scheduled by `concurrent.futures`, or by the scheduler of a Dask cluster.
+In: captures by path, pattern or URL. Out of `convert`: a file of points for each capture (several
+    files if the capture is larger than a piece), and a manifest. Out of `read`: a Dask dataframe
+    with a partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask cluster.
 
-`device.file_scans` cuts a large file. Its pieces are located in sequence: the task that skips
-a piece returns the bookmark of the next. So points of a piece are computed while the following
-pieces are still being located.
+A large file is cut by `device.file_scans`. The starts of its pieces are found one after the other:
+a task reads through a piece without computing points, and returns the bookmark of the next piece.
+Meanwhile, other tasks compute the points of pieces whose starts are known.
 
 The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: the
-input, the sensor and versions, and the output or the error. A file is not read again if all its
-lines and results exist. A line is written only after its result.
+input, the sensor and versions, and the output or the error. If all lines and results of a file
+exist, the file is not read again. Each line is written after its result.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
-#: the size of a piece that is written to a file.
+#: Size of a piece of a capture in bytes, if its points are written to a file.
 PIECE_BYTES = 256_000_000
-#: the size of a piece that becomes a partition in memory.
+#: Size of a piece of a capture in bytes, if its points are a partition in memory.
 PARTITION_BYTES = 32_000_000
 MANIFEST = "manifest.jsonl"
-#: the number of tasks that an executor has at a time.
+#: Maximum number of tasks that an executor has at a time.
 MAX_RUNNING_TASKS = 1000
-#: the time between two writes of a manifest that cannot be appended to.
+#: Time between two uploads of a manifest in a store, which cannot be appended to.
 MANIFEST_PERIOD_S = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
 
@@ -88,14 +88,14 @@ class FilePiece:
 
     Attributes:
         source: path or URL of the file.
-        sensor, options: id and options of the sensor; "" if it is to be detected.
-        target: the output file for all scans; a piece has its number in the name. "" without
-            output.
+        sensor, options: the sensor's id, or "" if it is to be detected, and its options.
+        target: the output file if the source is a single piece; otherwise the number of the piece
+            is added to its name. "" without output.
         every_point: whether to include points without a valid return.
-        size: the size of a piece, bytes.
-        select: the selected scans; a file with scans selected by time or index is not cut.
-        number, first: the number of the piece, and of its first scan.
-        count: the number of its scans; None for all that follow.
+        size: size of a piece in bytes.
+        select: the selected scans. If they are selected by time or number, the file is not cut.
+        number, first: the number of the piece in the file, and of its first scan.
+        count: number of its scans; None for all scans up to the end of the file.
         bookmark: the start of the piece; None for the start of the file.
         is_last: whether it is the last piece.
     """
@@ -123,7 +123,7 @@ class FilePiece:
 
     @property
     def settings(self) -> Record:
-        """The settings that its result depends on, apart from the file and the piece number."""
+        """The settings that its result depends on, besides the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
             name: str(value)
@@ -179,14 +179,14 @@ class FilePiece:
 
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
-    """Return the same sensor for all files, since its compiled code is cached with it."""
+    """Return a configured sensor; the same object each time, which has compiled code."""
     named = named_sensor(name)
     configured: Sensor = named.configure(**dict(options)) if options else named
     return configured
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Return the piece with the number of its scans, followed by the next piece, if any."""
+    """Return a piece with the number of its scans, and the next piece if any."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -215,7 +215,7 @@ def convert_piece(piece: FilePiece) -> Record:
                 output=piece.output if first is not None else None,
                 warnings=scans.warnings,
             )
-    except Exception as error:  # any error: the other pieces continue
+    except Exception as error:  # any error, because the other pieces must be converted
         return piece.describe_failure(error)
 
 
@@ -249,11 +249,11 @@ def make_pieces(
     size: int,
     select: Selection,
 ) -> list[FilePiece]:
-    """Return the files of some paths, patterns and URLs, each as one piece.
+    """Return all files that match paths, patterns and URLs, each as one piece.
 
     Raises:
         SourceError: if no file matches.
-        UsageError: if two results would have the same name.
+        UsageError: if two output files would have the same name.
     """
     if isinstance(sensor, Sensor):
         name = sensor.id
@@ -278,9 +278,9 @@ def make_pieces(
     return list(by_output.values())
 
 
-#: the keys of each record of a manifest, with their types.
+#: The keys of each record of a manifest, with their types.
 _RECORD_KEYS: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
-#: further keys of the record of a written piece.
+#: Further keys of the record of a piece without an error.
 _WRITTEN_KEYS: Mapping[str, Any] = {
     "last": bool,
     "size": int,
@@ -301,16 +301,16 @@ def _is_record(value: Any) -> bool:
 
 
 class Manifest:
-    """The records of the pieces in a folder, of this run and earlier ones.
+    """The records of the pieces in a folder, from this run and earlier runs.
 
     Args:
-        folder: path or URL.
+        folder: its path or URL.
 
     Raises:
         SourceError: if the folder cannot be written to.
 
     Attributes:
-        is_new: whether the folder had no manifest before.
+        is_new: whether the folder had no manifest before this run.
     """
 
     def __init__(self, folder: str) -> None:
@@ -344,7 +344,7 @@ class Manifest:
         """Store the record of a line; return False if the line is incomplete or damaged.
 
         Raises:
-            SourceError: if the line is nested more deeply than any record.
+            SourceError: if its brackets are nested too deeply.
         """
         try:
             record = json.loads(line)
@@ -364,7 +364,7 @@ class Manifest:
         return normalise_path(path) in self._outputs
 
     def find_finished(self, piece: FilePiece) -> Record | None:
-        """Return the record of a piece that does not have to be converted again, else None."""
+        """Return the record of a piece if it need not be converted again; otherwise None."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
             record is None
@@ -386,7 +386,7 @@ class Manifest:
         )
 
     def find_records(self, piece: FilePiece) -> list[Record]:
-        """Return the records of all pieces of a file; empty if one is missing."""
+        """Return the records of all pieces of a file; an empty list if one is missing."""
         records = list[Record]()
         for number in itertools.count():
             if (record := self.find_finished(replace(piece, number=number))) is None:
@@ -397,7 +397,7 @@ class Manifest:
         return []
 
     def clear(self, piece: FilePiece) -> None:
-        """Remove the outputs of a file that has changed or has other settings now."""
+        """Remove the outputs of a file that has changed, or whose settings have."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if (
@@ -420,7 +420,7 @@ class Manifest:
         self._file.flush()
 
     def close(self) -> None:
-        """Write pending records, and close the file."""
+        """Write all records that are not written yet, and close the file."""
         if self._is_stored:
             self._put()
         else:
@@ -447,7 +447,7 @@ class _InProcessExecutor(Executor):
 
 
 def _exit_with_parent() -> None:
-    """Make a worker process end together with its parent, without a traceback."""
+    """Make this worker process end when its parent ends, without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -508,22 +508,23 @@ def convert(
 ) -> Iterator[tuple[Record, bool]]:
     """Write the points of many files into a folder.
 
-    Yields the record of each piece when it is finished, and whether it was finished before. A piece
-    that fails has an "error" in its record; the others continue.
+    For each finished piece, its record is yielded, and whether it was finished in an earlier run.
+    If a piece fails, its record has an "error", and the other pieces are still converted.
 
     Args:
         sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
-        folder: path or URL; its files are named after their sources, below the fixed part of the
-            pattern.
-        to: the suffix of a format, "parquet".
+        folder: path or URL. Each output has the same path in it as its source has below the part of
+            the pattern without wildcards.
+        to: the suffix of a format, such as "parquet".
         sensor: as in `lidarspec.open`; by default detected for each file.
         jobs: number of processes on this computer.
-        scheduler: the address of a Dask scheduler, to use its workers; they must be able to access
-            sources and folder.
+        scheduler: the address of a Dask scheduler whose workers are used. They must have access to
+            the sources and the folder.
         every_point: include points without a valid return.
-        select: the selected scans of each file; a file selected by times or numbers is not cut.
-        size: bytes of a piece; a larger file gives several files of points.
-        force: repeat finished pieces.
+        select: the selected scans of each file. If they are selected by time or number, files are
+            not cut.
+        size: size of a piece in bytes. A larger file is cut, and gives several files of points.
+        force: convert finished pieces again.
 
     Raises:
         SourceError: if a source does not exist, the folder cannot be written to, the scheduler
@@ -564,7 +565,7 @@ def convert(
 def _iter_results(
     executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
-    """Yield the record of each finished piece, and whether it is an old record.
+    """Yield the record of each finished piece, and whether it is from an earlier run.
 
     Pieces for which `done` returns a record are not converted again.
     """
@@ -614,9 +615,9 @@ def _is_large(piece: FilePiece) -> bool:
 
 
 def _check_format(to: str) -> None:
-    """Write an empty file in a format, to check that its library is installed.
+    """Check that the library of a format is installed, before any input is read.
 
-    This happens before any input is read.
+    To do so, an empty file is written.
     """
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(ValueError, IndexError):
         write(Path(folder) / f"none.{to}", [])
@@ -624,7 +625,7 @@ def _check_format(to: str) -> None:
 
 @contextlib.contextmanager
 def _without_partial_files(folder: str, to: str) -> Iterator[None]:
-    """Remove partial files of killed processes from a folder, before and after."""
+    """Remove partial files of killed processes from a folder, on entry and on exit."""
 
     def sweep() -> None:
         for path in () if is_remote(folder) else Path(folder).rglob(f".*.{to}"):
@@ -648,15 +649,16 @@ def read(
 ) -> Any:
     """Return the points of many files as a Dask dataframe, one partition per piece.
 
-    The columns are those of a Parquet file. A file that is larger than a piece is read through once
-    by this call, without making its points; everything else is deferred.
+    The columns are those of a Parquet file. If a file is larger than a piece, this call reads
+    through it without computing its points, to cut it. Points are computed only when Dask needs
+    them.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
         sensor: as in `lidarspec.open`; by default detected for each file.
         every_point: include points without a valid return.
         select: as in `convert`.
-        size: bytes of a piece; its points take about ten times as many.
+        size: size of a piece in bytes. Its points take about ten times as much memory.
 
     Raises:
         SourceError: if a file does not exist.

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 from lidarspec.errors import SpecError
 
-#: the group of modules with hooks, which are loaded before any sensor is handed out.
+#: The group of modules with hooks, which are loaded before any sensor is returned.
 GROUP = "lidarspec"
 SENSORS = "lidarspec.sensors"
 VERBS = "lidarspec.verbs"
-#: the group of the module that serves the page of `lidarspec view --web`.
+#: The group of the module that serves the page of `lidarspec view --web`.
 PAGE = "lidarspec.page"
 _FOLDERS = (".dist-info", ".egg-info")
 
@@ -37,7 +37,7 @@ class EntryPoint(NamedTuple):
     Attributes:
         name: its name.
         value: "module" or "module:object".
-        distribution, version: of the distribution, "?" if unknown.
+        distribution, version: name and version of the distribution; "?" if unknown.
     """
 
     name: str
@@ -67,7 +67,7 @@ class EntryPoint(NamedTuple):
 def entry_points(group: str) -> list[EntryPoint]:
     """Return every entry point of a group, sorted by name and value.
 
-    If several distributions have one name, the first on `sys.path` counts.
+    If several distributions have the same name, the first on `sys.path` is used.
     """
     try:
         entries = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
@@ -77,7 +77,7 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def _distributions() -> Iterator[str]:
-    """Yield the folders that describe installed distributions, the first of each name."""
+    """Yield the metadata folder of each installed distribution, one for each name."""
     if any(
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path
@@ -113,8 +113,8 @@ def _list_names(path: str) -> list[str]:
 def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group that one distribution declares.
 
-    If the file is not UTF-8, an entry without a module is yielded first for the group of modules;
-    its `load` raises the error.
+    If its file is not UTF-8 and the group is `GROUP`, the first entry has no module, and its `load`
+    raises the error.
     """
     text = _text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP

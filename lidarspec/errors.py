@@ -1,9 +1,10 @@
-"""Exceptions, by fault.
+"""The exceptions of lidarspec: one class for each party that may be at fault.
 
-``SpecError`` is the fault of a plugin's author, ``WireError`` of the bytes, ``UsageError`` of the
-caller, ``SourceError`` of the system, ``CommandError`` of the device. Noise on a stream is not an
-error: decoders count it. Each exception builds its message from typed arguments, so that programs
-can read the details from its attributes.
+``SpecError`` means a mistake of a plugin's author, ``WireError`` bytes that are not the expected
+frame, ``UsageError`` a mistake of the caller, ``SourceError`` a failure of the system,
+``CommandError`` a failure of the device. Noise in a stream is not an error: decoders count it. Each
+exception builds its message from typed arguments, so that programs can read the details from its
+attributes.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from typing import Any, TypeVar
 
 
 class LidarSpecError(Exception):
-    """The base of every exception that lidarspec raises on purpose.
+    """The base class of all exceptions of lidarspec.
 
-    Any other exception is a bug.
+    If lidarspec raises any other exception, that is a bug.
     """
 
 
@@ -27,10 +28,11 @@ class SpecError(LidarSpecError):
     """A sensor's description is wrong: the fault of the plugin's author.
 
     Attributes:
-        path: field path or name of the part of the spec, "" for the whole.
+        path: field path, or name of the part of the spec; "" if the error concerns the whole spec.
         reason: the fault.
-        sensor: the id, "" if unknown.
-        rule: the code under which `lidarspec check` explains it, "" if there is none.
+        sensor: the id; "" if unknown.
+        rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
+            none.
     """
 
     def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
@@ -41,23 +43,23 @@ class SpecError(LidarSpecError):
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 
-#: packages that a plugin calls; their lines are not the plugin's.
+#: Packages that a plugin calls. The line at fault is never in them.
 _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
-    """Return the error for an expression or a checksum of a struct that raised."""
+    """Return the error for an exception of an expression or checksum in a struct."""
     reason = f"an expression of the struct raised {type(error).__name__}: {error}"
     return SpecError(reason, path=path, sensor=sensor, rule="LS115")
 
 
 class PluginError(SpecError):
-    """A function of a plugin raised, or returned an unusable value.
+    """A function of a plugin raised an exception, or returned an unusable value.
 
-    In streams, such errors are counted.
+    In streams, such errors are counted instead of raised.
 
     Attributes:
-        file, line: the place in the plugin, "" and 0 if unknown.
+        file, line: the location in the plugin; "" and 0 if unknown.
         traceback: the traceback as text.
     """
 
@@ -90,7 +92,7 @@ class PluginError(SpecError):
 
         Args:
             what: a description of the function, such as "points of data".
-            function: the function; its first line is the place if no code of the plugin was
+            function: the function. Its first line is the location if no code of the plugin was
                 running.
         """
         from traceback import format_exception  # only needed after a failure
@@ -102,12 +104,12 @@ class PluginError(SpecError):
         if not file and code is not None:
             file = code.co_filename
             line = code.co_firstlineno
-        place = f" ({shown_path(file)}:{line})" if file else ""
+        location = f" ({shown_path(file)}:{line})" if file else ""
         if type(error) is SpecError:
             kind = ""
         else:
             kind = f"{type(error).__name__}: "
-        reason = f"{kind}{' '.join(str(error).split())}{place}"
+        reason = f"{kind}{' '.join(str(error).split())}{location}"
         text = "".join(format_exception(error))
         return cls(
             reason,
@@ -121,34 +123,39 @@ class PluginError(SpecError):
 
 
 def printable(text: str) -> str:
-    """Return text with escaped control characters (`\\x1b`), except ends of lines.
+    """Return text with escaped control characters such as `\\x1b`.
 
-    These are all characters that control a terminal or change the direction of writing.
+    Line ends and tabs are kept. Control characters are all characters that control a terminal or
+    change the direction of writing.
     """
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     from unicodedata import category
 
-    # control, format and half characters; separators of lines and paragraphs
+    # control, format and surrogate characters; separators of lines and paragraphs
     steering = {
         character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
     } - {"\n", "\t"}
     return text.translate(
-        {ord(one): one.encode("unicode_escape").decode("ascii") for one in steering}
+        {
+            ord(character): character.encode("unicode_escape").decode("ascii")
+            for character in steering
+        }
     )
 
 
 def shown_path(file: str) -> str:
-    """Return a path below the working directory relative to it, others unchanged."""
+    """Return a path relative to the working directory if it is below, else unchanged."""
     if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
         return os.path.relpath(file)
     return file
 
 
 def raised_at(error: BaseException) -> tuple[str, int]:
-    """Return file and line of the plugin's code that raised.
+    """Return file and line of the plugin's code that raised an exception.
 
-    That is the innermost frame that is neither ours nor a library's; "" and 0 if there is none.
+    This is the innermost frame of the traceback outside lidarspec and libraries. Returns "" and 0
+    if there is none.
     """
     from traceback import extract_tb
 
@@ -179,10 +186,10 @@ class WireError(LidarSpecError):
     """Bytes that are not the expected frame.
 
     Attributes:
-        sensor, frame: ids, "" if unknown.
-        kind: kind of the fault, such as "checksum" or "trailing bytes"; "" if it has no name.
+        sensor, frame: the id of the sensor and the name of the frame type; "" if unknown.
+        kind: the kind of fault, such as "checksum" or "trailing bytes"; "" for other kinds.
         offset: byte offset of the fault in the data.
-        path: field path with array indices, "" for the whole frame.
+        path: field path with array indices; "" if the fault concerns the whole frame.
         expected, got: the expected and the actual value.
         data: the bytes.
     """
@@ -219,7 +226,7 @@ class WireError(LidarSpecError):
 
 
 class UsageError(LidarSpecError):
-    """An invalid call: the caller's fault."""
+    """The caller has made a mistake, such as an invalid argument."""
 
 
 class LibraryError(UsageError):
@@ -228,8 +235,8 @@ class LibraryError(UsageError):
     Attributes:
         distribution: name of the library on the package index.
         extra: the extra of lidarspec that installs it.
-        least_version: the least version needed, "" if any will do.
-        installed_version: the version found, "" if it is missing.
+        least_version: the oldest version that can be used; "" if any version can be used.
+        installed_version: the installed version; "" if the library is missing.
     """
 
     def __init__(
@@ -257,7 +264,7 @@ class LibraryError(UsageError):
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
 
-#: maximum number of suggested names that contain the typed one.
+#: Maximum number of suggested names that contain the typed name.
 SUGGESTED = 6
 
 
@@ -269,15 +276,15 @@ def did_you_mean(
     aliases: Mapping[str, str] = MappingProxyType({}),
     max_parts: int = SUGGESTED,
 ) -> str:
-    """Return a clause such as ``; did you mean 'speed'?``, or "" without a close name.
+    """Return a clause such as ``; did you mean 'speed'?``; "" if no name is similar.
 
-    Names that contain this one have priority over similar names.
+    Names that contain the unknown name have priority over similar names.
 
     Args:
         name: the unknown name.
         known: the valid names.
-        alike: the minimum share of common letters, from 0 to 1.
-        aliases: alias -> the name to suggest in its place.
+        alike: minimum share of letters that both names have in common, from 0 to 1.
+        aliases: alias -> the name to suggest instead of it.
         max_parts: the maximum number of suggested names that contain `name`.
     """
     import difflib  # imported here because suggestions are rare
@@ -297,7 +304,7 @@ def did_you_mean(
 
 
 def format_names(names: Sequence[str]) -> str:
-    """Return names as text: 'a', 'b' or 'c'."""
+    """Return names as a text such as "'a', 'b' or 'c'"."""
     *others, last = map(repr, names)
     if others:
         return f"{', '.join(others)} or {last}"
@@ -309,20 +316,20 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """Add the next command to type as a note; keep an existing one."""
+    """Add a note to an error with the command to type next, unless it has one."""
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error
 
 
 def suggestion(error: BaseException) -> str:
-    """Return the next command to type of an error, "" if it has none."""
+    """Return the command that an error suggests to type next; "" if there is none."""
     notes: Sequence[str] = getattr(error, "__notes__", ())
     return next((note.removeprefix(_NEXT) for note in notes if note.startswith(_NEXT)), "")
 
 
 def refuse_text(data: object) -> None:
-    """Raise UsageError for a text or a path in place of bytes."""
+    """Raise UsageError if the argument is a text or a path instead of bytes."""
     if isinstance(data, str | os.PathLike):
         raise UsageError(
             f"expected bytes, got {type(data).__name__}: use bytes.fromhex(...) for"
@@ -331,12 +338,12 @@ def refuse_text(data: object) -> None:
 
 
 class UnknownName(UsageError):
-    """An unknown name; the message suggests the closest known one, or lists all.
+    """An unknown name; the message suggests similar names, or lists all names.
 
     Attributes:
-        alike: the minimum share of letters that a suggested name has in common with it.
-        max_parts: the maximum number of suggested names that contain it.
-        max_listed: the maximum number of names to list if none is suggested.
+        alike: minimum share of letters that a suggested name has in common with it.
+        max_parts: maximum number of suggested names that contain it.
+        max_listed: maximum number of names that are listed if none is suggested.
     """
 
     what = "name"
@@ -372,9 +379,9 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has it, if that is known and is not installed or failed
-            to load, else "".
-        failure: why the installed distribution failed to load, else "".
+        distribution: the distribution that has the sensor, if it is known, and is not installed or
+            failed to load; otherwise "".
+        failure: the reason why the installed distribution failed to load; otherwise "".
     """
 
     what = "sensor"
@@ -437,7 +444,7 @@ class UnknownFormat(UnknownName):
 
 
 class MissingField(UsageError):
-    """A value is missing that only the caller can supply when a frame is built."""
+    """A value is missing that the caller must supply to build a frame."""
 
     def __init__(self, path: str, *, place: str = "") -> None:
         self.path = path
@@ -468,18 +475,18 @@ class OutOfRange(UsageError):
 
 
 class SourceError(LidarSpecError):
-    """A port, socket or file cannot be opened, read or written: the system's fault."""
+    """A port, socket or file cannot be opened, read or written."""
 
 
 class SourceTimeout(SourceError, TimeoutError):
-    """A source sent no data, or accepted none, in time."""
+    """A source sent or accepted no data before a timeout."""
 
 
 class WriteError(SourceError):
-    """A recording cannot be written any further.
+    """Writing a recording has failed; it ends here.
 
     Attributes:
-        reason: the reason without the path.
+        reason: the reason, without the path.
     """
 
     def __init__(self, path: str, reason: str, state: str) -> None:
@@ -488,32 +495,32 @@ class WriteError(SourceError):
 
 
 class CommandError(LidarSpecError):
-    """The device refused a command, or answered with something else."""
+    """The device rejected a command, or sent a reply that does not match."""
 
 
 class ReplyTimeout(CommandError, TimeoutError):
-    """The device did not reply to a command in time."""
+    """The device did not reply to a command before the timeout."""
 
 
 @contextmanager
 def system_errors(place: object) -> Iterator[None]:
-    """Convert OSError to `SourceError` with a place, such as a path.
+    """Convert OSError to a `SourceError` that names a place, such as a path.
 
     Raises:
-        SourceError: also for an invalid path.
+        SourceError: for an OSError, and for an invalid path.
     """
     if "\0" in str(place):
         raise SourceError(f"{str(place)!r}: a path must not contain a zero byte")
     try:
         yield
-    except LidarSpecError:  # a timeout is an OSError too
+    except LidarSpecError:  # such as a SourceTimeout, which is also an OSError
         raise
     except OSError as error:
         raise SourceError(f"{place}: {failure_reason(place, error)}") from None
 
 
 def failure_reason(place: object, error: OSError) -> str:
-    """Return the reason why the system refused a path, such as a missing folder."""
+    """Return the reason of the system's error for a path, such as a missing folder."""
     folder = os.path.dirname(str(place))
     if isinstance(error, FileNotFoundError) and folder and not os.path.isdir(folder):
         return f"folder {folder} does not exist"

@@ -3,8 +3,8 @@
 `known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in
 the core that names sensors. It serves two purposes: messages can name the distribution of a sensor
 that is not installed, and installed sensors can be listed without loading their plugins. A row
-describes one version of a distribution; `plugins` uses it only if that version is installed and its
-entry points have the same names as the row.
+describes a sensor in one version of its distribution. `plugins` uses the row only if that version
+is installed and its entry points have the same names as the row.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor, suggest
 
-#: placeholder for the vendor's distribution in an install command.
+#: Placeholder for a distribution in an install command.
 ANY_DISTRIBUTION = "lidarspec-VENDOR"
 _REPOSITORY = "https://github.com/lidarspec/lidarspec"
 _PREFIX = "lidarspec-"
@@ -29,7 +29,7 @@ class KnownLink(NamedTuple):
 
     Attributes:
         kind: "serial", "udp", "tcp" or another kind.
-        numbers: baud rates or ports, the most likely first.
+        numbers: its baud rates or ports, the likeliest first.
     """
 
     kind: str
@@ -121,8 +121,8 @@ def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
 def list_described_sensors() -> list[KnownSensor] | None:
     """Return a row for each installed sensor, sorted by id; None if rows are missing.
 
-    Then plugins must be loaded: a plugin has hooks, belongs to another project, or has a name that
-    another plugin has, too.
+    Rows are missing if a plugin has hooks, belongs to another project, or has the same name as
+    another plugin. Then the plugins must be loaded.
     """
     if entry_points(GROUP):
         return None
@@ -135,7 +135,11 @@ def list_described_sensors() -> list[KnownSensor] | None:
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
-    """Return the row with an id or alias in any case, with or without hyphens, or None."""
+    """Return the row of a sensor; None if there is none.
+
+    Args:
+        name: an id or alias, in upper or lower case, with or without hyphens.
+    """
     letters = _letters(name)
     return next(
         (row for row in known_sensors() if any(_letters(known) == letters for known in row.names)),
@@ -150,8 +154,8 @@ def _letters(name: str) -> str:
 def install_command(*distributions: str, extra: str = "") -> str:
     """Return the command that installs distributions of this project.
 
-    No package index has them yet. If lidarspec runs from a checkout, the command names its folders,
-    otherwise the repository.
+    The distributions are not on a package index yet. If lidarspec runs from a checkout, the command
+    names folders of the checkout, otherwise the repository.
     """
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
@@ -186,13 +190,14 @@ def unknown_sensor_error(
     aliases: Mapping[str, str],
     failures: Mapping[str, str],
 ) -> UnknownSensor:
-    """Return the error for an unknown sensor, with its install command if it is known.
+    """Return the error for an unknown sensor; it has the install command if known.
 
     Args:
         name: an id or alias.
         installed: the ids of the installed sensors.
-        aliases: other names of the installed sensors, by alias.
-        failures: reasons why plugins of unknown content failed to load, by distribution.
+        aliases: alias -> id of an installed sensor.
+        failures: distribution -> the reason why its plugin failed to load, if its sensors are
+            unknown.
     """
     row = find_known_sensor(name)
     if row is not None:

@@ -1,6 +1,6 @@
 """Leap seconds: the offsets of TAI and GPS time from UTC.
 
-TAI and GPS time count every second; UTC falls behind them by one second at each leap second. GPS
+TAI and GPS time count all seconds; at each leap second, UTC falls behind them by one second. GPS
 time is always 19 s behind TAI. The dates are in a table of the operating system or of the package
 tzdata, in one of two formats: `leapseconds` (the time zone compiler's) and `leap-seconds.list`
 (NTP's). The table with the latest expiry date is used. Without a table, the offsets since 2017

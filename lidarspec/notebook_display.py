@@ -1,7 +1,7 @@
 """The methods with which notebooks display values.
 
-IPython calls a method of the value, and the method calls a function of `lidarspec.view.notebook`.
-That module depends on all values, so it is only imported when a value is displayed.
+IPython calls a method of the value, which calls a function of `lidarspec.view.notebook`. That
+module imports the classes of all values, so it is only imported when a value is displayed.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-#: the module with a function for each kind of value.
+#: The module with a function for each kind of value.
 DRAWING = "lidarspec.view.notebook"
 
 
 def make_display_method(kind: str) -> Callable[[Any], str | None]:
-    """Return a method that displays a value with the function of this name.
+    """Return a method that displays a value by the function `kind` of `DRAWING`.
 
-    The method returns None if the value is displayed as text.
+    The method returns HTML, or None if the value is to be displayed as text.
     """
 
     def representation(value: Any) -> str | None:

@@ -1,7 +1,8 @@
-"""Optional libraries: the least version of each, and the extra of lidarspec that installs it.
+"""Optional libraries: the oldest usable version of each, and the extra with it.
 
-`import_library` is the one way to import an optional library. It compares the installed version
-with `EXTRAS` first, because an old version may import and then fail on a missing name.
+An extra is a set of libraries that `pip install lidarspec[EXTRA]` installs. All optional libraries
+are imported by `import_library`. It first compares the installed version with `EXTRAS`, because the
+import of an old version may succeed, and fail later for lack of a name.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from lidarspec.errors import LibraryError
 
 
 class Requirement(NamedTuple):
-    """A distribution and the least version of it that lidarspec works with."""
+    """A distribution, and the oldest version of it that lidarspec works with."""
 
     distribution: str
     least_version: str
 
 
-#: extra -> module -> requirement; pyproject.toml declares the same, and a test compares both.
+#: Extra -> module -> requirement. pyproject.toml declares the same, and a test compares both.
 EXTRAS: dict[str, dict[str, Requirement]] = {
     "arrow": {"pyarrow": Requirement("pyarrow", "14.0")},
     "dask": {"dask": Requirement("dask", "2024.8")},
@@ -56,10 +57,10 @@ EXTRAS: dict[str, dict[str, Requirement]] = {
 
 
 def import_library(module: str, extra: str) -> Any:
-    """Return a module of an optional library.
+    """Import and return a module of an optional library.
 
     Args:
-        module: dotted name, such as "rosbags.typesys".
+        module: its full name, such as "rosbags.typesys".
         extra: the extra that installs the library, a key of `EXTRAS`.
 
     Raises:
@@ -86,10 +87,10 @@ def import_library(module: str, extra: str) -> Any:
 
 
 def find_requirement(module: str, extra: str) -> Requirement | None:
-    """Return the requirement of a module's library, None if `EXTRAS` has no entry for it.
+    """Return the requirement of a module's library; None if `EXTRAS` does not have it.
 
-    The standard library, such as `compression.zstd`, has no entry; neither has a library that
-    another one requires, such as `distributed`.
+    Modules of the standard library, such as `compression.zstd`, are not in `EXTRAS`, nor are
+    libraries that another library requires, such as `distributed`.
     """
     for name, requirement in EXTRAS[extra].items():
         if module == name or module.startswith(f"{name}."):

@@ -1,14 +1,15 @@
-"""Plugins: the hooks that they can implement, and the registry of installed ones.
+"""Plugins: their hooks, and the registry of installed plugins.
 
-A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry for
-each id and alias, so that a request for one sensor loads one plugin. The registry reads the aliases
-of a sensor from there. Modules with other hooks are in the group ``lidarspec`` and are loaded
+    A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry
+    for each id and alias, so that a request for one sensor loads only one plugin. The registry
+    reads the aliases of a sensor from these entries. Modules with other hooks are in the group
+    ``lidarspec`` and are loaded
 before any sensor is returned. A hook is a function with one of the names below, marked with
 ``@hookimpl``.
 
-Each plugin is loaded on its own. If one cannot be imported, names an unknown hook or adds an
-invalid sensor, it is reported with its distribution and its error, and rolled back; the others are
-not affected.
+Each plugin is loaded separately. If a plugin cannot be imported, has an unknown hook or adds an
+invalid sensor, none of its hooks and sensors are used, and it is reported with its distribution and
+error. Other plugins are not affected.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
     """Return the checksum algorithm of a frame type; None keeps the declared one.
 
-    A hook replaces the algorithm, but never the field or the covered bytes.
+    The field that stores the checksum and the covered bytes do not change.
     """
 
 
@@ -94,7 +95,7 @@ def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
     """Return the points of a batch of packets; None calls the sensor's own function.
 
-    For example, a hook can apply the calibration of a site.
+    A hook can, for example, apply a calibration.
     """
 
 
@@ -103,7 +104,7 @@ def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
     """Return a transport for a URL scheme that the package does not support, or None.
 
     Args:
-        url: the SOURCE.
+        url: the source as the user typed it.
         sensor: the sensor that sends; None if unknown.
     """
 
@@ -115,7 +116,7 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
     It is called for kinds of links that the package does not support.
 
     Args:
-        source: the SOURCE of the data.
+        source: the source of the data.
         link: the declared link.
         host: the address of the sensor; None if unknown.
     """
@@ -159,16 +160,16 @@ def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """Return the file formats that the plugin adds."""
 
 
-#: how long a plugin loads before this is reported.
+#: Seconds after which a plugin that is still loading is reported.
 LOAD_WARNING_S = 5.0
-#: how long a plugin loads before it counts as hanging.
+#: Seconds after which a plugin that is still loading counts as hanging.
 LOAD_TIMEOUT_S = 10.0
-#: the reason by module, for modules whose import hangs.
+#: Module whose import hangs -> the reason.
 _hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
 
-#: the distribution and module of a sensor.
+#: The distribution and module of a plugin.
 Home = tuple[str, str]
 
 
@@ -192,12 +193,13 @@ class Plugin:
     """An installed plugin.
 
     Attributes:
-        distribution, version, entry_point: its origin.
+        distribution, version, entry_point: where it is declared.
         sensors: the ids that it adds.
-        error: the reason why it, or one of its ids, is not available; "" without an error.
-        rule: the code under which `lidarspec check` explains the error, "" if there is none.
+        error: the reason why the plugin or one of its ids is not available; "" if all are.
+        rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
+            none.
         traceback: the traceback of the error.
-        remark: side effects of loading it.
+        remark: a description of side effects of loading it, such as printed text.
     """
 
     distribution: str
@@ -220,21 +222,22 @@ class Plugin:
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Several plugins may claim one name, an id or an alias. An entry point with this name, or a
-    module that is always loaded, has priority over a sensor that only declares the name.
-    Among several distributions the owner gets the name: the distribution in the user's own
-    settings, or `lidarspec-VENDOR` for ids that begin with this vendor and for the aliases of these
-    sensors. Among two modules of one distribution, the first gets it. A request for a name without
-    an owner is an error. A plugin that loses a name keeps its other names.
+    Several plugins may claim the same name (an id or an alias). Claims by an entry point with this
+    name, or by a module that is always loaded, have priority over claims by a sensor that only
+    declares the name. If several distributions remain, the name belongs to its owner: the
+    distribution that the user's own settings name, or `lidarspec-VENDOR` for ids that begin with
+    this vendor and for the aliases of these sensors. If one distribution has two modules with the
+    name, it belongs to the first. A request for a name without an owner is an error. A plugin that
+    loses a name keeps its other names.
 
-    Two threads may load the same sensor at the same time: it is then added twice, with the same
-    result.
+    If two threads load the same sensor at the same time, it is added twice, with the same result.
 
     Args:
-        modules: entry points of modules with hooks; each is loaded at once.
-        offered: entry points of sensors, by id and alias; each is loaded on request.
-        owners: returns the distributions that the user names as owners, by id; called if several
-            claim a name.
+        modules: entry points of modules with hooks, which are loaded immediately.
+        offered: entry points of sensors, which are loaded on request; each is named by an id or
+            alias.
+        owners: returns the distributions that the user names as owners, by id. It is called if
+            several distributions claim a name.
     """
 
     def __init__(
@@ -263,13 +266,13 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All installed plugins, with the errors of those that failed or lost a name."""
+        """All installed plugins; those that failed or lost a name have an error."""
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._judge(plugin) for plugin in (*self._modules, *offered)]
 
     def _judge(self, plugin: Plugin) -> Plugin:
-        """Return a plugin with the ids that it owns, and an error for a name that it lost."""
+        """Return a plugin with only the ids that it owns, and an error if it lost a name."""
         home = plugin.home
         own = sorted(name for name in self._sensors.get(home, {}) if self._holder(name) == home)
         lost = [
@@ -295,8 +298,8 @@ class Registry:
         """Register a module or object with hooks, and return the ids that it adds.
 
         Raises:
-            SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is
-                registered then.
+            SpecError: for an unknown hook, a wrong signature, or an invalid sensor. Then nothing is
+                registered.
         """
         _check_hooks(plugin, name)
         try:
@@ -368,7 +371,7 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _holder(self, name: str) -> Home | None:
-        """Return the plugin that owns a name; None without a claim or an owner."""
+        """Return the plugin that owns a name; None if no plugin claims or owns it."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normalise_name(home[0]): home for home in reversed(homes)}
@@ -377,7 +380,7 @@ class Registry:
         alike = {home: self._find_same_names(home, name) for home in first.values()}
         named = self._named_owners()
         wanted = {
-            home: {normalise_name(named[one]) for one in names if one in named}
+            home: {normalise_name(named[other]) for other in names if other in named}
             for home, names in alike.items()
         }
         chosen = [home for home in alike if normalise_name(home[0]) in wanted[home]]
@@ -389,22 +392,22 @@ class Registry:
         return None
 
     def _find_same_names(self, home: Home, name: str) -> set[str]:
-        """Return all names of a plugin's sensor with this name.
+        """Return all names of the sensor of a plugin that has this name.
 
-        Before it is loaded, these are the names of its entry points.
+        If the sensor is not loaded, these are the names of its entry points.
         """
         entries = self._offered.get(home, [])
         values = {entry.value for entry in entries if entry.name == name}
-        loaded = [{one.id, *one.aliases} for one in self._sensors.get(home, {}).values()]
+        loaded = [{sensor.id, *sensor.aliases} for sensor in self._sensors.get(home, {}).values()]
         return {entry.name for entry in entries if entry.value in values}.union(
             *(names for names in loaded if name in names)
         )
 
     def _find(self, name: str) -> Sensor | None:
-        """Return the sensor with a name; None if there is none or it does not load.
+        """Return the sensor with a name; None if it does not exist or cannot be loaded.
 
         Raises:
-            UsageError: if several distributions claim it, and none owns it.
+            UsageError: if several distributions claim the name, and none owns it.
         """
         home = self._holder(name)
         if home is None:
@@ -425,11 +428,11 @@ class Registry:
         )
 
     def _loaded_sensors(self) -> dict[str, Sensor]:
-        """Return the loaded sensors by id, without ids that another plugin claimed."""
+        """Return the loaded sensors by id, without ids that belong to another plugin."""
         return {
-            name: one
+            name: sensor
             for home, own in self._sensors.items()
-            for name, one in own.items()
+            for name, sensor in own.items()
             if self._holder(name) == home
         }
 
@@ -456,14 +459,14 @@ class Registry:
     def sensors(self) -> dict[str, Sensor]:
         """Return every sensor by id, sorted, with its hooks applied.
 
-        Sensors with a claimed id that has no owner are left out.
+        Sensors are omitted if several distributions claim their id and none owns it.
         """
         self._load_all()
         return {name: self.sensor(name) for name in sorted(self._loaded_sensors())}
 
     @property
     def failures(self) -> list[Plugin]:
-        """The plugins loaded so far that failed, or lost a name to another."""
+        """The plugins loaded so far that failed, or lost a name to another plugin."""
         offered = [
             self._load_module([entry for entry in entries if entry in self._tried])
             for entries in self._offered.values()
@@ -506,7 +509,7 @@ class Registry:
     def sensor(self, name: str) -> Sensor:
         """Return a sensor by id or alias, with its hooks applied.
 
-        Upper case and other separators are accepted too.
+        Upper case, other separators and missing separators are also accepted.
 
         Raises:
             UnknownSensor: with a suggestion, or with the packages to install if no sensor is
@@ -524,15 +527,15 @@ class Registry:
             plugin_sensor = self._find(name)
         if plugin_sensor is not None and plugin_sensor.id != name:
             own = plugin_sensor
-            name = plugin_sensor.id  # the owner of an id owns its aliases too
+            name = plugin_sensor.id  # the owner of an id also owns the aliases
             plugin_sensor = self._find(name)
             if plugin_sensor is None or plugin_sensor.id != own.id:
                 plugin_sensor = None
         if plugin_sensor is None:
-            known = self._loaded_sensors()
-            aliases = {alias: one.id for one in known.values() for alias in one.aliases}
+            loaded = self._loaded_sensors()
+            aliases = {alias: other.id for other in loaded.values() for alias in other.aliases}
             raise self._load_error(name) or unknown_sensor_error(
-                name, known, aliases, self._failed_modules()
+                name, loaded, aliases, self._failed_modules()
             )
         if name not in self._ready:
             # another thread may have stored it first
@@ -540,7 +543,7 @@ class Registry:
         return self._ready[name]
 
     def _load_error(self, name: str) -> UnknownSensor | None:
-        """Return the error for a sensor with an entry point that failed to load, else None."""
+        """Return the error for a sensor whose entry point failed to load; otherwise None."""
         for entry, plugin in self._tried.items():
             if entry.name == name and plugin.error:
                 error = UnknownSensor(name, distribution=plugin.distribution, failure=plugin.error)
@@ -548,9 +551,9 @@ class Registry:
         return None
 
     def _failed_modules(self) -> dict[str, str]:
-        """Return the errors of modules with hooks that failed to load, by distribution.
+        """Return distribution -> error of the modules with hooks that failed to load.
 
-        Their sensors are unknown.
+        It is not known which sensors such a module would have added.
         """
         return {
             plugin.distribution: plugin.error
@@ -582,7 +585,7 @@ class Registry:
     def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
         """Return a frame with the checksum of the first hook that returns a checksum.
 
-        If a hook raises, the error is recorded and the next hook is called.
+        If a hook raises an exception, the error is recorded and the next hook is called.
         """
         arguments = {"sensor": sensor, "frame": frame}
         for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
@@ -619,7 +622,7 @@ class Registry:
 
 
 def make_row(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
-    """Return the row of a sensor, without its signatures."""
+    """Return a row of the table of known sensors for a sensor, without signatures."""
     return KnownSensor(
         sensor.id,
         sensor.vendor,
@@ -649,7 +652,7 @@ def _summarize_link(link: Link) -> KnownLink:
 
 
 def _list_port(port: int) -> tuple[int, ...]:
-    """Return a port; nothing for 0."""
+    """Return a tuple with the port; an empty tuple for port 0, which means any port."""
     return (port,) if port else ()
 
 
@@ -664,9 +667,9 @@ def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
 
 
 def named_owners() -> dict[str, str]:
-    """Return the owners of ids, as distributions, from the user's own settings.
+    """Return id -> the distribution that owns it, from the user's own settings.
 
-    Invalid settings are reported in a warning.
+    Invalid settings cause a Python warning.
     """
     file = own_settings()
     try:
@@ -689,7 +692,7 @@ def named_owners() -> dict[str, str]:
 def _import_in_time(entry: EntryPoint) -> Any:
     """Import an entry point, and return its module or object.
 
-    If the import hangs, this is reported, and its thread keeps running.
+    If the import hangs, its thread keeps running.
 
     Raises:
         SpecError: if the import hangs.
@@ -719,7 +722,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
         thread.join(max(LOAD_TIMEOUT_S - LOAD_WARNING_S, 0))
     if not outcome:
         _hanging[entry.module] = (
-            f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s{_describe_place(thread)}"
+            f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s{_describe_location(thread)}"
         )
         warnings.warn(
             f"{entry.distribution}: {_hanging[entry.module]}; the plugin is ignored",
@@ -732,8 +735,8 @@ def _import_in_time(entry: EntryPoint) -> Any:
     return loaded
 
 
-def _describe_place(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER" for the module that a thread imports, or ""."""
+def _describe_location(thread: threading.Thread) -> str:
+    """Return " at FILE, line NUMBER" of the module that a thread is importing, or ""."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -744,7 +747,7 @@ def _describe_place(thread: threading.Thread) -> str:
 def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """Load and register an entry point; return the resulting plugin.
 
-    An exception is stored in the plugin, so that it does not affect other plugins.
+    If loading fails, the plugin has the error, and other plugins are not affected.
     """
     plugin = Plugin(entry.distribution, entry.version, f"{names} = {entry.value}")
     try:
@@ -797,7 +800,7 @@ def _check_hooks(plugin: Any, name: str) -> None:
             raise SpecError(f"{attribute} lacks @hookimpl", path=name, rule="LS003")
 
 
-#: the registry of this environment after its first use, and substitutes for it.
+#: The registry of this environment, if it has been used, and the registries that replace it.
 _registries: list[Registry] = []
 
 
@@ -809,9 +812,9 @@ def registry() -> Registry:
 
 
 def try_plugins() -> list[Plugin]:
-    """Load each plugin in another process, then here, and return all plugins.
+    """Load each plugin in another process, then in this process; return all plugins.
 
-    Plugins that hang or end that process are not loaded in this one.
+    Plugins that hang or end the other process are not loaded in this process.
     """
     if len(_registries) > 1:  # a substitute is active
         return registry().plugins
@@ -849,7 +852,8 @@ def _modules() -> list[EntryPoint]:
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
     """Return the result of `_trial` for each plugin.
 
-    One process loads all plugins. If there is any problem, each plugin gets its own process.
+    First, one process loads all plugins. If there is a problem, each plugin is loaded in a process
+    of its own.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -861,7 +865,7 @@ def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
 
 
 def _trial(*homes: Home) -> tuple[str, str]:
-    """Load plugins in another process, and return the error and the side effects."""
+    """Load plugins in another process; return their error and side effects, or ""."""
     import subprocess
 
     mark = f"{os.urandom(8).hex()}:"
@@ -899,9 +903,9 @@ def _trial(*homes: Home) -> tuple[str, str]:
 
 
 def load_alone() -> None:
-    """Load the plugins in the arguments, print the threads they left, and end.
+    """Load the plugins in `sys.argv`, print the threads that keep running, and exit.
 
-    `_trial` starts a process for this. A mark precedes the names of the threads in the output.
+    `_trial` runs this in a process. In the output, a marker precedes the names of the threads.
     """
     import faulthandler
 
@@ -927,8 +931,8 @@ def load_hooks(entry: EntryPoint) -> Registry:
         SpecError: if its plugin cannot be loaded.
     """
     hooks = Registry()
-    place = f"{entry.distribution}:{entry.module}"
-    loaded = _load_entry(entry, entry.name, functools.partial(hooks.add, name=place))
+    plugin_name = f"{entry.distribution}:{entry.module}"
+    loaded = _load_entry(entry, entry.name, functools.partial(hooks.add, name=plugin_name))
     if loaded.error:
         raise SpecError(loaded.error, path=entry.distribution)
     return hooks
@@ -964,10 +968,10 @@ def sensors() -> dict[str, Sensor]:
 
 
 def sensor(name: str | Path | Sensor) -> Sensor:
-    """Return one sensor, by id or alias, or from a file.
+    """Return a sensor, by id or alias, or from a file.
 
-    A file is "./mysensor.py", or "./mysensor.py:id" if it has several sensors. A `Sensor` is
-    returned unchanged.
+    A file is given as "./mysensor.py", or as "./mysensor.py:id" if it has several sensors. A
+    `Sensor` is returned unchanged.
 
     Raises:
         UnknownSensor: with a suggestion.
@@ -982,7 +986,7 @@ def sensor(name: str | Path | Sensor) -> Sensor:
 
 
 def is_file_name(text: str) -> bool:
-    """Return whether a sensor's name is a file, which would be executed, not an id."""
+    """Return whether a sensor's name is the name of a Python file, not an id."""
     return "/" in text or "\\" in text or text.endswith(".py")
 
 
@@ -1020,10 +1024,11 @@ def _from_file(text: str) -> Sensor:
 def import_file(file: Path) -> ModuleType:
     """Import a file as a module.
 
-    It gets a unique name in `sys.modules`, as dataclasses, pickle and typing require.
+    The module has a unique name in `sys.modules`, because dataclasses, pickle and typing need it.
 
     Raises:
-        SourceError, SpecError: if it is missing or cannot be imported.
+        SourceError: if the file is missing.
+            SpecError: if it cannot be imported.
     """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
@@ -1045,7 +1050,7 @@ def import_file(file: Path) -> ModuleType:
 
 @contextlib.contextmanager
 def _faults_of(file: Path) -> Iterator[None]:
-    """Convert exceptions of the code of a file to `SpecError` with its name."""
+    """Convert exceptions of the code in a file to `SpecError` with the file's name."""
     try:
         yield
     except LidarSpecError:
@@ -1055,7 +1060,7 @@ def _faults_of(file: Path) -> Iterator[None]:
 
 
 def rebuild_sensor(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-    """Return an installed sensor with options; used to unpickle one."""
+    """Return an installed sensor with options; pickle calls this to load a sensor."""
     installed = sensor(sensor_id)
     return installed.configure(**options) if options else installed
 

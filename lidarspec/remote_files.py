@@ -1,6 +1,6 @@
-"""Files in stores, such as s3://bucket/drives/a.pcap.
+"""Files in remote stores, such as s3://bucket/drives/a.pcap.
 
-fsspec opens them by URL. Paths of local files are accepted too.
+They are opened by the library fsspec. All functions also accept paths of local files.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, cast
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
 from lidarspec.optional_libraries import import_library
 
-#: scheme -> the library that fsspec requires for it; "" if it needs none.
+#: URL scheme -> the library that fsspec requires for it; "" if it needs none.
 DRIVERS = {
     **dict.fromkeys(("file", "ftp", "memory"), ""),
     **dict.fromkeys(("s3", "s3a"), "s3fs"),
@@ -31,7 +31,7 @@ DRIVERS = {
     "smb": "smbprotocol",
     "hdfs": "pyarrow",
 }
-#: number of bytes at the beginning and at the end that distinguish files of the same size.
+#: Number of bytes at the beginning and at the end of a file from which its hash is computed.
 DIGESTED_END_BYTES = 1 << 16
 
 
@@ -42,10 +42,10 @@ def is_remote(path: object) -> bool:
 
 
 def find_file_system(url: str) -> Any:
-    """Return the file system of fsspec for a URL.
+    """Return the fsspec file system of a URL.
 
     Raises:
-        UsageError: if fsspec, or its driver, is not installed.
+        UsageError: if fsspec, or the library for this scheme, is not installed.
         SourceError: if the store cannot be reached.
     """
     fsspec = import_library("fsspec", "fsspec")
@@ -63,7 +63,7 @@ def open_stored(path: str) -> BinaryIO:
 
     Raises:
         UsageError: if the library of a store is not installed.
-        SourceError: if it cannot be opened.
+        SourceError: if the file cannot be opened.
     """
     if not is_remote(path):
         with system_errors(path):
@@ -72,7 +72,9 @@ def open_stored(path: str) -> BinaryIO:
     with _failures(path):
         file: BinaryIO = system.open(path, "rb")
         if isinstance(file, io.BytesIO):
-            return io.BytesIO(file.getbuffer())  # all readers of one BytesIO share its offset
+            return io.BytesIO(
+                file.getbuffer()
+            )  # a copy, because all readers of one BytesIO would share its offset
         return file
 
 
@@ -80,7 +82,7 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
     """Return the files that match a path or URL with *, ? and **.
 
     Returns:
-        (path, path below the fixed part of the pattern) of each file.
+        (path, path relative to the part of the pattern without wildcards) of each file.
 
     Raises:
         SourceError: if there is none.
@@ -106,17 +108,17 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
 
 
 def files_in(folder: str) -> set[str]:
-    """Return the normalised paths of everything in a folder and below.
+    """Return the normalised paths of all files and folders below a folder.
 
-    Empty if there is no folder.
+    Returns an empty set if the folder does not exist.
 
     Raises:
         SourceError: if the store cannot be reached.
     """
     if not is_remote(folder):
         return {
-            normalise_path(Path(at, name))
-            for at, folders, files in os.walk(folder)
+            normalise_path(Path(parent, name))
+            for parent, folders, files in os.walk(folder)
             for name in (*folders, *files)
         }
     system = find_file_system(folder)
@@ -129,7 +131,7 @@ def files_in(folder: str) -> set[str]:
 def normalise_path(path: object) -> str:
     """Return a normalised path or URL for comparison.
 
-    memory:///a and memory://a are equal, as are ./a and a.
+    The results for memory:///a and memory://a are equal, as are those for ./a and a.
     """
     if is_remote(path):
         return str(path).partition("://")[2].lstrip("/")
@@ -137,9 +139,9 @@ def normalise_path(path: object) -> str:
 
 
 def read_stamp(path: str) -> dict[str, Any]:
-    """Return the `size` of a file and the time it was `modified`.
+    """Return the `size` of a file, and the time when it was `modified`.
 
-    In a store, the time may be the store's tag instead.
+    Some stores give a tag instead of the time.
 
     Raises:
         SourceError: if there is no such file.
@@ -171,7 +173,7 @@ def digest(path: str) -> str:
 
 
 def upload(local: Path, url: str) -> None:
-    """Copy a file or folder to a store; a file appears there as a whole.
+    """Copy a file or folder to a store; a file appears there only when complete.
 
     Raises:
         SourceError: if that fails.

@@ -1,8 +1,8 @@
 """The class `Sensor`: a sensor's description, with the engines as methods.
 
-The engines (`frames`, `framing`, `packets`, `scans`) are functions of a `SensorDescription`. This
-module stands above them and gives them the names of one class. Each method imports its engine on
-the first call, so listing and configuring sensors does not import any engine.
+The engines are the packages `frames`, `framing`, `packets` and `scans`, whose functions take a
+`SensorDescription`. `Sensor` has a method for each main function. The method imports its engine on
+the first call, so that no engine is imported to list or configure sensors.
 """
 
 from __future__ import annotations
@@ -26,54 +26,57 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
 class Sensor(SensorDescription):
-    """One sensor: the facts of its manual, and the engines as methods.
+    """A sensor: a description of its protocol, and methods to parse, build and decode.
 
     Args:
         id: vendor-model in lower case with hyphens; it never changes.
         vendor, model: names as the vendor writes them.
-        frames: every message type by name, in both directions. If several types fit at one
-            offset, the first one in this order is taken.
+        frames: all frame types by name, in both directions. If bytes match several types, the first
+            in this order is chosen.
         points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
             has a function of its own, or if the sensor has no points (no frame with ``data=True``).
         scan: the rule by which a scan ends and the next one begins; None without points.
-        links: the links by name. Data comes over "data", commands go over the link that they name.
+        links: the links by name. Data is received on the link "data"; each command names the link
+            on which it is sent.
         commands: the commands by name.
         clock: the sensor's clock, if it has one.
         sequence: the packet counter, if it has one.
         fillers: bytes that the sensor sends between frames; they are counted separately.
         state: default values for ``f.state``, by frame and field path, in the unit of the field.
         simulation: additional facts for a simulated sensor.
-        configure: a function of the sensor and its options, by name, that returns another sensor.
-            The annotations of its parameters say which values an option takes.
-        recognise: needed if data frames do not contain their own layout: a function of datagrams
-            that returns the options of `configure` which decode them, {} if the datagrams are not
-            from such a sensor.
-        on_open, on_close: names of the commands that are sent on opening and on closing.
-        range_limits: the shortest and the longest range that it can measure, metres; None without
-            points.
+        configure: a function of the sensor and its options (keyword arguments) that returns another
+            sensor. The annotations of its parameters are the possible values of the options.
+        recognise: a function that is needed if data frames do not contain their own layout. Its
+            argument is a list of datagrams; it returns the options of `configure` that decode them,
+            or {} if the datagrams are not from such a sensor.
+        on_open, on_close: names of the commands that are sent when a device is opened or closed.
+        range_limits: the shortest and the longest range in metres that the sensor can measure; None
+            without points.
         vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
             of forward, back, left, right, up and down.
-        beams: points of a scan, if their number is constant.
+        beams: number of points of a scan, if it is constant.
         returns: the names of the returns of a firing, by return index, if they are not in the
             order of their distance: "first", "last", "strongest", "second strongest", or "varying"
             if a setting of the sensor decides. `Selection` chooses by them.
-        turn: the slowest and the fastest number of scans a second.
+        turn: the lowest and the highest number of scans per second.
         relatives: ids of related models, installed or not, with the difference: a text if the pace
             of the clock or the model in `info` shows it, a `Relative` if single packets show it.
         info: fields with information about the device: name -> "frame.path", or a `Reported`. The
             names "serial", "firmware", "model" and "temperature" have a meaning for all sensors.
-        status: how it was verified: "manual", "vectors", "capture" or "hardware".
-        source: the manual with its revision and sections, and the captures.
+        status: how the description was verified: "manual", "vectors", "capture" or "hardware".
+        source: the manual with its revision and sections, and the captures, from which it was
+            written.
         aliases: other ids of the sensor. An installed plugin declares them as entry points, which
             are added here; give them if there are no entry points, such as in a script.
-        api: the version of this interface that it was written for.
+        api: the version of this interface that the description was written for.
         acknowledged: findings of `lidarspec check` about the sensor as a whole that are accepted:
             "LS401" -> the reason.
-        options: the options that it was configured with; not set by plugins.
-        hooked: applies the hooks of installed plugins to a sensor; not set by plugins.
+        options: the options that the sensor was configured with; plugins do not set it.
+        hooked: a function that applies the hooks of installed plugins; plugins do not set it.
 
     Raises:
-        SpecError: for an invalid id or status, or if a part refers to one that does not exist.
+        SpecError: for an invalid id or status, or if a part refers to another part that does not
+            exist.
     """
 
     _repr_html_ = make_display_method("sensor")
@@ -81,17 +84,17 @@ class Sensor(SensorDescription):
     def parse(
         self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False
     ) -> Any:
-        """Return exactly one frame as a construct Container of raw wire integers.
+        """Parse exactly one frame; return a construct Container of raw integers.
 
         Args:
-            frame: its type; identified if left out.
-            verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-            units: return physical values, as ``build(units=True)`` takes them: scaled fields in
-                their units, other fields as they are.
+            frame: the name of its type; by default it is identified.
+            verify: with False, wrong constants, a wrong checksum and trailing bytes are accepted.
+            units: return physical values, which ``build(units=True)`` accepts: scaled fields in
+                their units, other fields unchanged.
 
         Raises:
-            WireError: if the bytes are not such a frame; it has the sensor, the offset, the field
-                path and the expected and actual value.
+            WireError: if the bytes are not such a frame. The error has the sensor, the offset, the
+                field path, and the expected and actual value.
         """
         from lidarspec.frames.parse import parse
 
@@ -103,11 +106,11 @@ class Sensor(SensorDescription):
         """Return the bytes of one frame; constants, counts and checksum are filled in.
 
         Args:
-            value: a mapping of all fields, such as what `parse` returned; `values` override it.
-            units: take physical values, and round them to the steps of the wire.
+            value: a mapping of all fields, such as the result of `parse`. `values` override it.
+            units: whether values are physical; they are rounded to the nearest raw value.
 
         Raises:
-            UsageError: for a missing or unknown field, or a value that its field cannot hold.
+            UsageError: for a missing or unknown field, or a value that a field cannot hold.
         """
         from lidarspec.frames.build import build
 
@@ -127,7 +130,7 @@ class Sensor(SensorDescription):
         """Return the bytes of a command.
 
         Args:
-            arguments: by name, in the unit of the field.
+            arguments: name -> value, in the unit of its field.
 
         Raises:
             UnknownCommand: for a command that the sensor does not have.
@@ -138,11 +141,11 @@ class Sensor(SensorDescription):
         return build_command(self, name, arguments)
 
     def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
-        """Return a new incremental decoder without I/O, independent of all others.
+        """Return a new decoder, to which received bytes are fed as they arrive.
 
         Args:
-            stream: True reads a byte stream, False one datagram with each `feed`; by default the
-                data link decides.
+            stream: True if the bytes are a stream, False if each `feed` gets one datagram; the
+                default depends on the data link.
             backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
@@ -203,7 +206,7 @@ class Sensor(SensorDescription):
     def _decode(
         self, data: Any, frame: str | None, backend: str
     ) -> tuple[Packets, WaitingSamples | None]:
-        """Return the packets of a frame type, and the IMU samples if no type is named."""
+        """Return the packets of a frame type; if no type is named, also IMU samples."""
         from lidarspec.framing.decoder import decode_all, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 
@@ -223,14 +226,14 @@ class Sensor(SensorDescription):
     ) -> Iterator[Scan]:
         """Return an iterator over the scans; the first and last have ``complete=False``.
 
-        Issues a Python warning if the data has no data frame, or if `points` raises for some of
-        the packets.
+        A Python warning is issued if the data has no data frame, or if `points` raises an exception
+        for some packets.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
             backend: "auto", "numpy" or "jit"; the results are the same.
-            select: the scans to return, and the part of each.
+            select: the scans to return, and the part of each scan.
 
         Raises:
             UsageError: for a text or a path, an unknown back end, a sensor that has no frames
@@ -252,7 +255,7 @@ class Sensor(SensorDescription):
         return self._warn_after(ScanSelector(select, "the data").iter_selected(scans), packets)
 
     def _warn_after(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
-        """Yield the scans, then warn about errors of the plugin and scans without an end."""
+        """Yield the scans, then warn about errors of the plugin or scans without an end."""
         yield from scans
         if packets.stats.unended:
             warnings.warn(f"{self.id}: {packets.stats.unended}", stacklevel=2)

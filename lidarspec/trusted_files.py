@@ -1,8 +1,8 @@
-"""Decide which files are trusted, and restrict the content of all others.
+"""Decide which files are trusted, and read other files safely.
 
-Trusted are installed plugins, the user's own settings, and folders that the user has allowed. All
-other files are data: no code runs because a file names it, and paths in a file may only lead to
-files in its own folder.
+Installed plugins, the user's own settings, and folders that the user has allowed are trusted. All
+other files are data: they cannot cause code to run, and a path in such a file must lead to a file
+in the same folder or below.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from lidarspec.errors import UsageError, system_errors
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: maximum size of a file. JSON may contain frames; reading TOML takes more than linear
-#: time.
+#: Maximum size of a file in bytes. JSON files may contain frames and be large. The time for reading
+#: TOML grows faster than its size.
 MAX_BYTES = {"JSON": 1 << 22, "TOML": 1 << 18}
-#: a key with at least 32 parts: reading a very long one would take minutes.
+#: Pattern of a TOML key with at least 32 parts, because reading a very long key takes minutes.
 _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
-#: the name of a settings file.
+#: Name of a settings file.
 FILE = "lidarspec.toml"
-#: the file with the allowed folders, one per line, and the variable that allows one for a single
-#: run.
+#: Name of the file with the allowed folders, one in each line, and of the environment variable that
+#: allows a folder for a single run.
 TRUSTED = "trusted"
 VARIABLE = "LIDARSPEC_TRUST"
 _WRITABLE_BY_ALL = stat.S_IWOTH
@@ -41,37 +41,37 @@ def user_folder() -> Path:
 
 
 def own_settings() -> Path:
-    """Return the user's own settings file, which may be missing."""
+    """Return the path of the user's own settings file; the file may be missing."""
     return user_folder() / FILE
 
 
 def find_distrust(path: Path) -> str:
-    """Return the reason why a file is not the user's own, "" if it is.
+    """Return the reason why a file is not the user's own; "" if it is.
 
-    An example is "/tmp belongs to user 0". The file and its folder have to belong to the user, and
-    must not be writable by others. The group may write, because it is often the user's own. On
-    systems without such owners, all files in the user's folder are the user's own.
+    An example is "/tmp belongs to user 0". The file and its folder must belong to the user, and
+    must not be writable by all users. The group may be able to write, because it often has no other
+    members. On systems without file owners, all files in the user's folder are the user's own.
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
         if path.resolve().is_relative_to(home):
             return ""
         return f"{path} is not in {home}"
-    for place in (path, path.parent):
-        with system_errors(place):
-            status = place.stat()
+    for checked in (path, path.parent):
+        with system_errors(checked):
+            status = checked.stat()
         if reason := describe_sharing(status, _WRITABLE_BY_ALL):
-            return f"{place} {reason}"
+            return f"{checked} {reason}"
     return ""
 
 
 def describe_sharing(status: os.stat_result, others: int) -> str:
-    """Return the reason why a file is not the user's own, "" if it is.
+    """Return a text such as "belongs to user 0"; "" for a file of the user's own.
 
-    An example is "belongs to user 0". On Windows it is always "".
+    On Windows it is always "".
 
     Args:
-        others: the mode bits that only the user may have.
+        others: the mode bits of permissions that others must not have.
     """
     if os.name == "nt":
         return ""
@@ -96,14 +96,14 @@ def is_trusted(folder: Path) -> bool:
 
 
 def trust(folder: str | Path) -> Path:
-    """Allow the files of a folder to name Python files, and paths anywhere.
+    """Trust the files of a folder: they may name Python files, and paths anywhere.
 
     Returns:
         The absolute path of the folder.
 
     Raises:
-        UsageError: unless it is a folder of the user's own.
-        SourceError: if this cannot be stored.
+        UsageError: if it is not a folder, or not the user's own.
+        SourceError: if the list of allowed folders cannot be written.
     """
     from pathlib import Path
 
@@ -122,10 +122,10 @@ def trust(folder: str | Path) -> Path:
 
 
 def resolve_beside(folder: Path, value: object) -> Path:
-    """Return the file that a file in `folder` names: one in it or below it.
+    """Return the path of a file, in `folder` or below, that another file there names.
 
     Raises:
-        UsageError: for any other path, and unless it is a regular file.
+        UsageError: for any other path, or if it is not a regular file.
     """
     if isinstance(value, str) and "\0" not in value:
         path = folder / value
@@ -140,7 +140,7 @@ def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
     """Return the content of a TOML or JSON file.
 
     Raises:
-        UsageError: for an invalid or too large file.
+        UsageError: if the file is invalid or too large.
         SourceError: if it cannot be read.
     """
     import json  # imported here because finding an installed sensor does not need them

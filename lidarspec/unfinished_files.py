@@ -1,6 +1,7 @@
-"""Names of files while they are written, and removal of files that killed processes left.
+"""Temporary names of files while they are written, and removal of abandoned files.
 
-A file is written under a temporary name in the folder of its destination, and renamed at the end.
+A file is written under a temporary name in the folder of its destination, and renamed when it is
+complete. A process that is killed leaves a temporary file.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from pathlib import Path
 from lidarspec.errors import SourceError
 from lidarspec.remote_files import remove
 
-#: seconds without a write before the file of an ended process is removed; a process with the same
-#: number on another computer may still be writing it.
+#: Seconds without a write after which the file of an ended process is removed. Before that, a
+#: process of the same number on another computer may still be writing it.
 ABANDONED_AFTER_S = 60.0
 
 
@@ -40,7 +41,7 @@ def remove_abandoned(path: Path) -> None:
 
 @functools.cache  # listed once: a folder can get many thousands of files
 def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
-    """Return (process, name) of the unfinished files in a folder."""
+    """Return (process number, final name) of each unfinished file in a folder."""
     try:
         names = os.listdir(folder)
     except OSError:
@@ -50,7 +51,7 @@ def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
 
 
 def is_running(process: int) -> bool:
-    """Return whether a process exists; True if the system cannot report it."""
+    """Return whether a process exists; True if the system does not tell."""
     if os.name != "posix":
         return True
     try:
