@@ -265,7 +265,7 @@ def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
 
 
 def _evaluate_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
-    """Return the median of the clock steps per packet that a sensor declares, ns."""
+    """Return the median time per packet, in ns, that a sensor's `pace` expects."""
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 

@@ -433,7 +433,7 @@ def _span_cuts(draft: Draft) -> list[int]:
 
 
 def _find_angles(draft: Draft) -> list[str]:
-    """Return the paths of the angles, the angles of blocks first."""
+    """Return the paths of all angle fields; those in blocks of points come first."""
     paths = []
     if draft.blocks:
         paths = [

@@ -323,9 +323,9 @@ class FrameClock:
         return StatusWriter(self._sensor, self._first, read)
 
     def check(self, faults: ClockFaults) -> None:
-        """Raise UsageError if these frames cannot show the faults of the readings.
+        """Raise UsageError if faults of the clock cannot be written into these frames.
 
-        Faults of the status are not checked.
+        `check_status` checks faults of the clock's status.
         """
         if self._writer is None:
             raise UsageError(
