@@ -1,7 +1,7 @@
 """YDLIDAR's 360 degree lidars over a UART: one packet, with samples in eight forms.
 
-Most models start after a request. Models with one channel, which have no receive line, send without
-a request.
+Most models start to measure after a request. Models with one channel cannot receive, and measure
+without a request.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
@@ -53,9 +53,9 @@ from lidarspec_ydlidar.models import MODELS, Model
 from lidarspec_ydlidar.requests import ANSWERS, COMMANDS, REQUEST, SCAN_START
 from lidarspec_ydlidar.samples import Form
 
-SAMPLES_PER_PACKET = 40  # of a full packet (protocol, LSN)
+SAMPLES_PER_PACKET = 40  # number of samples of a full packet (protocol, LSN)
 SIMULATED_SPEED_HZ = 6.0  # within the limits of all models
-#: The most frequent value of the scan frequency of a T-mini Pro in good state (its packets).
+#: The scan frequency that packets of a T-mini Pro in good state contain most often.
 GOOD_STATE_HZ = 0.8
 #: Bytes per sample -> CSPC models with the same packet, but other meanings of the sample bits.
 CSPC_MODELS = {
@@ -65,7 +65,7 @@ CSPC_MODELS = {
 
 
 def make_angle() -> Construct:
-    """Return the struct of FSA or LSA: 1/64 degree above a check bit of 1."""
+    """Return the struct of FSA or LSA: steps of 1/64 degree, then a check bit of 1."""
     return ByteSwapped(
         BitStruct(
             "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
@@ -74,9 +74,9 @@ def make_angle() -> Construct:
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether angles are below 360 degrees and the sample count fits.
+    """Return whether angles are below 360 degrees and the number of samples is valid.
 
-    A packet has at least one sample, a zero packet exactly one.
+    A packet has at least one sample, and a zero packet exactly one.
     """
     return (
         (f.fsa.angle < 360)
@@ -119,9 +119,10 @@ def make_points_function(form: Form) -> Callable[[Fields], Points]:
 
 
 def points(f: Fields, form: Form) -> Polar:
-    """Return points at even steps from FSA to LSA.
+    """Return points at equal angular steps from FSA to LSA.
 
-    Angles of triangulating models are corrected by the distance ("angle analysis").
+    On models that measure by triangulation, angles are corrected by an amount that depends on the
+    distance ("angle analysis").
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = raw if form.correction is None else raw + form.correction(f.samples.distance)
@@ -137,7 +138,7 @@ def points(f: Fields, form: Form) -> Polar:
 def sweep(i: int, model: Model) -> dict[str, float]:
     """Return the simulated values of packet i.
 
-    A revolution is a zero packet, then full packets and a shorter one.
+    A revolution consists of a zero packet, full packets and a shorter packet.
     """
     steps = int(model.rate / SIMULATED_SPEED_HZ)
     packet = i % (1 + -(-(steps - 1) // SAMPLES_PER_PACKET))
@@ -180,9 +181,9 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """Return the models with the same packet size, and how to recognize each.
+    """Return id -> how to recognize it, of each model with samples of the same size.
 
-    CSPC models send the same packet too.
+    These include models of CSPC, which send the same packet.
     """
     own_model = MODELS[name]
     models = {
@@ -196,7 +197,7 @@ def relatives(name: str) -> dict[str, str | Relative]:
 
 
 def make_lidar(name: str) -> Sensor:
-    """Return the sensor of one model."""
+    """Return the description of a model."""
     model = MODELS[name]
     has_requests = not model.one_channel
     source = "YDLIDAR SDK: communication protocol, data set of models"

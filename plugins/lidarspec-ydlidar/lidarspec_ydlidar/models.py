@@ -22,8 +22,8 @@ class Model:
         rate: samples per second.
         range_limits: in metres.
         turn: the lowest and the highest number of scans per second.
-        number: the model number in its information; 0 if it is not public.
-        one_channel: whether it only sends.
+        number: the model number in the device information; 0 if it is not documented.
+        one_channel: whether the model only sends and cannot receive.
         has_state: whether packets other than zero packets contain the state of the device, in the
             bits of the scan frequency.
         status: the status of the sensor.

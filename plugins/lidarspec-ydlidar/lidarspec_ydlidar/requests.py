@@ -3,8 +3,8 @@
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (system commands);
 core/common/ydlidar_protocol.h (stamps). The request for the health is 92 in the SDK and 91 in older
 manuals, a reset 80 or 40; the order of the two bytes of the firmware differs between manuals (a
-T-mini's 00 01 is 1.0). Commands of only some models (low power, constant frequency, heartbeat, zero
-offset, pitch) are left out.
+T-mini's 00 01 is 1.0). Commands that only some models have (low power, constant frequency,
+heartbeat, zero offset, pitch) are omitted.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Enum(Int8ul, **CODES)),
 
 
 def make_request(cmd: str, reply: str | None = None, **more: Any) -> Command:
-    """Return the command for a request without payload."""
+    """Return a command that sends a request without payload."""
     return Command("request", {"cmd": cmd}, reply=reply, **more)
 
 

@@ -25,8 +25,9 @@ class Form:
     Attributes:
         struct: the struct of a sample.
         size: bytes of a sample.
-        groups: sizes in bytes of the words of a sample that enter the checksum.
-        correction: function from distance in metres to the degrees to add to the angle.
+        groups: sizes in bytes of the words of a sample that the checksum combines.
+        correction: a function of the distance in metres that returns the degrees to add to the
+            angle.
         slowest: the scan frequency in Hz of the raw value 0.
         has_intensity: whether it has an intensity.
     """
@@ -40,7 +41,7 @@ class Form:
 
 
 def camera_angle(distance: Any) -> Any:
-    """Return the degrees between the laser's ray and the ray of the camera.
+    """Return the angle in degrees between the laser's ray and the camera's ray.
 
     Source: "angle second-level analysis".
     """
