@@ -243,6 +243,8 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "check", "name": node.name, "condition": formula_data(node.condition)}
         case tree.Never():
             return {"kind": "never", "name": node.name}
+        case tree.Derived() if node.formula is not None:
+            return {"kind": "computed", "name": node.name, "value": formula_data(node.formula)}
         case tree.Empty() | tree.Derived() | tree.Opaque():
             return {"kind": "nothing", "name": node.name}
 

@@ -13,6 +13,7 @@ OPERATIONS = {
     "+": lambda a, b: a + b,
     "-": lambda a, b=None: -a if b is None else a - b,
     "*": lambda a, b: a * b,
+    "/": lambda a, b: a / b,
     "//": lambda a, b: a // b,
     "%": lambda a, b: a % b,
     "&": lambda a, b: a & b,
@@ -59,6 +60,9 @@ class Decoder:
             if member["name"]:
                 found[member["name"]] = value
         return found
+
+    def read_computed(self, part: dict[str, Any]) -> Any:
+        return self.value(part["value"])
 
     def read_uint(self, part: dict[str, Any], *, signed: bool = False) -> int:
         self.known[part["path"]] = int.from_bytes(

@@ -186,6 +186,8 @@ def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
     ):
         assert (is_frame, length) == (1, len(data)), f"{sensor.id} {name}"
         wanted = values(sensor.parse(data, frame=name))
+        for path in get_codec(sensor.frames[name]).schema.derived:
+            del wanted[path]  # C has no computed values
         assert found.keys() == wanted.keys()
         for path, numbers in wanted.items():
             assert len(found[path]) == len(numbers), f"{sensor.id} {name} {path}"
