@@ -9,6 +9,7 @@ from typing import Any
 from construct import EnumIntegerString
 
 from lidarspec import Sensor
+from lidarspec.framing.frame_engine import get_codec
 from tests.exports import oddities
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.shapes import SHAPES
@@ -58,6 +59,18 @@ def find_recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
 def number(value: Any) -> Any:
     """Return a value without its Enum name, which other languages do not compare."""
     return int(value) if isinstance(value, EnumIntegerString) else value
+
+
+def parse_wire_fields(sensor: Sensor, frame: str, data: bytes) -> Any:
+    """Return a parsed frame without its computed values, which C and Kaitai do not have."""
+    parsed = sensor.parse(data, frame)
+    for path in get_codec(sensor.frames[frame]).schema.derived:
+        *outer, name = path.split(".")
+        part = parsed
+        for key in outer:
+            part = part[key]
+        del part[name]
+    return parsed
 
 
 def values(parsed: Any) -> dict[str, list[Any]]:
