@@ -50,6 +50,7 @@ JOBS = (
     ("replay", "room.lsr --to again.pcap", RUNS),
     ("send", "sim:ldrobot-ld14p stop", RUNS),
     ("stats", "room.lsr", RUNS),
+    ("clock", "room.lsr", RUNS),
     ("info", "room.pcap", RUNS),
     ("convert", "room.lsr room.csv", RUNS),
     ("convert", "room.lsr room.npz", RUNS),
