@@ -236,7 +236,7 @@ class Leaf:
 
     @property
     def _is_packed(self) -> bool:
-        """Whether the innermost array is inside the bit block, so that it has no stride."""
+        """Whether the innermost array is inside a bit block; such an array has no stride."""
         return len(self.shape) > len(self.strides)
 
     def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:

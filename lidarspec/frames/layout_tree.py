@@ -779,7 +779,13 @@ class _CandidateSet:
     def read(
         self, node: HeaderNode, which: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read the field of a node like a `Reader`, and check the incomplete candidates."""
+        """Read the field of a node in the candidates that contain it.
+
+        Candidates that end before the field, and have a wrong constant, are added to `refuted`.
+
+        Returns:
+            The indices of the candidates with the field (None: all), and their values.
+        """
         assert node.leaf is not None
         there, values = node.leaf.read(
             self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]

@@ -344,8 +344,8 @@ class _LookupTable:
 
     Attributes:
         limits: the first and the last of these values; None if they are not consecutive.
-        bits: if `limits` is None, the bits that the condition depends on, and their allowed values;
-            None if these are more than two.
+        bits: if `limits` is None, a mask of the bits that the condition depends on, and the allowed
+            values of these bits; None if more than two values are allowed.
         listed: whether the condition is true, for each value.
     """
 

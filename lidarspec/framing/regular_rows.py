@@ -155,9 +155,9 @@ def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceRe
 def _count_needed(
     framing: Framing, mode: SearchState, kind: int, layout: Layout, rest: bytes
 ) -> int:
-    """Return how many bytes are needed to check an incomplete frame of a layout.
+    """Return the size from the start of a frame that is needed to check it further, in bytes.
 
-    Returns 0 if the bytes may be a frame of another type or layout.
+    Returns 0 if the type and the layout are not certain, or if a constant is wrong.
     """
     first = next(
         (other for other in framing.active_types(mode) if _begins_with(framing.marks[other], rest)),

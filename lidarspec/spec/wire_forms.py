@@ -353,9 +353,10 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 
 @lru_cache(maxsize=64)
 def _make_digit_weights(base: int) -> Values:
-    """Return the weight of a digit, by its distance from the end of its token.
+    """Return the weight of a digit, by its position counted from the end of its token.
 
-    The first and the last weight are 0, for characters that are not digits of a number.
+    Index 1 is the last digit. The weight is 0 at index 0, for characters that are not digits, and
+    at the last index, for digits that are too far from the end.
     """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 

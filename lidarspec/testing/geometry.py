@@ -702,7 +702,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     require(
         near_enough,
         "LS507",
-        f"a point is {worst:.4f} m from the nearest surface of the scene",
+        f"a simulated point is {worst:.4f} m from the nearest surface of the simulated scene",
         f"{name}.points",
     )
     assert subject.sensor.range_limits is not None  # every sensor with points has them

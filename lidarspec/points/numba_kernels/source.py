@@ -159,11 +159,11 @@ class Expressions(KernelWriter):
                     return text
             return self._write_call(node)
         if node.kind == "rows" and not self.is_shared(node.args[0]):
-            return self._write_row(node, "float64")
+            return self._look_up_row(node, "float64")
         return self.add_argument(node)
 
-    def _write_row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
-        """Return an element of a table row at an index.
+    def _look_up_row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
+        """Return the code that reads an element of a table row.
 
         Args:
             kind: the dtype of the table in the kernel.
@@ -314,7 +314,7 @@ class Expressions(KernelWriter):
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
                 return Trig(node.function.__name__, self.angle_of(node.args[0]))
         if node.kind == "rows" and not self.is_shared(node.args[0]) and not exact:
-            return self._write_row(node, "float32")
+            return self._look_up_row(node, "float32")
         made = self.double(node)
         return self.let(
             made.level, f"np.float32({made.text if not exact else f'replace_nan({made.text})'})"
@@ -337,11 +337,11 @@ class Expressions(KernelWriter):
         high, low, _ = self.get_or_make(
             ("halves", id(table), beam.step), lambda: (*_split_halves(table * beam.step), table)
         )
-        first, second = (self._write_row(beam.direction, "float32", half) for half in (high, low))
+        first, second = (self._look_up_row(beam.direction, "float32", half) for half in (high, low))
         return self.let(
             self.inner,
             f"multiply_add({sent.text}, {first.text}, multiply_add({sent.text}, {second.text},"
-            f" {self._write_row(beam.start, 'float32').text}))",
+            f" {self._look_up_row(beam.start, 'float32').text}))",
         )
 
     def _write_distance(self, node: Node, *, raw: bool = False) -> KernelValue | None:

@@ -80,7 +80,7 @@ FILE = Struct(
     "faces" / Int8ul,
     "fields" / Int8ul,
     "field_config" / Bytes(8),
-    "resolution" / Int8ul * "step of all angles",
+    "resolution" / Int8ul * "scale of the angle corrections: 1 means 0.01 degrees",
     "start" / Array(this.faces, Int32ul),
     "end" / Array(this.faces, Int32ul),
     "azimuth" / Array(LASERS, Int32sl),

@@ -81,7 +81,7 @@ class LineCheck(Checksum):
         return (sum(data[:-1]) & 0x3F) + 0x30
 
     def describe(self) -> str:
-        return "six bits of the sum before the semicolon"
+        return "low six bits of the sum of the characters before the semicolon, plus 0x30"
 
 
 def make_line(name: str, letters: str) -> Construct:
