@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,6 +49,8 @@ MAX_BEGINNING_PACKETS = 1 << 18
 MAX_DECODED_BYTES = 1 << 24
 #: Maximum number of senders to list.
 MAX_LISTED_FLOWS = 6
+#: Maximum number of characters in a line about the clock.
+CLOCK_TEXT_WIDTH = 66
 #: A time after all arrivals, ns since 1970.
 _END_NS = (1 << 63) - 1
 #: Transport of a file -> the kind of the file in words.
@@ -417,7 +420,10 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
     if content.clock:
-        yield "clock", printable(content.clock)
+        first, *others = textwrap.wrap(printable(content.clock), CLOCK_TEXT_WIDTH)
+        yield "clock", first
+        for line in others:
+            yield "", line
     for name, text in content.info.items():
         yield name.replace("_", " "), printable(text)
     yield "next", content.command

@@ -244,7 +244,7 @@ class Fletcher(Checksum):
     The first sum, in the low byte of the checksum, is the sum of all bytes. The second sum, in the
     high byte, adds the first sum after each byte.
 
-    Source: RFC 1145; UBX checksum of u-blox.
+    Source: RFC 1145; the checksum of UBX messages.
     """
 
     order: ByteOrder = "little"

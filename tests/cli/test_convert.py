@@ -271,7 +271,7 @@ def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> N
             "ldrobot-stl27l",
         ]
         done = subprocess.run(command, stdin=given, capture_output=True, check=False)
-    assert (done.returncode, b"is standard input: it would be overwritten" in done.stderr) == (
+    assert (done.returncode, b"is standard input, and would be overwritten" in done.stderr) == (
         2,
         True,
     )

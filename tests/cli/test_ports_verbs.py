@@ -119,7 +119,7 @@ class TestDetect:
         assert told["sources"][0]["sensor"] == "ldrobot-stl27l"
         alike = {
             f"ldrobot-{name}" for name in ("stl27l", "ld06", "ld14", "ld14p", "ld20", "stl06p")
-        }
+        } | {"oradar-ms200"}
         assert {fit["sensor"] for fit in told["sources"][0]["fits"]} == alike
 
     @pytest.mark.slow
@@ -289,7 +289,8 @@ class TestDoctor:
             {
                 "ok": False,
                 "text": (
-                    "/dev/ttyNONE7: no such port; check that it is plugged in, and its driver"
+                    "/dev/ttyNONE7: no such port; check that the device is connected and its driver"
+                    " is loaded"
                 ),
                 "fix": "lidarspec ports",
             }
@@ -339,7 +340,9 @@ class TestDoctor:
             number = free.getsockname()[1]
         silent = self._run_doctor(f"udp://127.0.0.1:{number}", "-t", "300ms")
         assert any("no data received" in finding["text"] for finding in silent)
-        assert any("receives only packets to 127.0.0.1" in finding["text"] for finding in silent)
+        assert any(
+            "only packets to 127.0.0.1 are received" in finding["text"] for finding in silent
+        )
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
             with working(
