@@ -33,7 +33,7 @@ REPORTS = {
     ),
     "raises = lidarspec_broken.raises": "ZeroDivisionError",
     "no-sensor = lidarspec_broken.no_sensor": "must return sensors, got str",
-    "bad-spec = lidarspec_broken.bad_spec": "no field may be called 'state' or 'on'",
+    "bad-spec = lidarspec_broken.bad_spec": "is_on: Flag keeps only one bit of its byte",
     "hook = lidarspec_broken.hook": "KeyError",
 }
 
@@ -231,7 +231,7 @@ def test_a_broken_distribution_is_checked_to_its_end(site: Path) -> None:
     loading, *sensors = json.loads(done.stdout)
     named = {finding["path"]: finding["code"] for finding in loading["findings"]}
     assert RULES.items() <= named.items()
-    assert named.get("on") == "LS102"
+    assert named.get("is_on") == "LS107"
     assert {"broken-checksum", "broken-plausible", "broken-points"} <= {
         report["name"] for report in sensors if report["findings"]
     }
