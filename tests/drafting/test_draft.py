@@ -193,7 +193,7 @@ def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
         " degree?\n" in text
     )
     assert (
-        "# lies between this frame's angle_4 and the next one's: the angle of the last sample?\n"
+        "# is between angle_4 of this frame and of the next frame: the angle of the last sample?\n"
         in text
     )
     assert "# correct in 256 of 256 frames, 1 in " in text
