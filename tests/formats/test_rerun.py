@@ -146,7 +146,7 @@ def test_where_no_viewer_can_be_shown_one_line_says_so(tmp_path: Path) -> None:
         "  next: lidarspec view SOURCE --rerun -o scans.rrd",
     ]
     assert (
-        "requires the suffix .rrd"
+        "needs the suffix .rrd"
         in ran("view", "sim:ldrobot-stl27l", "--rerun", "-o", "a.txt", code=2).stderr
     )
     assert (

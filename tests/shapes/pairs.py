@@ -65,7 +65,14 @@ SENSOR = Sensor(
     "shape-pairs",
     vendor="Shapes",
     model="Pairs",
-    frames={"data": Frame(DATA, data=True, plausible=plausible)},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            plausible=plausible,
+            acknowledged={"LS506": "a scan is a field of view, which begins on the right"},
+        )
+    },
     points=points,
     scan=OnRewind("number"),
     links={"data": Udp(7011)},

@@ -425,6 +425,16 @@ def has_customer_firmware(f: Fields) -> Any:
     return (f.mt.start == 0) & (f.mt.m > 0)
 
 
+def has_bits_later_in_a_turn(f: Fields) -> Any:
+    """Return whether the upper bits of M&T are set after the second packet of a revolution.
+
+    The first packet of a batch does not count, because the one before it is not known.
+    """
+    begins = np.asarray(f.mt.start == 1)
+    follows_start = np.concatenate([np.ones_like(begins[:1]), begins[:-1]])
+    return np.asarray(has_customer_firmware(f)) & ~follows_start
+
+
 def reports_firmware(f: Fields) -> Any:
     """Return whether an acknowledgement contains the firmware (manual 2.1.3; SDK for 5C)."""
     return ((f.mode == 0x50) | (f.mode == 0x5C)) & (f.firmware > 0)
@@ -433,8 +443,8 @@ def reports_firmware(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits above the lowest one of the third byte in packets that do not begin a revolution",
-    has_customer_firmware,
+    "bits above the lowest one of the third byte after the second packet of a revolution",
+    has_bits_later_in_a_turn,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
     **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "its replies to requests"),

@@ -193,9 +193,9 @@ def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """Return how to recognize each other model: by its point rate."""
+    """Return how to recognize each other model: by its point rate, or the MS200 by its commands."""
     others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
-    return {
+    distinct = {
         name: (
             "identical packets at the same point rate"
             if rate == POINT_RATES_HZ[own]
@@ -206,6 +206,7 @@ def relatives(own: str) -> dict[str, str | Relative]:
         )
         for name, rate in others.items()
     }
+    return {**distinct, "oradar-ms200": "identical packets; its commands begin with A5 F5"}
 
 
 DATA_FRAME = Frame(DATA, data=True, plausible=plausible)
