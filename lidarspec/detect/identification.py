@@ -132,7 +132,8 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     result = distinguish(models, {model.id: frames for model in models})
     if sensor.id not in result.candidates:
         return "the frames are those of " + " or ".join(
-            f"{name} ({why})" for name, why in (result.candidates or result.others).items()
+            f"{name} ({why})" if why else name
+            for name, why in (result.candidates or result.others).items()
         )
     names = _read_model_names(sensor, frames)
     fits = any(

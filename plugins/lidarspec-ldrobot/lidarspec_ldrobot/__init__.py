@@ -56,6 +56,8 @@ POINT_RATES_HZ = {
     "LD14P": 4_000,
     "LD20": 4_000,
 }
+# The ORADAR MS200 sends the same frames; its rate is assumed.
+MS200_POINT_RATE_HZ = 4_500
 CRC8 = Crc(width=8, poly=0x4D)
 
 
@@ -193,9 +195,10 @@ def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """Return how to recognize each other model: by its point rate, or the MS200 by its commands."""
+    """Return how to recognize each other model: by its point rate."""
     others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
-    distinct = {
+    others["oradar-ms200"] = MS200_POINT_RATE_HZ
+    return {
         name: (
             "identical packets at the same point rate"
             if rate == POINT_RATES_HZ[own]
@@ -206,7 +209,6 @@ def relatives(own: str) -> dict[str, str | Relative]:
         )
         for name, rate in others.items()
     }
-    return {**distinct, "oradar-ms200": "identical packets; its commands begin with A5 F5"}
 
 
 DATA_FRAME = Frame(DATA, data=True, plausible=plausible)
