@@ -425,14 +425,19 @@ def has_customer_firmware(f: Fields) -> Any:
     return (f.mt.start == 0) & (f.mt.m > 0)
 
 
-def has_bits_later_in_a_turn(f: Fields) -> Any:
-    """Return whether the upper bits of M&T are set after the second packet of a revolution.
+def has_bits_beside_firmware(f: Fields) -> Any:
+    """Return whether the upper bits of M&T are set, and are not the customer firmware.
 
-    The first packet of a batch does not count, because the one before it is not known.
+    The firmware is in the packet after a start packet, and the same in each revolution. The first
+    packet of a batch does not count, because the packet before it is not known.
     """
     begins = np.asarray(f.mt.start == 1)
-    follows_start = np.concatenate([np.ones_like(begins[:1]), begins[:-1]])
-    return np.asarray(has_customer_firmware(f)) & ~follows_start
+    values = np.asarray(f.mt.m)
+    follows_start = np.concatenate([np.zeros_like(begins[:1]), begins[:-1]])
+    firmware = values[follows_start][:1].sum()  # 0 if no packet follows a start packet
+    is_firmware = follows_start & (values == firmware)
+    is_known = np.arange(len(values)) > 0
+    return np.asarray(has_customer_firmware(f)) & is_known & ~is_firmware
 
 
 def reports_firmware(f: Fields) -> Any:
@@ -443,8 +448,8 @@ def reports_firmware(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits above the lowest one of the third byte after the second packet of a revolution",
-    has_bits_later_in_a_turn,
+    "bits above the lowest one of the third byte, which are not a constant firmware",
+    has_bits_beside_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
     **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "its replies to requests"),
