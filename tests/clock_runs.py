@@ -39,7 +39,7 @@ class Run:
     began_s: float = BEGAN_S
     seed: int = 0
 
-    def packets(self, sensor: Sensor = SYNCED) -> Packets:
+    def packets(self, sensor: Sensor = SYNCED, frame_type: str | None = None) -> Packets:
         """Return the packets, decoded from frames."""
         frame = SYNCED.build("data", number=0, sync=0, time=0, azimuth=0, distances=[0] * 4)
         rows = np.tile(np.frombuffer(frame, np.uint8), (len(self.sent_s), 1))
@@ -47,7 +47,7 @@ class Run:
         rows[:, 4] = self.status
         times = np.rint(self.clock_s * 1e9).astype("<i8")
         rows[:, 5:13] = times[:, None].view(np.uint8)
-        packets = sensor.decode(rows)
+        packets = sensor.decode(rows, frame=frame_type)
         late = np.random.default_rng(self.seed).uniform(0, JITTER_S, len(rows))
         packets.host_ns = np.rint((self.began_s + self.sent_s + late) * 1e9).astype(np.int64)
         return packets

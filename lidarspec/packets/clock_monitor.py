@@ -27,7 +27,7 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.timing import HOUR_S, ClockState
+from lidarspec.spec.timing import HOUR_S, Clock, ClockState
 
 Integers = NDArray[np.int64]
 
@@ -135,7 +135,8 @@ class ClockMonitor:
     def __init__(
         self, sensor: SensorDescription, *, drift_limit_ppm: float = DRIFT_LIMIT_PPM
     ) -> None:
-        self._sensor = sensor
+        self._clock = _find_main_clock(sensor)
+        self._timed_sensor = replace(sensor, clock=self._clock)
         self._drift_limit_ppm = drift_limit_ppm
         self.samples = deque[OffsetSample](maxlen=KEPT_SAMPLES)
         self._estimate = DeviceClock(ESTIMATE_PARTS)
@@ -155,17 +156,17 @@ class ClockMonitor:
         """Update the clock with packets, and return the events among them.
 
         Args:
-            packets: the next packets of a frame type that uses the sensor's clock.
+            packets: the next packets; those of frame types with another clock are only counted.
         """
-        clock = self._sensor.clock
+        clock = self._clock
         self._packets += len(packets)
         if not len(packets) or clock is None:
             return []
-        if find_clock(packets.sensor, packets.frame) is not clock:
+        if find_clock(packets.sensor, packets.frame) != clock:
             return []
         try:
             events = self._read_status(packets)
-            readings = clock_ns(self._sensor, packets.batch())
+            readings = clock_ns(self._timed_sensor, packets.batch())
         except Exception as error:  # the plugin's functions
             packets.stats.error(PluginError.of(error, "clock"), len(packets))
             return []
@@ -214,7 +215,7 @@ class ClockMonitor:
     @property
     def _epoch(self) -> str:
         """What the clock is declared to count now."""
-        clock = self._sensor.clock
+        clock = self._clock
         if clock is None:
             return ""
         epoch = clock.epoch if self._state is None else clock.epoch_in(self._state)
@@ -228,7 +229,7 @@ class ClockMonitor:
 
     def _read_status(self, packets: Packets) -> list[ClockFinding]:
         """Return the changes of the clock's status, and remember the last one."""
-        clock = self._sensor.clock
+        clock = self._clock
         assert clock is not None
         if clock.status is None:
             return []
@@ -291,7 +292,7 @@ class ClockMonitor:
         around = [
             reading for host, reading in self._readings if abs(host - jump.host_ns) <= 2 * PIECE_NS
         ]
-        clock = self._sensor.clock
+        clock = self._clock
         assert clock is not None
         limit_ns = RESTART_LIMIT_S * 1e9
         wrap_ns = math.inf if clock.wraps_at is None else clock.wraps_at * 1e9 - limit_ns
@@ -323,7 +324,7 @@ class ClockMonitor:
 
     def _judge(self) -> Iterator[ClockFinding]:
         """Yield one or more findings about the present state of the clock."""
-        if self._sensor.clock is None:
+        if self._clock is None:
             yield ClockFinding("no_clock")
             return
         state = self._state
@@ -374,6 +375,14 @@ def _split(host: Integers) -> list[slice]:
     starts = [0, *edges.tolist()]
     ends = [*edges.tolist(), len(host)]
     return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
+
+
+def _find_main_clock(sensor: SensorDescription) -> Clock | None:
+    """Return the clock of the sensor; without one, that of its first frame type with a clock."""
+    if sensor.clock is not None:
+        return sensor.clock
+    clocks = (sensor.frames[name].clock for name in sensor.main_frames)
+    return next((clock for clock in clocks if clock is not None), None)
 
 
 def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:

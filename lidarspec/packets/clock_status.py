@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions.columns import Batch, Fields, physical
 from lidarspec.frames.frame_table import Table
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.timing import ClockStatus
 
@@ -16,13 +17,13 @@ Values = NDArray[np.float64]
 def read_clock_status(packets: Packets) -> Values:
     """Return the clock's status at each packet, (n,).
 
-    Its meaning is given by `sensor.clock.status.state_of`. The value is nan if the sensor does not
+    `ClockStatus.state_of` gives the meaning of a value. The value is nan if the sensor does not
     send its status in this frame type, or has not sent it before the packet.
 
     Args:
-        packets: packets of a frame type that uses the sensor's clock.
+        packets: packets of a frame type that has a clock.
     """
-    clock = packets.sensor.clock
+    clock = find_clock(packets.sensor, packets.frame)
     unknown = np.full(len(packets), np.nan)
     if clock is None or clock.status is None:
         return unknown

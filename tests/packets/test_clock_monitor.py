@@ -66,6 +66,18 @@ def test_an_event_is_named_within_two_seconds(
     assert watched.monitor.report().late < RATE_HZ / 4  # those in the piece of the fault
 
 
+def test_the_clock_of_a_frame_type_is_watched_if_the_sensor_has_none() -> None:
+    frame = replace(SYNCED.frames["data"], data=False, clock=SYNCED.clock)
+    without_points = {"points": None, "scan": None, "range_limits": None}
+    sensor = replace(SYNCED, frames={"data": frame}, clock=None, sequence=None, **without_points)
+    run = make_run(END_S)
+    lose_lock(run)
+    monitor = ClockMonitor(sensor)
+    events = monitor.add(run.packets(sensor, "data"))
+    assert [event.code for event in events] == ["lock_lost"]
+    assert monitor.report().epoch == "tai"
+
+
 def test_a_second_at_the_end_of_a_month_is_a_leap_second() -> None:
     run = make_run(END_S, began_s=LEAP_S)
     step(-1)(run)

@@ -36,6 +36,8 @@ from construct import (
 from lidarspec.spec import (
     Checksummed,
     Clock,
+    ClockState,
+    ClockStatus,
     Command,
     Fields,
     Fletcher,
@@ -269,6 +271,15 @@ def utc_time(f: Fields) -> Any:
     return unix_time(f.year, f.month, f.day, f.hour, f.minute, f.second), f.nano * 1e-9
 
 
+PVT_CLOCK_STATUS = ClockStatus(  # p. 150: "UTC time of day has been fully resolved"
+    "valid.fully_resolved",
+    {
+        0: ClockState("time not fully resolved", locked=False),
+        1: ClockState("time resolved by GNSS", locked=True),
+    },
+)
+
+
 def date_values(i: int, rate: float) -> dict[str, Any]:
     """Return the date of simulated frame i, from Sunday, 2026-01-04, on."""
     second = int(i // rate)
@@ -387,13 +398,13 @@ GNSS = Sensor(
         "nav_pvt": Frame(
             NAV_PVT,
             plausible=is_position,
-            clock=Clock(utc_time),
+            clock=Clock(utc_time, epoch="utc", status=PVT_CLOCK_STATUS),
             simulation=Simulation(pvt_sweep, rate=5),
         ),
         "nav_timeutc": Frame(
             NAV_TIMEUTC,
             plausible=is_date,
-            clock=Clock(utc_time),
+            clock=Clock(utc_time, epoch="utc"),
             simulation=Simulation(timeutc_sweep, rate=1),
         ),
         "tim_tp": Frame(TIM_TP, plausible=is_pulse, simulation=Simulation(pulse_sweep, rate=1)),

@@ -12,6 +12,7 @@ import lidarspec as ls
 import lidarspec_ublox
 from lidarspec import simulate
 from lidarspec.errors import WireError
+from lidarspec.packets.clock_monitor import ClockMonitor
 
 GNSS = ls.sensor("ublox-gnss")
 VECTORS = json.loads((Path(lidarspec_ublox.__file__).parent / "vectors.json").read_text())
@@ -53,6 +54,15 @@ def test_a_split_of_the_stream_changes_nothing(rate: int) -> None:
     assert [(item.frame, item.offset) for item in found] == [
         (item.frame, item.offset) for item in GNSS.split(stream)
     ]
+
+
+def test_the_state_of_the_clock_is_that_of_the_receiver() -> None:
+    frames = b"".join(simulate(GNSS, 20))
+    packets = GNSS.decode(frames, frame="nav_pvt")
+    monitor = ClockMonitor(GNSS)
+    monitor.add(packets)
+    report = monitor.report()
+    assert (report.epoch, report.state, report.locked) == ("utc", "time resolved by GNSS", True)
 
 
 def test_times_are_utc() -> None:
