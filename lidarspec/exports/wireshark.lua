@@ -553,7 +553,7 @@ for place, patterns in pairs(sensor.places) do
 end
 
 -- Ports are hints: on others, datagrams that are as a whole a frame with constants are taken too.
-if not sensor.is_stream and sensor.places["udp.port"] then
+if sensor.has_udp and not sensor.is_stream then
   proto:register_heuristic("udp", function(tvb, pinfo, root)
     local frame = exact(tvb, 0, tvb:len(), last_before[pinfo.number])
     return frame ~= nil and #frame.magic > 1 and dissected(tvb, pinfo, root, true) > 0

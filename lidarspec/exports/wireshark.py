@@ -619,6 +619,7 @@ def dissector(sensor: Sensor) -> str:
     )
     about = {
         "title": title,
+        "has_udp": any(isinstance(link, Udp) for link in sensor.links.values()),
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
         "announcing": {frame.after: True for frame in sensor.frames.values() if frame.after},
         "places": _list_patterns(sensor),
