@@ -14,7 +14,7 @@ from typing import Any
 
 from lidarspec.exports import ExportedFrame, messages
 from lidarspec.frames.wire_table import frame_size
-from lidarspec.spec import Command, Frame, Sensor, tree
+from lidarspec.spec import Checksum, Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Filled
 from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, Split
@@ -149,15 +149,21 @@ def _frame(message: ExportedFrame) -> dict[str, Any]:
 
 
 def _wire_form(form: WireForm) -> dict[str, Any]:
-    """Return the class of a wire form and its arguments; those that are objects as Python text."""
-    members: tuple[dataclasses.Field[Any], ...] = ()
-    if dataclasses.is_dataclass(form):
-        members = dataclasses.fields(form)
-    arguments: dict[str, Any] = {item.name: getattr(form, item.name) for item in members}
+    """Return the class and the arguments of a wire form as JSON data.
+
+    Arguments that are objects, such as a `HexCheck`, become Python text.
+    """
     return {"form": type(form).__name__} | {
         name: repr(value) if dataclasses.is_dataclass(value) else _to_json(value)
-        for name, value in arguments.items()
+        for name, value in _arguments(form).items()
     }
+
+
+def _arguments(described: object) -> dict[str, Any]:
+    """Return the values of the fields of a dataclass; none for another class."""
+    if not dataclasses.is_dataclass(described):
+        return {}
+    return {item.name: getattr(described, item.name) for item in dataclasses.fields(described)}
 
 
 def _command(command: Command) -> dict[str, Any]:
@@ -318,16 +324,19 @@ def _part(part: tree.Part) -> dict[str, Any]:
 
 
 def _seal(node: tree.Sealed) -> dict[str, Any]:
-    algorithm = node.algorithm
-    own: dict[str, Any] = (
-        dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
-    )
-    parameters = {
-        name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)
-    }
-    kind = {
+    return {**facts(node, "fields", "over", "absent"), "algorithm": _algorithm(node.algorithm)}
+
+
+def _algorithm(algorithm: Checksum) -> dict[str, Any]:
+    parameters: dict[str, Any] = {}
+    for name, value in _arguments(algorithm).items():
+        if isinstance(value, Checksum):
+            parameters[name] = _algorithm(value)
+        elif isinstance(value, int | str | tuple):
+            parameters[name] = value
+    return {
         "kind": type(algorithm).__name__,
         "width": algorithm.width,
         "describe": algorithm.describe(),
+        **parameters,
     }
-    return {**facts(node, "fields", "over", "absent"), "algorithm": {**kind, **parameters}}

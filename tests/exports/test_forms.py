@@ -13,14 +13,15 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from construct import Bytes, Const, Struct
+from construct import Bytes, Const, Int8ub, Int16ub, Struct
 
 import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import EXPORTS, ExportError, UnknownExport, export, select_frame
 from lidarspec.exports.diagram import BIT_WIDTH_PX, LEFT_MARGIN_PX, ROW_BITS
+from lidarspec.exports.json import node_data
 from lidarspec.frames.schema import make_schema
-from lidarspec.spec import Command, Frame
+from lidarspec.spec import Checksummed, Command, Frame, WordXor, ZeroPadded
 from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
@@ -60,6 +61,16 @@ def test_json_has_text_frames_with_their_wire_form() -> None:
     assert frames["fix"]["wire"] is None
     wire = frames["line"]["wire"]
     assert (wire["form"], wire["start"], wire["sep"]) == ("Tokens", b"$".hex(), b",".hex())
+
+
+def test_json_has_the_algorithm_inside_another_one() -> None:
+    body = Struct("count" / Int8ub, "sum" / Int16ub)
+    sealed = Checksummed(body, field="sum", algorithm=ZeroPadded(WordXor(1, (1, 2)), 8))
+    layout = node_data(Frame(sealed).tree)
+    algorithm = layout["checksum"]["algorithm"]
+    assert (algorithm["kind"], algorithm["to"]) == ("ZeroPadded", 8)
+    inner = algorithm["algorithm"]
+    assert (inner["kind"], inner["head"], inner["groups"]) == ("WordXor", 1, (1, 2))
 
 
 @pytest.mark.slow
