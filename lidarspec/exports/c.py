@@ -7,7 +7,7 @@ It does not depend on struct packing. `header` joins:
 * a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
   argument, so that all frame types share it,
 * for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions that read a
-whole frame: they return its length, its validity, and its stored and computed checksums.
+  whole frame: they return its length, its validity, and its stored and computed checksums.
 
 `frame_length` checks that a byte exists before it reads the byte.
 """

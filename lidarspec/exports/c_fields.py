@@ -88,7 +88,7 @@ def quote(text: str) -> str:
     plain = all(32 <= byte < 127 and byte not in b'"\\?' for byte in data)
     if plain:
         return f'"{text}"'
-    return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
+    return quote_bytes(data)
 
 
 def quote_bytes(data: bytes) -> str:
