@@ -22,11 +22,12 @@ from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.testing import sensor_under_test as material
 from tests.exports.trees import (
+    NULL_TERMINATED,
     SHAPED,
     distinct_frames,
     distinct_sensors,
     find_recoded,
-    is_recoded,
+    list_byte_frames,
     parse_wire_fields,
     values,
 )
@@ -50,6 +51,7 @@ REFUSED = {
 }
 #: the installed sensors that C cannot say, with the reason.
 REFUSED_INSTALLED = {
+    **NULL_TERMINATED,
     **dict.fromkeys(("livox-mid360", "livox-hap"), f"parameters: {_PARTS}"),
     "ti-iwr6843": f"tlvs: {_PARTS}",
     **dict.fromkeys(("sick-multiscan136", "sick-picoscan150"), f"modules: {_PARTS}"),
@@ -88,13 +90,18 @@ int main(void)
 @functools.cache
 def subjects() -> dict[str, Sensor]:
     """Return every sensor that C supports, one for each set of frames, by id."""
-    refused = {*REFUSED, *REFUSED_INSTALLED}
     sensors = distinct_sensors()
-    return {
-        name: sensor
-        for name, sensor in sensors.items()
-        if name not in refused and not is_recoded(sensor)
-    }
+    refused = {*REFUSED, *REFUSED_INSTALLED, *find_recoded(sensors.values())}
+    return {name: sensor for name, sensor in sensors.items() if name not in refused}
+
+
+def list_frames() -> list[tuple[Sensor, str]]:
+    """Return the frame types of these sensors that C can read, each once."""
+    return [
+        (sensor, name)
+        for sensor, name in distinct_frames(subjects().values())
+        if name in list_byte_frames(sensor)
+    ]
 
 
 @pytest.mark.parametrize("name", [name for name in SHAPED if name not in REFUSED])
@@ -162,12 +169,12 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """
     folder = tmp_path_factory.mktemp("c")
     source, program = folder / "reader.c", folder / "reader"
-    dumps = [_dump(sensor, name) for sensor in subjects().values() for name in sensor.frames]
+    frames = list_frames()
+    dumps = [_dump(sensor, name) for sensor, name in frames]
     calls = [
         f'        if (!strcmp(name, "{sensor.id}:{name}"))'
         f" dump_{_word(make_prefix(sensor))}_{name}(p, n);\n"
-        for sensor in subjects().values()
-        for name in sensor.frames
+        for sensor, name in frames
     ]
     source.write_text(_MAIN % (_include_headers(folder), "\n".join(dumps), "".join(calls)))
     _compile(source, program, "-std=c99", *SANITIZED * (request.param == "checked"))
@@ -178,9 +185,7 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 @needs_gcc
 def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
     frames = [
-        (sensor, name, data)
-        for sensor, name in distinct_frames(subjects().values())
-        for data in _examples(sensor, name)
+        (sensor, name, data) for sensor, name in list_frames() for data in _examples(sensor, name)
     ]
     for (sensor, name, data), (is_frame, length, found) in zip(
         frames, _read(reader, frames), strict=True
@@ -198,7 +203,7 @@ def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
 def test_damaged_frames_are_rejected_by_both(reader: Path) -> None:
     source = random.Random(1)
     frames = []
-    for sensor, name in distinct_frames(subjects().values()):
+    for sensor, name in list_frames():
         data = sensor.example(name, seed=1)
         frames += [(sensor, name, material.mutate(data, source)) for _ in range(12)]
         frames += [(sensor, name, data[:cut]) for cut in {1, len(data) // 2, len(data) - 1}]

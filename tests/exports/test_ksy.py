@@ -30,7 +30,13 @@ from lidarspec.exports.ksy import identifier, yaml
 from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Every, Frame, Polar, Serial
 from tests.exports import kaitai, trees
-from tests.exports.trees import distinct_sensors, find_recoded, is_recoded, parse_wire_fields
+from tests.exports.trees import (
+    NULL_TERMINATED,
+    distinct_sensors,
+    find_recoded,
+    list_byte_frames,
+    parse_wire_fields,
+)
 
 #: the shapes that are exported; of oddities there are own ones below.
 SHAPED = {name: sensor for name, sensor in trees.SHAPED.items() if name != "shape-oddities"}
@@ -42,19 +48,19 @@ REFUSED = {
     **find_recoded(SHAPED.values()),
 }
 #: the installed sensors that Kaitai cannot say, and why.
-REFUSED_INSTALLED = dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _CONSTANTS)
+REFUSED_INSTALLED = {
+    **NULL_TERMINATED,
+    **dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _CONSTANTS),
+}
 
 
 @functools.cache
 def subjects() -> dict[str, Sensor]:
     """Return every sensor that Kaitai supports, one for each set of frames, by id."""
     sensors = distinct_sensors()
-    refused = {*REFUSED, *REFUSED_INSTALLED, "shape-oddities"}
-    return {
-        name: sensor
-        for name, sensor in sensors.items()
-        if name not in refused and not is_recoded(sensor)
-    }
+    recoded = find_recoded(sensors.values())
+    refused = {*REFUSED, *REFUSED_INSTALLED, *recoded, "shape-oddities"}
+    return {name: sensor for name, sensor in sensors.items() if name not in refused}
 
 
 def make_sensor(*fields: Any, case: str = "odd") -> Sensor:
@@ -110,7 +116,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_kaitai_reads_the_values_that_lidarspec_reads(compiled: Path) -> None:
     for sensor in subjects().values():
         found = kaitai.module(sensor, compiled)
-        for frame in sensor.frames:
+        for frame in list_byte_frames(sensor):
             for seed in range(2):
                 data = sensor.example(frame, seed=seed)
                 read = kaitai.reader(found, sensor, frame).from_bytes(data)

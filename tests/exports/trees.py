@@ -16,8 +16,12 @@ from tests.shapes import SHAPES
 
 #: the invented sensors that have frames, by id.
 SHAPED = {sensor.id: sensor for sensor in (*SHAPES.values(), oddities.SENSOR) if sensor.frames}
-#: the reason of every refusal of a frame that stands on the wire in a form of its own.
+#: The reason of the refusal of a sensor that has only frames in a wire form.
 RECODED = "this export does not support frame types with a wire form"
+#: The installed sensors that other languages cannot read because of a struct, with the reason.
+NULL_TERMINATED = dict.fromkeys(
+    ("hokuyo-urg04lx", "hokuyo-utm30lx", "hokuyo-utm30lxew"), "NullTerminated is Python code"
+)
 
 
 @functools.cache
@@ -47,13 +51,14 @@ def is_recoded(sensor: Sensor) -> bool:
     return any(frame.wire is not None for frame in sensor.frames.values())
 
 
+def list_byte_frames(sensor: Sensor) -> list[str]:
+    """Return the names of the frame types without a wire form."""
+    return [name for name, frame in sensor.frames.items() if frame.wire is None]
+
+
 def find_recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
-    """Return the reason of the refusal, by id, of sensors all of whose frames are recoded."""
-    return {
-        sensor.id: RECODED
-        for sensor in sensors
-        if all(frame.wire is not None for frame in sensor.frames.values())
-    }
+    """Return {id: reason of the refusal} of the sensors that have only frames in a wire form."""
+    return {sensor.id: RECODED for sensor in sensors if not list_byte_frames(sensor)}
 
 
 def number(value: Any) -> Any:
