@@ -17,7 +17,7 @@ import zoneinfo
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 #: TAI minus UTC since 2017, and before the first leap second in 1972, s.
@@ -55,6 +55,14 @@ class LeapSeconds:
     def gps_minus_utc(self, utc_s: float) -> int:
         """Return GPS time minus UTC in seconds at a time, seconds since 1970 in UTC."""
         return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
+
+    def scale_offsets(self, utc_s: float) -> dict[str, int]:
+        """Return the seconds by which "utc", "tai" and "gps" are ahead of UTC at a time."""
+        return {
+            "utc": 0,
+            "tai": self.tai_minus_utc(utc_s),
+            "gps": self.gps_minus_utc(utc_s),
+        }
 
     def utc_from_tai(self, tai_s: float) -> float:
         """Return the UTC of a time in TAI; both are seconds since 1970.
@@ -130,7 +138,7 @@ def _parse_zone_table(text: str, path: str) -> LeapSeconds:
             offset += 1
         else:
             offset -= 1
-        starts.append(int(date.timestamp()) + 86_400)
+        starts.append(int((date + timedelta(days=1)).timestamp()))
         offsets.append(offset)
     if not starts:
         raise ValueError(path)

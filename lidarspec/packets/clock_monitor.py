@@ -27,7 +27,7 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.timing import HOUR_S, Clock, ClockState
+from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, HOUR_S, Clock, ClockState
 
 Integers = NDArray[np.int64]
 
@@ -37,22 +37,20 @@ DRIFT_LIMIT_PPM = 100.0  # crystals are within 50 ppm
 OFFSET_LIMIT_S = 0.5
 SCALE_TOLERANCE_S = 0.25  # of the offset from another time scale
 STEP_TOLERANCE_S = 0.05  # of a step by a second
-#: the first date that a synchronized clock can have, s: 2001. Clocks that count from power-up, or
-#: from a wrong date, are earlier.
-FIRST_DATE_S = 1e9
 LATE_NS = 50_000_000
+JITTER_PERCENTILE = 95  # of the delays of packets
 PIECE_NS = 250_000_000  # packets are judged in pieces of this duration
 ESTIMATE_PARTS = 360  # 90 s, for a drift within 1 ppm of a clock that counts milliseconds
 MIN_PIECES = 4  # after which a clock can be in order
-WRONG_DATE_S = 86_400.0
+WRONG_DATE_S = DAY_S  # difference from the host from which on the date is wrong
 #: the time that a clock shows at most when the first packets after its restart arrive, s
 RESTART_LIMIT_S = 1.0
 #: how near to the end of a month a second is a leap second, s
 LEAP_LIMIT_S = 10.0
-DAY_S = 86_400
 KEPT_DELAYS = 4096
 KEPT_EVENTS = 1000
 KEPT_SAMPLES = 600
+KEPT_READINGS = 64
 SAMPLE_NS = 1_000_000_000
 
 
@@ -146,7 +144,8 @@ class ClockMonitor:
         self._state: ClockState | None = None
         self._device_ns = 0
         self._host_ns = 0
-        self._readings = deque[tuple[int, int]](maxlen=64)  # arrival and reading of each piece
+        # arrival time and reading of the first packet of each piece, ns
+        self._readings = deque[tuple[int, int]](maxlen=KEPT_READINGS)
         self._pieces = 0
         self._packets = 0
         self._late = 0
@@ -186,12 +185,12 @@ class ClockMonitor:
         """Return what is known now."""
         offset_s = error_s = drift_ppm = jitter_ms = math.nan
         if self._pieces:
-            offset_s = -self._estimate.offset_ns / 1e9
+            offset_s = self._offset_s
             error_s = self._find_error_s()
         if self._estimate.is_settled:
             drift_ppm = self._estimate.drift_ppm
         if len(self._delays):
-            jitter_ms = float(np.percentile(self._delays, 95)) / 1e6
+            jitter_ms = self._find_jitter_ms()
         state = self._state
         faults = tuple(event for event in self._events if event.is_fault)
         findings = sorted((*self._judge(), *faults), key=_rank)
@@ -213,19 +212,24 @@ class ClockMonitor:
         )
 
     @property
+    def _offset_s(self) -> float:
+        """The sensor's time minus the host's, s."""
+        return -self._estimate.offset_ns / 1e9
+
+    def _find_jitter_ms(self) -> float:
+        """Return the delay that few of the newest packets exceed, ms."""
+        return float(np.percentile(self._delays, JITTER_PERCENTILE)) / 1e6
+
+    @property
     def _epoch(self) -> str:
-        """What the clock is declared to count now."""
-        clock = self._clock
-        if clock is None:
+        """The epoch that the sensor declares for the present state of the clock."""
+        if self._clock is None:
             return ""
-        epoch = clock.epoch if self._state is None else clock.epoch_in(self._state)
-        if epoch == "hour" and self._has_date:
-            return "utc"  # another frame has completed the hour
-        return epoch
+        return self._clock.epoch_at(self._device_ns, self._state)
 
     @property
     def _has_date(self) -> bool:
-        return self._device_ns >= FIRST_DATE_S * 1e9
+        return self._device_ns >= FIRST_DATE_NS
 
     def _read_status(self, packets: Packets) -> list[ClockFinding]:
         """Return the changes of the clock's status, and remember the last one."""
@@ -268,16 +272,15 @@ class ClockMonitor:
         if len(self._delays) and (
             not self.samples or self._host_ns - self.samples[-1].host_ns >= SAMPLE_NS
         ):
-            offset_s = -self._estimate.offset_ns / 1e9
-            jitter_ms = float(np.percentile(self._delays, 95)) / 1e6
-            self.samples.append(OffsetSample(self._host_ns, offset_s, jitter_ms))
+            sample = OffsetSample(self._host_ns, self._offset_s, self._find_jitter_ms())
+            self.samples.append(sample)
         return jumps
 
     def _name_jump(self, jump: ClockJump) -> ClockFinding:
         """Return the event that caused a jump of the clock."""
         change_s = jump.change_ns / 1e9
         event = ClockFinding("jump", jump.host_ns, change_s)
-        if self._began_again(jump):
+        if self._has_restarted(jump):
             return replace(event, code="restart")
         if abs(abs(change_s) - 1) < STEP_TOLERANCE_S:
             if _is_at_month_end(jump.host_ns):
@@ -285,7 +288,7 @@ class ClockMonitor:
             return replace(event, code="second_step")
         return event
 
-    def _began_again(self, jump: ClockJump) -> bool:
+    def _has_restarted(self, jump: ClockJump) -> bool:
         """Return whether the clock went back by more than a day, or to 0 without a wrap."""
         if jump.change_ns < -DAY_S * 1e9:
             return True
@@ -302,25 +305,17 @@ class ClockMonitor:
 
     def _find_error_s(self) -> float:
         """Return the offset without the difference of the time scales, s; nan without a date."""
-        offset_s = -self._estimate.offset_ns / 1e9
         epoch = self._epoch
-        if epoch == "hour" and not self._has_date:
-            offset_s = (offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2
-            return offset_s
+        if epoch == "hour":
+            return (self._offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2
         if epoch == "boot" or not self._has_date:
             return math.nan
-        return offset_s - self._scale_offsets.get(epoch, 0)
+        return self._offset_s - self._scale_offsets.get(epoch, 0)
 
     @property
     def _scale_offsets(self) -> dict[str, int]:
-        """Seconds by which each time scale is ahead of UTC."""
-        leap_seconds = read_leap_seconds()
-        utc_s = self._host_ns / 1e9
-        return {
-            "utc": 0,
-            "tai": leap_seconds.tai_minus_utc(utc_s),
-            "gps": leap_seconds.gps_minus_utc(utc_s),
-        }
+        """Seconds by which each time scale is ahead of UTC now."""
+        return read_leap_seconds().scale_offsets(self._host_ns / 1e9)
 
     def _judge(self) -> Iterator[ClockFinding]:
         """Yield one or more findings about the present state of the clock."""

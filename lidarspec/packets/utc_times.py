@@ -23,22 +23,18 @@ from lidarspec.leap_seconds import TAI_MINUS_GPS_S, read_leap_seconds
 from lidarspec.packets.clock_estimate import DeviceClock
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.packets import Packets
-from lidarspec.spec.timing import EPOCHS, HOUR_S, Clock
+from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS, FIRST_DATE_NS, HOUR_S, Clock, ClockState
 
 Times = NDArray[np.int64]
 SECOND_NS = 1_000_000_000
 HOUR_NS = HOUR_S * SECOND_NS
-#: The first date that a clock can have, s: 2001. A clock that was never set shows an earlier one.
-FIRST_DATE_S = 1e9
 #: How many changes are described one by one.
 MAX_DESCRIBED_CHANGES = 10
-#: The epochs of clocks that have a date.
-DATED_EPOCHS = ("utc", "tai", "gps")
 
 
 @dataclass(frozen=True)
 class UtcSource:
-    """Where UTC comes from.
+    """The source of UTC.
 
     Attributes:
         kind: "clock": the sensor's clock has a date. "hour": it counts from the full hour, and the
@@ -195,24 +191,19 @@ class UtcTimes:
         clock = self._clock
         if clock is None:
             raise self._explain_no_clock()
-        epoch = clock.epoch
-        locked: bool | None = None
-        meaning = ""
+        state: ClockState | None = None
         if clock.status is not None and not math.isnan(self._status):
             state = clock.status.state_of(self._status)
-            epoch = clock.epoch_in(state)
-            locked = state.locked
-            meaning = state.meaning
-        has_date = time_ns >= FIRST_DATE_S * SECOND_NS
-        if epoch == "hour" and has_date:
-            epoch = "utc"  # another frame has completed the hour
-        if epoch in DATED_EPOCHS and has_date:
+        epoch = clock.epoch_at(time_ns, state)
+        if epoch in DATED_EPOCHS and time_ns >= FIRST_DATE_NS:
             kind = "clock"
         elif epoch == "hour":
             kind = "hour"
         else:
             kind = "arrival"
-        return UtcSource(kind, epoch, locked, meaning)
+        if state is None:
+            return UtcSource(kind, epoch)
+        return UtcSource(kind, epoch, state.locked, state.meaning)
 
     def _subtract_scale(self, time_ns: int, epoch: str) -> int:
         """Return the UTC of a time in another time scale, ns."""

@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from lidarspec.errors import UsageError, did_you_mean
 from lidarspec.leap_seconds import read_leap_seconds
 from lidarspec.spec.fields import duration
+from lidarspec.spec.timing import DATED_EPOCHS
 
 Times = NDArray[np.int64]
 SECOND_NS = 1_000_000_000
-#: The time scales that a clock can follow.
-SCALES = ("utc", "tai", "gps")
 #: States of a clock: it is locked to its source, it has lost its source and continues, or it has
 #: restarted.
 LOCKED = 0
@@ -65,9 +64,9 @@ class ClockFaults:
     restarts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.follows not in ("", *SCALES):
+        if self.follows not in ("", *DATED_EPOCHS):
             raise UsageError(
-                f"a clock cannot follow {self.follows!r}: expected {', '.join(SCALES)}"
+                f"a clock cannot follow {self.follows!r}: expected {', '.join(DATED_EPOCHS)}"
             )
         if not abs(self.drift_ppm) <= MAX_DRIFT_PPM:
             raise UsageError(f"drift must be at most {MAX_DRIFT_PPM:g} ppm, not {self.drift_ppm:g}")
@@ -92,12 +91,12 @@ def parse_clock_faults(text: str) -> ClockFaults:
         fault, mark, when = part.strip().partition("@")
         name, _, value = fault.partition("=")
         start_s = duration(when) if mark else 0.0
-        if name in SCALES and part.strip() == name:
+        if name in DATED_EPOCHS and part.strip() == name:
             faults = replace(faults, follows=name)
         elif name in _READERS:
             faults = _READERS[name](faults, value, start_s)
         else:
-            names = (*SCALES, *_READERS)
+            names = (*DATED_EPOCHS, *_READERS)
             raise UsageError(
                 f"invalid clock fault {part.strip()!r}: expected {', '.join(names)}"
                 f"{did_you_mean(name, names)}"
@@ -216,7 +215,5 @@ class ClockTimeline:
 
     def _scale_offset_ns(self) -> int:
         """Return the time scale that the clock follows minus UTC, ns."""
-        table = read_leap_seconds()
-        now_s = self._power_on_ns / SECOND_NS
-        offsets_s = {"utc": 0, "tai": table.tai_minus_utc(now_s), "gps": table.gps_minus_utc(now_s)}
+        offsets_s = read_leap_seconds().scale_offsets(self._power_on_ns / SECOND_NS)
         return offsets_s[self.faults.follows] * SECOND_NS

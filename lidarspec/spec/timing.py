@@ -18,7 +18,10 @@ import numpy as np
 from lidarspec.errors import SpecError
 
 HOUR_S = 3600
-_DAY_S = 86_400
+DAY_S = 86_400
+#: The first date that a clock can have, ns since 1970: 2001. Clocks that count from power-up, or
+#: from a date that was never set, show earlier times.
+FIRST_DATE_NS = 10**18
 #: The days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
 _EPOCH_DAYS = 719_469
 #: Times in 64-bit nanoseconds are limited to 292 years.
@@ -26,9 +29,10 @@ MAX_CLOCK_S = 2**63 / 1e9
 #: A field path, several paths of fields to add, or a function of `Fields` that returns one column
 #: or several columns to add.
 Source = str | tuple[str, ...] | Callable[[Any], Any]
-#: What a clock can count, by the name in `Clock.epoch`. "utc", "tai" and "gps" count from 1970, so
-#: that they differ by leap seconds only: in 2017 to 2026, TAI is 37 s and GPS time 18 s ahead of
-#: UTC.
+#: The epochs of clocks with a date. They count from 1970 and differ by leap seconds only: in 2017
+#: to 2026, TAI is 37 s and GPS time 18 s ahead of UTC.
+DATED_EPOCHS = ("utc", "tai", "gps")
+#: What a clock can count, by the name in `Clock.epoch`.
 EPOCHS = MappingProxyType(
     {
         "": "not declared",
@@ -235,11 +239,18 @@ class Clock:
                 path="clock.wraps_at",
             )
 
-    def epoch_in(self, state: ClockState) -> str:
-        """Return what the clock counts in a state."""
-        if state.epoch is not None:
+    def epoch_in(self, state: ClockState | None) -> str:
+        """Return what the clock counts in a state; None if the state is unknown."""
+        if state is not None and state.epoch is not None:
             return state.epoch
         return self.epoch
+
+    def epoch_at(self, time_ns: int, state: ClockState | None) -> str:
+        """Return what the clock counts in a state, at a time that it shows, ns."""
+        epoch = self.epoch_in(state)
+        if epoch == "hour" and time_ns >= FIRST_DATE_NS:
+            return "utc"  # another frame has completed the hour
+        return epoch
 
 
 def _check_epoch(epoch: str, path: str) -> None:
@@ -295,4 +306,4 @@ def unix_time(
     leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
     days_before_month = np.floor((153 * months + 2) / 5)  # months have 31, 30, 31, 30, 31 days
     days = 365 * years + leap_days + days_before_month + day - _EPOCH_DAYS
-    return _DAY_S * days + 3600 * hour + 60 * minute + second
+    return DAY_S * days + 3600 * hour + 60 * minute + second
