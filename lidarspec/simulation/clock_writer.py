@@ -35,13 +35,11 @@ from lidarspec.packets.packet_type import find_clock
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.clock_faults import ClockFaults, ClockTimeline
 from lidarspec.simulation.raw_values import PartRows, write_raw
-from lidarspec.spec.timing import Clock, ClockState
+from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, Clock, ClockState
 from lidarspec.spec.tree import FieldInfo, to_exact
 
 Times = NDArray[np.int64]
-DAY_NS = 86_400_000_000_000
-#: First date of a clock that was set, ns since 1970: 2001.
-FIRST_DATE_NS = 10**18
+DAY_NS = DAY_S * 10**9
 #: Numbers of days in a year. The next constant is the numbers of days in a month.
 YEAR_DAYS = (365, 366)
 MONTH_DAYS = (28, 29, 30, 31)
@@ -241,12 +239,12 @@ class ClockWriter:
             base = np.datetime64(self.read(table).item() // DAY_NS, "D")
             self._date = _DateFields(*paths, base, (year, month, day))
         elif date:
-            raise self._refuse("the fields of its date were not all found")
+            raise self._make_error("the fields of its date were not all found")
         self._set_fields(linear)
 
     def _set_fields(self, fields: list[_TimeField]) -> None:
         if not fields:
-            raise self._refuse("no field outside of arrays determines it")
+            raise self._make_error("no field outside of arrays determines it")
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
@@ -269,9 +267,9 @@ class ClockWriter:
             wanted = wanted % self.period_ns
         self.write(table, wanted)
         if abs(self.read(table) - wanted).item() > max(self.resolution_ns, 1000):
-            raise self._refuse("its function cannot be inverted")
+            raise self._make_error("its function cannot be inverted")
 
-    def _refuse(self, reason: str) -> UsageError:
+    def _make_error(self, reason: str) -> UsageError:
         return UsageError(f"the clock of {self._sensor.id} cannot be written: {reason}")
 
 
@@ -364,10 +362,8 @@ class FrameClock:
         if timeline.faults.sets_status:
             try:
                 status = self._status
-            except (
-                UsageError
-            ):  # only faults of the lock require the status, and they were checked before
-                status = None
+            except UsageError:
+                status = None  # `check_status` has checked the faults that require the status
             if status is not None:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
 
@@ -475,14 +471,11 @@ class StatusWriter:
         """
 
         def rank(choice: _StatusChoice, epoch: str, raw: tuple[int, ...]) -> tuple[Any, ...]:
+            # The field with the mode comes before the field with its status, which is changed
+            # rather than the mode.
             changes = [a != b for a, b in zip(choice.raw, raw, strict=True)]
             differs = self._clock.epoch_in(choice.state) != epoch
-            return (
-                differs,
-                sum(changes),
-                sum(choice.raw),
-                changes,
-            )  # a field with the mode comes before the field with its status
+            return differs, sum(changes), sum(choice.raw), changes
 
         locked = min(
             (choice for choice in self._choices if choice.state.locked),
