@@ -1,4 +1,4 @@
-"""Findings about a sensor's clock: codes, their words, and what to do about them.
+"""Findings about a sensor's clock: codes, their words, and the next step.
 
 A `ClockFinding` is either a state, such as a clock that runs on TAI, or an event with a time, such
 as a clock that was set. Programs compare codes; only people read the words.
@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from lidarspec.spec.timing import DAY_S
+
 
 class FindingType(NamedTuple):
     """The words of a code, with the fields of `ClockFinding` in braces.
 
     Attributes:
         text: what was found.
-        advice: what to do about it; "" if nothing is wrong.
+        advice: the next step; "" if none is needed.
         is_fault: whether something is wrong.
     """
 
@@ -42,11 +44,11 @@ FINDING_TYPES = MappingProxyType(
             "runs on UTC, expected {epoch}", "-O epoch=utc, or let the grandmaster send TAI"
         ),
         "behind_utc": FindingType(
-            "{value:.0f} s behind UTC: it subtracts the offset of TAI from a time in UTC",
+            "{behind:.0f} s behind UTC: it subtracts the offset of TAI from a time in UTC",
             "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
         ),
         "second_off": FindingType(
-            "{value:+.3f} s off: a second, as when a pulse (PPS) has the wrong sentence",
+            "{value:+.3f} s off: a pulse (PPS) was probably combined with the wrong sentence",
             "check that the NMEA sentence follows the pulse that it belongs to",
         ),
         "wrong_date": FindingType(
@@ -58,7 +60,7 @@ FINDING_TYPES = MappingProxyType(
             "synchronize both to one source; chronyc tracking shows this computer's",
         ),
         "drift": FindingType(
-            "runs {value:+.1f} ppm fast", "synchronize the sensor by PTP or PPS, or use --time host"
+            "drifts by {value:+.1f} ppm", "synchronize the sensor by PTP or PPS, or use --time host"
         ),
         "unsynchronized": FindingType(
             "counts from power-up, expected {epoch}",
@@ -113,14 +115,17 @@ class ClockFinding:
     @property
     def text(self) -> str:
         """A few words on what was found, to be put after the name of the sensor."""
-        value = abs(self.value) if self.code == "behind_utc" else self.value
-        text = FINDING_TYPES[self.code].text
-        days = abs(value) / 86_400
-        return text.format(value=value, days=days, state=self.state, epoch=self.epoch.upper())
+        return FINDING_TYPES[self.code].text.format(
+            value=self.value,
+            behind=-self.value,
+            days=abs(self.value) / DAY_S,
+            state=self.state,
+            epoch=self.epoch.upper(),
+        )
 
     @property
     def advice(self) -> str:
-        """What to do about the finding; "" if nothing is wrong."""
+        """The next step; "" if none is needed."""
         return FINDING_TYPES[self.code].advice
 
     @property
