@@ -47,6 +47,7 @@ LATE_LIMIT_NS = 10_000_000
 CERTAIN_OUTLIERS = 3
 LATE_OUTLIERS = 5  # if they are only late
 LATE_OUTLIERS_NS = 1_000_000_000  # minimum duration if they are only late
+MIN_LATE_SPREADS = 4  # minimum of lateness divided by spread, if they are only late
 
 
 class ClockSample(NamedTuple):
@@ -54,6 +55,11 @@ class ClockSample(NamedTuple):
 
     device: int
     delay: int
+
+    @property
+    def host(self) -> int:
+        """The arrival time, ns."""
+        return self.device + self.delay
 
 
 class ClockLine(NamedTuple):
@@ -199,13 +205,13 @@ class DeviceClock:
         deviation = self._deviation(sample)
         has_paused = (
             bool(self._min_delays)
-            and sum(sample) - sum(self._min_delays[-1]) > self._parts * PART_NS
+            and sample.host - self._min_delays[-1].host > self._parts * PART_NS
         )
         if has_paused and abs(deviation) < UNSETTLED_LIMIT_NS:
             self._forget_offset()  # the drift is not known well enough for such a pause
         early_limit = UNSETTLED_LIMIT_NS
         late_limit = UNSETTLED_LIMIT_NS
-        if len(self._min_delays) >= SETTLED_PARTS:
+        if self.is_settled:
             early_limit = EARLY_LIMIT_NS
             late_limit = LATE_LIMIT_NS
         if not self._min_delays or -early_limit < deviation < late_limit:
@@ -213,9 +219,9 @@ class DeviceClock:
             self._update_line(sample)
             return None
         if not self._outliers:
-            self._first_outlier_ns = sum(sample)
+            self._first_outlier_ns = sample.host
         self._outliers.append(sample)
-        if self._was_set(sum(sample) - self._first_outlier_ns):
+        if self._was_set(sample.host - self._first_outlier_ns):
             return self._restart_at_outliers()
         return None
 
@@ -247,7 +253,7 @@ class DeviceClock:
         return (
             len(outliers) == LATE_OUTLIERS
             and lasting >= LATE_OUTLIERS_NS
-            and min(map(self._deviation, outliers)) > 4 * spread
+            and min(map(self._deviation, outliers)) > MIN_LATE_SPREADS * spread
         )
 
     def _restart_at_outliers(self) -> ClockJump:
@@ -257,7 +263,7 @@ class DeviceClock:
         """
         outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
         self.jumps += 1
-        host_ns = sum(outliers[-1])
+        host_ns = outliers[-1].host
         delay_before = self._line.delay_at(host_ns - self._line.delay)
         delay_after = min(sample.delay for sample in outliers)
         jump = ClockJump(delay_before - delay_after, self._first_outlier_ns)
@@ -279,7 +285,7 @@ class DeviceClock:
             self._min_delays.pop()
         self._min_delays.append(sample)
         self._line = fit_line(self._min_delays, self._reliable_slope)
-        if len(self._min_delays) >= SETTLED_PARTS:
+        if self.is_settled:
             self.jump = None
         if len(self._min_delays) == self._parts:
             self._reliable_slope = self._line.slope
