@@ -1,4 +1,4 @@
-"""`clock`: tell what the clocks of sensors count, and how well they run."""
+"""`clock`: diagnose the clocks of sensors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from lidarspec.packets.packets import Packets
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.live_scans import LOOK_S
 
-UNSYNCHRONIZED = ("not_locked", "unsynchronized", "wrong_date")
+#: Codes of findings about a clock that nothing synchronizes.
+UNSYNCHRONIZED_CODES = ("not_locked", "unsynchronized", "wrong_date")
 DEFAULT_DURATION_S = 12.0  # the drift is known after ten seconds
 
 
@@ -116,11 +117,11 @@ def clock(
         ]
         with contextlib.suppress(KeyboardInterrupt):
             _read_all(clocks, duration)
-        reports = [one.report() for one in clocks]
-        for one, report in zip(clocks, reports, strict=True):
-            _print_report(one, report, reports[0], as_json=as_json)
-        for one in clocks:
-            conclude(one.device)
+        reports = [source_clock.report() for source_clock in clocks]
+        for source_clock, report in zip(clocks, reports, strict=True):
+            _print_report(source_clock, report, reports[0], as_json=as_json)
+        for source_clock in clocks:
+            conclude(source_clock.device)
     if any(finding.is_fault for report in reports for finding in report.findings):
         raise click.exceptions.Exit(FINDINGS)
 
@@ -135,28 +136,43 @@ def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) 
     """
     try:
         with open_device(source, sensor_id, start=False, period=LOOK_S) as device:
-            one = SourceClock(device, source, DRIFT_LIMIT_PPM)
-            _read_all([one], seconds)
-            report = one.report()
+            source_clock = SourceClock(device, source, DRIFT_LIMIT_PPM)
+            _read_all([source_clock], seconds)
+            report = source_clock.report()
     except LidarSpecError:
         return None
     verdict = report.verdict
     if verdict.code == "no_clock":
         return None
-    is_ok = not verdict.is_fault or verdict.code in UNSYNCHRONIZED
+    is_ok = not verdict.is_fault or verdict.code in UNSYNCHRONIZED_CODES
     return Diagnosis(is_ok, f"clock: {describe_clock(report)}", "" if is_ok else verdict.advice)
 
 
 def _read_all(clocks: Sequence[SourceClock], duration: float | None) -> None:
-    """Read all sources in turn, until the duration has passed or the input has ended."""
-    if duration is None and not all(one.device.is_live for one in clocks):
-        duration = math.inf
-    deadline = time.monotonic() + (DEFAULT_DURATION_S if duration is None else duration)
+    """Read all sources in turn, until the duration has passed or the input has ended.
+
+    Without a duration, live sources are read for the default duration, and files to their end.
+    """
+    began = time.monotonic()
     running = list(clocks)
-    while running and time.monotonic() < deadline:
-        for one in running:
-            one.read()
-        running = [one for one in running if not one.ended]
+    while running:
+        for source_clock in running:
+            source_clock.read()
+        passed_s = time.monotonic() - began
+        running = [
+            source_clock
+            for source_clock in running
+            if not source_clock.ended and passed_s < _find_limit_s(source_clock, duration)
+        ]
+
+
+def _find_limit_s(source_clock: SourceClock, duration: float | None) -> float:
+    """Return the time after which a source is no longer read, in seconds."""
+    if duration is not None:
+        return duration
+    if source_clock.device.is_live:
+        return DEFAULT_DURATION_S
+    return math.inf
 
 
 def _iter_batches(device: Device) -> Iterator[Iterable[Packets]]:
@@ -170,18 +186,21 @@ def _iter_batches(device: Device) -> Iterator[Iterable[Packets]]:
 
 
 def _print_report(
-    one: SourceClock, report: ClockReport, first: ClockReport, *, as_json: bool
+    source_clock: SourceClock, report: ClockReport, first: ClockReport, *, as_json: bool
 ) -> None:
     """Print what is known about one clock, and its offset from the first one."""
     mutual_s = math.nan
     if report is not first:
         mutual_s = report.error_s - first.error_s
     if as_json:
-        facts: dict[str, Any] = {"source": one.source, "sensor": one.device.sensor.id}
+        facts: dict[str, Any] = {
+            "source": source_clock.source,
+            "sensor": source_clock.device.sensor.id,
+        }
         facts["to_first_s"] = None if math.isnan(mutual_s) else mutual_s
         say(json.dumps({**facts, **report.to_dict()}, allow_nan=False))
         return
-    say(f"{one.source}: {one.device.sensor.id}")
+    say(f"{source_clock.source}: {source_clock.device.sensor.id}")
     rows = list(iter_clock_rows(report))
     if not math.isnan(mutual_s):
         rows.insert(2, ("", f"{mutual_s * 1e3:+.2f} ms to the first source"))

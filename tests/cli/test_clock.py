@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
+from lidarspec.cli import clock
 from lidarspec.spec import Chunk
 from tests.cli.running import ran
 from tests.evidence import capture
@@ -67,6 +68,16 @@ def test_sources_are_compared_with_the_first(tmp_path: Path) -> None:
     assert reports[0]["to_first_s"] is None
     assert reports[1]["to_first_s"] == pytest.approx(2e-3, abs=1e-6)
     assert "+2.00 ms to the first source" in ran("clock", first, second).stdout
+
+
+def test_a_live_source_ends_beside_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a duration, a file is read to its end, and a live source for a limited time."""
+    monkeypatch.setattr(clock, "DEFAULT_DURATION_S", 1.0)
+    path = record(tmp_path / "drive.lsr", ahead_ns=TAI_NS)
+    lines = ran("clock", path, f"sim:{ID}", "--json", code=1).stdout.splitlines()
+    packets = [json.loads(line)["packets"] for line in lines]
+    assert packets[0] == 200
+    assert packets[1] > 0
 
 
 def test_stats_and_doctor_report_the_clock(tmp_path: Path) -> None:
