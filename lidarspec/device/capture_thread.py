@@ -78,9 +78,7 @@ class BoundedQueue:
         self._max_bytes = size
         self._events: deque[Event] = deque()
         self._kept_events: dict[Event, None] = {}  # events other than data that left the full queue
-        self._links_with_gap: set[str] = (
-            set()
-        )  # links with dropped chunks; their next chunk has a gap
+        self._links_with_gap = set[str]()  # links with dropped chunks; their next chunk has a gap
         self._waiting = self._size = 0
         self._changed = threading.Condition()
         self.produced = self.consumed = self.dropped = 0

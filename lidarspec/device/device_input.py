@@ -173,7 +173,7 @@ class DeviceInput(Protocol):
         """
 
     def mark(self) -> int:
-        """Return a count of the data that has arrived, as an argument for `caught_up`."""
+        """Return a count of the data that has arrived, as an argument for `has_decoded_until`."""
         return 0
 
     def has_decoded_until(self, mark: int) -> bool:
