@@ -227,9 +227,9 @@ def _add_points(
     """Return the rows with the points that each contains, and notes on the frame."""
     frame = sensor.frames[name]
     survey = get_codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    notes = ["the values are not plausible, so decoders skip this frame"] * bool(
-        survey.status[0] == IMPLAUSIBLE
-    )
+    notes = list[str]()
+    if survey.status[0] == IMPLAUSIBLE:
+        notes.append("the values are not plausible, so decoders skip this frame")
     if not (frame.data or frame.points):
         return rows, tuple(notes)
     try:
@@ -243,9 +243,10 @@ def _add_points(
         evaluated = evaluate_plainly(packets)
     except LidarSpecError as error:
         return rows, (*notes, f"the frame could not be decoded to points: {error}")
-    notes += [
-        "default values are used, because a frame of another type with the values is missing"
-    ] * bool(evaluated.cloud.nominal)
+    if evaluated.cloud.nominal:
+        notes.append(
+            "default values are used, because a frame of another type with the values is missing"
+        )
     points = [ExplainedPoint.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain
     parts = _find_parts_with_points(sensor, name, data)
