@@ -85,13 +85,11 @@ class HexText:
 
     def __init__(self) -> None:
         self._in_comment = self._in_array = False
-        self._columns: tuple[int, int] | None = (
-            None  # indices of the columns with values and times in a table
-        )
+        # indices of the columns with values and times in a table
+        self._columns: tuple[int, int] | None = None
         self._bus = ""
-        self._dump_offset: int | None = (
-            None  # number of bytes so far in a dump with offsets that have no colon
-        )
+        # number of bytes so far in a dump with offsets that have no colon
+        self._dump_offset: int | None = None
 
     def read_line(self, text: str) -> Chunk:
         """Return the bytes and the time of the next line.

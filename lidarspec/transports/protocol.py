@@ -196,9 +196,10 @@ class Transport(ABC):
         stored: Any = self.stored
         if stored is None or not stored.seekable():
             return None
-        size: int = (
-            stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size
-        )  # in a store, or on this computer
+        if hasattr(stored, "size"):  # the file is in a store
+            size: int = stored.size
+        else:
+            size = os.fstat(stored.fileno()).st_size
         return stored.tell(), size
 
     def skip_until(self, time_ns: int) -> bool:

@@ -65,9 +65,8 @@ class SimulatedTransport(LiveTransport):
         self._clock = HostClock()
         self._next_read_ns = 0
         self._changed: threading.Condition
-        self._unread: dict[
-            str, list[bytes]
-        ]  # link -> bytes that the device has sent and that were not read yet
+        # link -> bytes that the device has sent and that were not read yet
+        self._unread: dict[str, list[bytes]]
         if data is None:
             self._changed = threading.Condition()
             self._unread = {}
