@@ -178,7 +178,7 @@ class _SendBuffer:
 class UdpLine(OutletLine):
     """Sends UDP datagrams to a host, or to the sender of the last command.
 
-    `UdpLine.to` and `UdpLine.replying` make a line.
+    `UdpLine.to` and `UdpLine.make_reply_line` make a line.
 
     Attributes:
         takes_commands: whether the line receives commands. If so, the data is sent to the sender of
