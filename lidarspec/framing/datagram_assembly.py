@@ -24,9 +24,10 @@ from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: The maximum number of incomplete messages, the maximum number of stored keys of messages that
-#: were completed or dropped, and the time after which an incomplete message is dropped.
+#: The maximum number of incomplete messages. At most as many keys of completed and dropped messages
+#: are stored.
 MAX_WAITING_MESSAGES = 8
+#: The time after which an incomplete message is dropped.
 MAX_WAIT_NS = 10**9
 
 #: The maximum payload of a datagram in bytes.

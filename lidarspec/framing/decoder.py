@@ -229,7 +229,7 @@ class Decoder:
         if at is None:
             times = repeat(-1, len(data))
         else:
-            times = np.array([-1 if one is None else one for one in at], np.int64)
+            times = np.array([-1 if time is None else time for time in at], np.int64)
         return self.decode_placed(buffer, _compute_offsets(sizes), sizes, times)
 
     def decode_placed(
