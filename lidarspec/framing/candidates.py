@@ -290,7 +290,7 @@ class Candidates:
         Attributes:
             buffer: the bytes to search, shortened if there are too many candidates.
             is_whole: whether `buffer` was not shortened.
-            judged: the checked candidates of each type that was searched so far, by type index.
+            checked: the checked candidates of each type that was searched so far, by type index.
                 Types without candidates are left out.
     """
 
@@ -302,7 +302,7 @@ class Candidates:
         if not all(framing.marks[kind] for kind in framing.active_types(mode)):
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._offsets_by_prefix: dict[Marks, Offsets] = {}
-        self.judged: dict[int, Frames] = {}
+        self.checked: dict[int, Frames] = {}
         self._live: dict[int, Frames] = {}
         self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
@@ -336,7 +336,7 @@ class Candidates:
         all_runs = dict[int, WeakRuns]()
         active = self._framing.active_types(mode)
         for kind in active:
-            own = self.judged.get(kind)
+            own = self.checked.get(kind)
             if own is None:
                 continue
             if self._framing.is_weak(kind):
@@ -421,7 +421,7 @@ class Candidates:
             if not own.is_sound:
                 is_right = own.status != CONSTANT
                 own = own if is_right.all() else own.select(is_right)
-            self.judged[kind] = own
+            self.checked[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
         """Return how many candidates of a type, from the first on, can be checked now."""

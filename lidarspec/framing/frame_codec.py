@@ -101,13 +101,13 @@ class Codec:
 
     def make_checker(self, layout: Layout) -> CandidateChecker:
         """Return the checker for candidates of one layout that have the checked constants."""
-        judge = layout.notes.get(CandidateChecker)
-        if judge is None:
+        checker = layout.notes.get(CandidateChecker)
+        if checker is None:
             self._conditions = self._conditions or StructConditions(
                 self.frame.plausible, self.schema, layout
             )
             tests = self._conditions.make_struct_conditions(layout), self._conditions.checks(layout)
-            judge = layout.notes[CandidateChecker] = CandidateChecker(
+            checker = layout.notes[CandidateChecker] = CandidateChecker(
                 self.frame, self.schema, layout, self._checked_constants, *tests
             )
-        return judge
+        return checker

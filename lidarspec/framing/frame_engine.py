@@ -169,7 +169,7 @@ class CompiledCodec(Codec):
             buffer, offsets[partial], ends[~is_whole], together.layouts[0], sizes[partial]
         )
         whole = which[is_whole]
-        status[whole] = together.judge(buffer, offsets[whole], together.forms[is_whole], sums)
+        status[whole] = together.check(buffer, offsets[whole], together.forms[is_whole], sums)
         if together.is_final:
             return []
         is_undecided = np.zeros(len(which), np.bool_)
@@ -209,23 +209,23 @@ class CompiledCodec(Codec):
         number = len(offsets)
         own = offsets if count == number else offsets[whole]
         gathered = gathered and (count == number or bool(whole[:count].all()))
-        judge = self.make_checker(layout)
+        check = self.make_checker(layout)
         step = max(BLOCK // layout.size, 1)
         kept = None
         if count <= step or not gathered:
             rows = gather_rows(buffer, own, layout.size, gathered=gathered)
-            judged = judge(rows, errors, sums)
+            row_status = check(rows, errors, sums)
             kept = rows if gathered else None
         else:
             blocks = (own[start : start + step] for start in range(0, count, step))
-            judged = np.concatenate(
-                [judge(gather_rows(buffer, block, layout.size), errors, sums) for block in blocks]
+            row_status = np.concatenate(
+                [check(gather_rows(buffer, block, layout.size), errors, sums) for block in blocks]
             )
         if count == number:
-            return judged, repeat(layout.size, number), kept
+            return row_status, repeat(layout.size, number), kept
         status = np.empty(number, np.uint8)
         sizes = np.full(number, layout.size)
-        status[whole] = judged
+        status[whole] = row_status
         ends = len(buffer) if stops is None else stops[~whole]
         status[~whole], sizes[~whole] = _check_incomplete(
             buffer, offsets[~whole], ends, layout, sizes[~whole]

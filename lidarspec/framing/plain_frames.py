@@ -55,7 +55,7 @@ class _Text:
     terminator: int
     following: Mapping[int, int]
 
-    def judge(
+    def check(
         self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], ends: NDArray[np.intp]
     ) -> NDArray[np.uint8]:
         """Check candidates by the terminator of the text, and return their status, (n,).
@@ -151,7 +151,7 @@ class PlainCodec(Codec):
         ends = np.minimum(offsets + self.frame.room, len(buffer) if stops is None else stops)
         status = np.full(len(offsets), VALID, np.uint8)
         if self._text is not None:
-            status = self._text.judge(buffer, offsets, ends)
+            status = self._text.check(buffer, offsets, ends)
             is_whole = ends - offsets >= self.frame.room
             status[is_whole & (status == SHORT)] = LENGTH
         if self.frame.endless is not None:

@@ -151,19 +151,19 @@ class CandidateChecker:
 
 
 def _check_valid(
-    status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]
+    status: NDArray[np.uint8], rows: Bytes2D, check: Callable[[Bytes2D], NDArray[np.uint8]]
 ) -> None:
     """Check the candidates that are valid so far, and set their status.
 
     Args:
-        judge: a function that returns the status of candidates.
+        check: a function that returns the status of candidates.
     """
     if not np.count_nonzero(status):
-        status[:] = judge(rows)
+        status[:] = check(rows)
         return
     left = np.flatnonzero(status == VALID)
     if len(left):
-        status[left] = judge(take_rows(rows, left))
+        status[left] = check(take_rows(rows, left))
 
 
 def _check_valid_parts(
@@ -256,12 +256,16 @@ class StructConditions:
         """Return the conditions of the struct as checks of frames of a layout."""
         every = (
             (
-                one,
-                {info.path: leaf for info in one.fields if (leaf := layout.leaves.get(info.path))},
+                condition,
+                {
+                    info.path: leaf
+                    for info in condition.fields
+                    if (leaf := layout.leaves.get(info.path))
+                },
             )
-            for one in layout.conditions
+            for condition in layout.conditions
         )
-        return [self._check(one, leaves) for one, leaves in every]
+        return [self._check(condition, leaves) for condition, leaves in every]
 
     def checks(self, layout: Layout) -> list[Check] | None:
         """Return the checks on rows of bytes that frames of a layout have to pass.

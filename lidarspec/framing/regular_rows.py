@@ -51,7 +51,7 @@ def find_regular_frames(
             return None
         if 2 * lead <= number or framing.switches(kind, mode):
             return None
-        frames = judge_rows(framing, kind, buffer, rows[:lead], 0)
+        frames = check_rows(framing, kind, buffer, rows[:lead], 0)
         if frames is None:
             return None
         if frames.is_sound:
@@ -83,10 +83,10 @@ def find_regular_datagrams(
         return None
     if framing.switches(kind, mode):
         return None
-    return judge_rows(framing, kind, buffer, rows, int(starts[0]))
+    return check_rows(framing, kind, buffer, rows, int(starts[0]))
 
 
-def judge_rows(
+def check_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
     """Check rows with the constants of a type as candidates of one layout.

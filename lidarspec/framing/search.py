@@ -251,7 +251,7 @@ def count_rejected(
     begins = np.array([begin for begin, _ in stays])
     numbers = {name: number for number, name in enumerate({name for _, name in stays})}
     modes = np.array([numbers[name] for _, name in stays])
-    for kind, own in candidates.judged.items():
+    for kind, own in candidates.checked.items():
         status = own.status
         if framing.is_weak(kind):  # a valid candidate that was not accepted is in no run
             status = np.where(status == VALID, IMPLAUSIBLE, status)

@@ -91,8 +91,8 @@ class TextCodec(Codec):
         owners = np.array(list(structs), np.intp)
         groups, refused = self._group_by_layout(list(structs.values()))
         for group in groups:
-            judge = self.make_checker(group.layout)
-            status[owners[group.where]] = judge(group.rows, errors, sums)
+            check = self.make_checker(group.layout)
+            status[owners[group.where]] = check(group.rows, errors, sums)
         for refusal, where in refused:
             if refusal.error is not None:
                 errors.append(refusal.error)

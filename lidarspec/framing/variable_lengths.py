@@ -33,7 +33,7 @@ Status = NDArray[np.uint8]
 #: A layout and the indices of its candidates.
 LayoutGroup = tuple[Layout, Offsets]
 #: A function that returns the checker of a layout.
-MakeJudge = Callable[[Layout], CandidateChecker]
+MakeChecker = Callable[[Layout], CandidateChecker]
 
 #: Layouts are checked together if at least `MANY_LAYOUTS` layouts have fewer than `MANY_CANDIDATES`
 #: candidates each.
@@ -73,7 +73,7 @@ class LayoutFamilies:
         self._next = itertools.count()
 
     def split(
-        self, groups: list[LayoutGroup], make_judge: MakeJudge
+        self, groups: list[LayoutGroup], make_checker: MakeChecker
     ) -> tuple[list[JointChecker], list[LayoutGroup]]:
         """Split groups into those to check together, and those to check layout by layout."""
         if len(groups) < MANY_LAYOUTS:
@@ -82,7 +82,7 @@ class LayoutFamilies:
         alike = dict[int, list[tuple[LayoutGroup, LayoutFamily]]]()
         for layout, which in groups:
             if len(which) < MANY_CANDIDATES:
-                likeness = self.find_family(layout, make_judge(layout))
+                likeness = self.find_family(layout, make_checker(layout))
             else:
                 likeness = None
             if likeness is None:
@@ -95,32 +95,32 @@ class LayoutFamilies:
             if len(some) < MANY_LAYOUTS:
                 left += some_groups
             else:
-                together.append(JointChecker(some_groups, families, make_judge))
+                together.append(JointChecker(some_groups, families, make_checker))
         return together, left
 
-    def find_family(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
+    def find_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
         """Return the family of a layout.
 
         Returns None if its candidates cannot be checked together with candidates of other layouts.
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
-            layout.notes[self] = self._find(layout, judge)
+            layout.notes[self] = self._find(layout, checker)
         family: LayoutFamily | None = layout.notes[self]
         return family
 
-    def _find(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
+    def _find(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
         if layout.regions or not all(_is_extended(seal) for seal in layout.seals):
             return None
         constants = tuple(sorted(layout.constants.items()))
         lengths = tuple(sorted(layout.held.items()))
         seals = tuple(_seal_key(seal, layout.size) for seal in layout.seals)
-        tests = tuple(_test_key(check) for check in judge.checks)
-        key = constants, lengths, seals, tests, judge.is_complete
+        tests = tuple(_test_key(check) for check in checker.checks)
+        key = constants, lengths, seals, tests, checker.is_complete
         if key not in self._numbers:
             if len(self._numbers) >= MAX_KEYS:
                 self._numbers.clear()
             self._numbers[key] = next(self._next)
-        return LayoutFamily(self._numbers[key], tuple(map(_find_length, judge.checks)))
+        return LayoutFamily(self._numbers[key], tuple(map(_find_length, checker.checks)))
 
 
 def _is_extended(seal: Seal) -> bool:
@@ -171,15 +171,15 @@ class JointChecker:
         self,
         groups: Sequence[LayoutGroup],
         families: Sequence[LayoutFamily],
-        make_judge: MakeJudge,
+        make_checker: MakeChecker,
     ) -> None:
         self.layouts = [layout for layout, _ in groups]
         self.which = np.concatenate([which for _, which in groups])
         self.forms = np.repeat(np.arange(len(groups)), [len(which) for _, which in groups])
-        self._judge = make_judge
+        self._make_checker = make_checker
         self._sizes = np.array([layout.size for layout in self.layouts], np.intp)
         self._lengths = np.array([family.lengths for family in families], np.intp).T
-        first = make_judge(self.layouts[0])
+        first = make_checker(self.layouts[0])
         self.is_final = first.is_complete and all(
             isinstance(check, LookupCondition) for check in first.checks
         )
@@ -196,7 +196,7 @@ class JointChecker:
         )
         return [(layout, which) for layout, which in found if len(which)]
 
-    def judge(
+    def check(
         self, buffer: Bytes1D, offsets: Offsets, forms: Offsets, sums: Sums | None = None
     ) -> Status:
         """Check complete candidates, and return their status, (k,).
@@ -221,13 +221,13 @@ class JointChecker:
 
         Bytes after the end of a candidate are ignored.
         """
-        judge = self._judge(self.layouts[longest])
+        checker = self._make_checker(self.layouts[longest])
         status = np.zeros(len(rows), np.uint8)
-        judge.check_constants(status, rows)
+        checker.check_constants(status, rows)
         for seal in self.layouts[longest].seals:
             right = _are_intact(seal, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
-        for index, check in enumerate(judge.checks):
+        for index, check in enumerate(checker.checks):
             if isinstance(check, LookupCondition):
                 right = check.holds_within(rows, self._lengths[index, forms])
                 status[~right & (status == VALID)] = IMPLAUSIBLE

@@ -109,18 +109,18 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = SENSORS[name]
-    judged = 0
-    judge = JointChecker.judge
+    checked = 0
+    check = JointChecker.check
 
     def counting(self: JointChecker, buffer: Any, offsets: Any, forms: Any, sums: Any) -> Any:
-        nonlocal judged
-        judged += len(offsets)
-        return judge(self, buffer, offsets, forms, sums)
+        nonlocal checked
+        checked += len(offsets)
+        return check(self, buffer, offsets, forms, sums)
 
-    monkeypatch.setattr(JointChecker, "judge", counting)
+    monkeypatch.setattr(JointChecker, "check", counting)
     data = false_headers(sensor, 20_000)
     together = [books(sensor, data, piece) for piece in (700, 20_000)]
-    assert judged > 300
+    assert checked > 300
     monkeypatch.setattr(variable_lengths, "MANY_LAYOUTS", NEVER)
     assert together == [books(sensor, data, piece) for piece in (700, 20_000)]
 
@@ -149,7 +149,7 @@ def test_checksums_are_computed_for_all_lengths_at_once() -> None:
 def test_a_checksum_that_zeros_change_is_computed_length_by_length(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(JointChecker, "judge", None)
+    monkeypatch.setattr(JointChecker, "check", None)
     sensor = summed_behind(Crc(16, 0x1021))
     data = false_headers(sensor, 3000)
     assert books(sensor, data, 3000)[0]
