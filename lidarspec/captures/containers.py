@@ -158,7 +158,7 @@ class UnpackedFile(io.RawIOBase):
             self._count += len(data)
             return data
         except EOFError:
-            self.damage = Damage(f"{self.name} is truncated{self._read}", 0)
+            self.damage = Damage(f"{self.name} is truncated{self._read_part}", 0)
         except Exception as error:
             # Each library raises its own exceptions for damaged bytes; bz2 and gzip raise OSError.
             if isinstance(error, OSError) and error.errno is not None:
@@ -167,12 +167,13 @@ class UnpackedFile(io.RawIOBase):
             size = self._packed.seek(0, os.SEEK_END) if offset else 0
             where = f" before byte {offset} of {size}" if offset else ""
             self.damage = Damage(
-                f"{self.name} is corrupt{where} ({error}){self._read}", max(size - offset, 1)
+                f"{self.name} is corrupt{where} ({error}){self._read_part}", max(size - offset, 1)
             )
         return b""
 
     @property
-    def _read(self) -> str:
+    def _read_part(self) -> str:
+        """The end of a message: the part of the content that was read."""
         return f": only the first {self._count} decompressed bytes were read"
 
 
