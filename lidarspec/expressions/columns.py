@@ -515,7 +515,7 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
             f"axes {first.strip('?')!r} and {name.strip('?')!r} belong to different arrays:"
             " move one value to the axis of the other with .on(...)"
         )
-    return min(first, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
+    return min(first, name, key=lambda axis: (axis.startswith("?"), axis.endswith("?")))
 
 
 def _count_elements(value: AlongAxis, axis: str) -> int:
