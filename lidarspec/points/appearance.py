@@ -186,7 +186,9 @@ def round_up(value: float, rounds: Sequence[float] = ROUND_NUMBERS) -> float:
         rounds: the round numbers between 1 and 10.
     """
     power = 10.0 ** math.floor(math.log10(value))
-    return next((one * power for one in rounds if one * power >= value * 0.999), 10 * power)
+    return next(
+        (number * power for number in rounds if number * power >= value * 0.999), 10 * power
+    )
 
 
 def ring_step(reach: float) -> float:

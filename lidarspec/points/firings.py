@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from lidarspec.errors import UsageError
 from lidarspec.points.cloud import PointCloud
 
-#: a choice among the returns of each firing.
+#: A choice among the returns of each firing.
 Returns = Literal["first", "last", "strongest", "all"]
 RETURNS: tuple[Returns, ...] = ("first", "last", "strongest", "all")
-#: index of a return that is missing.
+#: The index of a return that is missing.
 MISSING = -1
-#: ranks of returns that are not valid, and of returns that are missing, in the choice of one.
+#: The return with the lowest rank is chosen. These are the ranks of returns that are not valid, and
+#: of returns that are missing.
 _INVALID_RANK = 1e30
 _MISSING_RANK = 1e31
 
@@ -43,11 +44,11 @@ def group_firings(cloud: PointCloud) -> NDArray[np.intp]:
     if count % size == 0 and (numbers.reshape(-1, size) == np.arange(size)).all():
         return np.arange(count).reshape(-1, size)  # adjacent returns
     cloud.load("column", "time", "ring")
-    place = cloud.time if cloud.column is None else cloud.column
+    columns = cloud.time if cloud.column is None else cloud.column
     rings = np.zeros(count, np.uint16) if cloud.ring is None else cloud.ring
-    occurrences = _count_occurrences(place, rings, numbers)
-    order = np.lexsort((occurrences, rings, place))
-    is_first = _find_changes(place[order], rings[order], occurrences[order])
+    occurrences = _count_occurrences(columns, rings, numbers)
+    order = np.lexsort((occurrences, rings, columns))
+    is_first = _find_changes(columns[order], rings[order], occurrences[order])
     firings = np.full((int(is_first.sum()), size), MISSING, np.intp)
     firings[np.cumsum(is_first) - 1, numbers[order]] = order
     first_points = np.where(firings == MISSING, count, firings).min(axis=1)

@@ -135,8 +135,8 @@ class WrapDetector:
         finite = np.isfinite(angles)
         if not finite.all():
             rows = np.flatnonzero(finite)
-            found, steps = self.push(angles[rows], full, at)
-            return rows[found], steps
+            passes, steps = self.push(angles[rows], full, at)
+            return rows[passes], steps
         if not len(angles):
             return np.empty(0, np.intp), np.empty(0)
         before = previous_values(angles, self._angle)
@@ -151,8 +151,8 @@ class WrapDetector:
         else:
             behind_earlier = _reduce_to_turn(direction * (before - at), full)
         passed = np.flatnonzero(behind_earlier - behind > full / 2)
-        found = self._select_armed(passed, behind, full)
-        return found, 1 - (behind_earlier[found] - behind[found]) / full
+        passes = self._select_armed(passed, behind, full)
+        return passes, 1 - (behind_earlier[passes] - behind[passes]) / full
 
     def _select_armed(
         self, passed: NDArray[np.intp], behind: Floats, full: float

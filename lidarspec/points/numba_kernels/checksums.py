@@ -179,7 +179,7 @@ class _ByteShares:
         self.tables = np.concatenate(
             [shares.pop(word + byte, none) for word in words for byte in range(8)]
         )
-        low, high = (self.tables.reshape(-1, 256)[:, 1] == one for one in (1, 256))
+        low, high = (self.tables.reshape(-1, 256)[:, 1] == share for share in (1, 256))
         bytes_ = np.arange(256, dtype=np.uint16)
         self.is_plain = np.array_equal(
             self.tables.reshape(-1, 256), np.outer(low, bytes_) + np.outer(high, bytes_ << 8)

@@ -202,9 +202,10 @@ def is_code_available(source: str) -> bool:
 def compile_source(source: str) -> Any:
     """Return the compiled function of a kernel.
 
+    If the compiled code cannot be stored on disk, it is compiled again in each run.
+
     Args:
-        source: the source of the kernel. If the compiled code cannot be stored on disk, it is
-            compiled in each run.
+        source: the source of the kernel.
     """
     name = _make_module_name(source)
     module = types.ModuleType(name)

@@ -458,10 +458,10 @@ class Expressions(KernelWriter):
                 f"{first.text} {'+' if function is np.add else '-'} {second.text}",
             )
         if function is np.multiply and any(not isinstance(arg, Node) for arg in args):
-            known, other = args if not isinstance(args[0], Node) else args[::-1]
-            if np.size(known) == 1:
-                return self.angle(other, factor * float(np.asarray(known).reshape(())), depth)
-            row = self.constant(np.asarray(known) * factor, depth)
+            constant, other = args if not isinstance(args[0], Node) else args[::-1]
+            if np.size(constant) == 1:
+                return self.angle(other, factor * float(np.asarray(constant).reshape(())), depth)
+            row = self.constant(np.asarray(constant) * factor, depth)
             made = self.double(other)
             return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
         if function is np.where and len(args) == 3:
