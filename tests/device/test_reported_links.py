@@ -20,7 +20,7 @@ from lidarspec.spec import Command, Http, Port, Sensor, Simulation, Tcp, Templat
 from lidarspec.testing.check import CheckTarget, reports
 from lidarspec.testing.fixtures import virtual_port
 from tests.lines import TIMEOUT_S, free_port, read_until
-from tests.shapes.conversation import REPORTED, SENSOR, TOLD, make_handle_sensor, page
+from tests.shapes.conversation import HANDLES, REPORTED, SENSOR, make_handle_sensor, page
 
 
 def on_free_port(sensor: Sensor, **answers: Any) -> Sensor:
@@ -38,16 +38,16 @@ def test_a_template_contains_arguments_and_values_of_replies() -> None:
     assert text.fill({"handle": "s10", "own_port": 2368}) == b"/start?handle=s10&port=2368"
     assert text.match(b"/start?handle=s10&port=2368") == {"handle": "s10", "own_port": "2368"}
     assert text.match(b"/start?handle=s10&more=1&port=2368") is None
-    assert TOLD.parse(TOLD.command("set_rate", rate=7.5), "ask").path == b"/rate?hz=7.5"
-    assert TOLD.parse(TOLD.command("set_rate", rate=10.0), "ask").path == b"/rate?hz=10"
-    assert TOLD.parse(TOLD.command("start", handle="a"), "ask").path == b"/start?handle=a"
-    assert TOLD.parse(TOLD.command("start"), "ask").path == b"/start?handle=0"
+    assert HANDLES.parse(HANDLES.command("set_rate", rate=7.5), "ask").path == b"/rate?hz=7.5"
+    assert HANDLES.parse(HANDLES.command("set_rate", rate=10.0), "ask").path == b"/rate?hz=10"
+    assert HANDLES.parse(HANDLES.command("start", handle="a"), "ask").path == b"/start?handle=a"
+    assert HANDLES.parse(HANDLES.command("start"), "ask").path == b"/start?handle=0"
     with pytest.raises(OutOfRange, match="rate"):
-        TOLD.command("set_rate", rate=30)
+        HANDLES.command("set_rate", rate=30)
     with pytest.raises(UsageError, match="name must consist of letters"):
-        TOLD.command("set_name", name="a&b=c")
+        HANDLES.command("set_name", name="a&b=c")
     with pytest.raises(UsageError, match="string of up to 8 bytes"):
-        TOLD.command("set_name", name="123456789")
+        HANDLES.command("set_name", name="123456789")
 
 
 @pytest.mark.parametrize("text", ["/start", "{a}{a}", "{a.b}", "{a:3}", "{", "{}", "é{a}"])
@@ -56,14 +56,14 @@ def test_an_invalid_template_is_an_error(text: str) -> None:
         Template(text)
 
 
-@pytest.mark.parametrize("sensor", [TOLD, REPORTED], ids=lambda sensor: sensor.model)
+@pytest.mark.parametrize("sensor", [HANDLES, REPORTED], ids=lambda sensor: sensor.model)
 def test_a_sensor_that_is_started_with_a_handle_conforms(sensor: Sensor) -> None:
     (report,) = reports(CheckTarget([sensor]), sensor.id, examples=2)
     assert report.findings == []
 
 
 def test_a_sensor_sends_to_the_address_in_a_request() -> None:
-    sensor = on_free_port(TOLD)
+    sensor = on_free_port(HANDLES)
     with virtual_port(sensor, to="udp://127.0.0.1") as port:
         web = port.outlet.controls["web"].port
         assert port.path == f"udp://127.0.0.1?control=127.0.0.1:{web}"
@@ -111,7 +111,7 @@ def test_data_comes_from_the_port_that_a_reply_reports() -> None:
 def test_a_reply_without_the_value_is_a_command_error(
     answers: dict[str, Any], name: str, error: str
 ) -> None:
-    sensor = on_free_port(TOLD, **answers)
+    sensor = on_free_port(HANDLES, **answers)
     with virtual_port(sensor, to="udp://127.0.0.1") as port:
         if not name:
             with pytest.raises(CommandError, match=error):
@@ -122,7 +122,7 @@ def test_a_reply_without_the_value_is_a_command_error(
 
 
 def test_a_command_without_its_value_is_not_sent() -> None:
-    session = Session(TOLD)
+    session = Session(HANDLES)
     assert "handle is unknown" in str(session.request("start", 0).failure)
     assert session.outgoing() == []
 
@@ -136,7 +136,7 @@ def test_a_reported_port_that_refuses_the_connection_is_an_error() -> None:
         ls.open(port.path, sensor)
 
 
-@pytest.mark.parametrize("sensor", [TOLD, REPORTED], ids=lambda sensor: sensor.model)
+@pytest.mark.parametrize("sensor", [HANDLES, REPORTED], ids=lambda sensor: sensor.model)
 def test_the_demonstration_starts_the_sensor(sensor: Sensor) -> None:
     result = demonstrate(on_free_port(sensor), turns=1)
     assert [reply.command for reply in result.replies] == ["request_handle", "start"]
@@ -153,7 +153,7 @@ def test_the_demonstration_finds_a_sensor_without_a_broadcast() -> None:
 
 
 def test_a_simulated_source_needs_no_ports() -> None:
-    for sensor in (TOLD, REPORTED):
+    for sensor in (HANDLES, REPORTED):
         with ls.open("sim:?rate=max", sensor) as device:
             assert device.latest(TIMEOUT_S).complete
 
@@ -266,7 +266,8 @@ def test_commands_over_the_data_link_are_broadcast_until_the_sensor_sends() -> N
         ),
         (
             lambda: dataclasses.replace(
-                TOLD, commands={"start": dataclasses.replace(TOLD.commands["start"], provides=None)}
+                HANDLES,
+                commands={"start": dataclasses.replace(HANDLES.commands["start"], provides=None)},
             ),
             "no command has `provides`",
         ),
@@ -287,13 +288,13 @@ def test_an_incomplete_declaration_is_an_error(change: Any, error: str) -> None:
 
 def test_an_argument_of_a_template_must_be_in_it() -> None:
     command = dataclasses.replace(
-        TOLD.commands["set_rate"], args={"speed": ("path", 1, 2), "rate": ("path", Text(3))}
+        HANDLES.commands["set_rate"], args={"speed": ("path", 1, 2), "rate": ("path", Text(3))}
     )
-    sensor = dataclasses.replace(TOLD, commands={**TOLD.commands, "set_rate": command})
+    sensor = dataclasses.replace(HANDLES, commands={**HANDLES.commands, "set_rate": command})
     with pytest.raises(SpecError, match=r"the argument 'speed' must be in the text"):
         sensor.command("set_rate", speed=1, rate="a")
     changed = dataclasses.replace(command, args={"rate": ("path", bytes)})
-    sensor = dataclasses.replace(TOLD, commands={**TOLD.commands, "set_rate": changed})
+    sensor = dataclasses.replace(HANDLES, commands={**HANDLES.commands, "set_rate": changed})
     with pytest.raises(SpecError, match=r"the argument 'rate' must be in the text"):
         sensor.command("set_rate", rate=b"1")
 

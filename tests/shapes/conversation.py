@@ -256,7 +256,7 @@ def make_handle_sensor(data: Udp | Tcp, web_port: int = 7022) -> Sensor:
 
 
 #: The sensor sends to the address and port in the request.
-TOLD = make_handle_sensor(Udp())
+HANDLES = make_handle_sensor(Udp())
 #: The reply contains the port of the data.
 REPORTED = dataclasses.replace(
     make_handle_sensor(Tcp(reported="data_port")), id="shape-reported-port", model="ReportedPort"
