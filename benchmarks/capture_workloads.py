@@ -231,10 +231,12 @@ def hostile(inputs: Inputs) -> Work:
         for name, parts in streams(SensorUnderTest(sensor), length=length).items():
             tasks[f"{name} of {sensor.id}"] = sensor, parts
 
-    def finding(sensor: ls.Sensor, parts: list[bytes]) -> Callable[[], Any]:
+    def make_search(sensor: ls.Sensor, parts: list[bytes]) -> Callable[[], Any]:
         return lambda: sensor.decoder().frames(b"".join(parts))
 
-    own = {name: Contender(finding(*task), sum(map(len, task[1]))) for name, task in tasks.items()}
+    own = {
+        name: Contender(make_search(*task), sum(map(len, task[1]))) for name, task in tasks.items()
+    }
 
     def run() -> None:
         for contender in own.values():
@@ -267,7 +269,7 @@ def line_rate(sensor: ls.Sensor) -> float:
     return max(link.bauds) / 10 if isinstance(link, Serial) else 0.0
 
 
-def importing(inputs: Inputs) -> Work:
+def start_process(inputs: Inputs) -> Work:
     """Return the workload of starting a process that imports lidarspec and finds a sensor.
 
     It is compared with a process that imports only the required libraries.
@@ -312,5 +314,5 @@ ELSEWHERE: Mapping[str, Callable[[Inputs], Work]] = {
     "parse-xt32": lambda inputs: parse(inputs, "xt32", "parse one Pandar XT32 packet"),
     "parse-m1": lambda inputs: parse(inputs, "m1", "parse one RS-LiDAR-M1 packet"),
     "hostile": hostile,
-    "import": importing,
+    "import": start_process,
 }

@@ -84,7 +84,7 @@ def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], byt
     def any_frame(source: random.Random) -> bytes:
         return example(source, source.choice(names))
 
-    def announced(source: random.Random) -> bytes:
+    def announced_frame(source: random.Random) -> bytes:
         name = source.choice([name for name in names if after[name]])
         return example(source, after[name] or "") + example(source, name) * source.choice(
             (1, incoming[name].confirm)
@@ -106,7 +106,7 @@ def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], byt
             data[spot : spot + 1] = bytes([data[spot] & ~mask | value]) if spot < len(data) else b""
         return behind(source, name, bytes(data))
 
-    def damaged(source: random.Random) -> bytes:
+    def damaged_frame(source: random.Random) -> bytes:
         name = source.choice(names)
         data = bytearray(example(source, name))
         data[source.randrange(len(data))] ^= 1 << source.randrange(8)
@@ -117,12 +117,12 @@ def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], byt
         "frames of all types": any_frame,
         "heads of frames": head,
         "random headers": header,
-        "damaged frames": damaged,
+        "damaged frames": damaged_frame,
     }
     if announcing:
         makers |= {
             "announcements": lambda source: example(source, source.choice(announcing)),
-            "what was announced": announced,
+            "announced frames": announced_frame,
         }
     if with_headers:
         makers["frames with random headers"] = lambda source: of_header(

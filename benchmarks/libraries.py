@@ -141,21 +141,21 @@ def rplidar_nodes(frames: Sequence[bytes]) -> Contender:
 def lds2d_stream(model: str, data: bytes, points: int) -> Contender:
     """Prepare lds2d's driver on a byte stream."""
     driver = library("lds2d").core.driver_for(model)
-    return Contender(lambda: _until_end(driver(_Recorded(data))), points)
+    return Contender(lambda: _until_end(driver(_RecordedPort(data))), points)
 
 
-class _Recorded:
+class _RecordedPort:
     """A serial port for lds2d that returns recorded bytes."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self._spot = 0
+        self._offset = 0
 
     def read(self, size: int) -> bytes:
-        if self._spot >= len(self._data):
+        if self._offset >= len(self._data):
             raise EOFError
-        self._spot += size
-        return self._data[self._spot - size : self._spot]
+        self._offset += size
+        return self._data[self._offset - size : self._offset]
 
 
 def _until_end(driver: Any) -> int:

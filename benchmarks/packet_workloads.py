@@ -95,12 +95,12 @@ def points_of(sensor: ls.Sensor, data: Any, backend: str) -> Callable[[], Any]:
     return lambda: columns(sensor.decode(data, backend=backend).points())
 
 
-def plainly(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
+def make_plain_decoding(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
     """Return a function that decodes data with the plain evaluation of `points`."""
     return lambda: columns(evaluate_plainly(sensor.decode(data, backend="numpy")).cloud)
 
 
-def evaluating(packets: Packets) -> Callable[[], Any]:
+def make_evaluation(packets: Packets) -> Callable[[], Any]:
     """Return a function that computes the points of decoded packets."""
     return lambda: columns(packets.points())
 
@@ -127,7 +127,7 @@ def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) 
     points = len(sensor.decode(rows).points())
     others: Others = {
         **beside_construct(inputs, key),
-        "plain": lambda: Contender(plainly(sensor, rows), points),
+        "plain": lambda: Contender(make_plain_decoding(sensor, rows), points),
         "by hand": lambda: Contender(lambda: BY_HAND[key](rows), points),
     }
     return Work(
@@ -138,7 +138,7 @@ def in_memory(inputs: Inputs, key: str, title: str, more: Others | None = None) 
         lambda backend: points_of(sensor, rows, backend),
         {**others, **(more or {})},
         lambda backend: {
-            "points alone": Contender(evaluating(sensor.decode(rows, backend=backend)), points)
+            "points alone": Contender(make_evaluation(sensor.decode(rows, backend=backend)), points)
         },
         lambda backend, rates: {
             "% of the time for points()": 100 * times(rates, "ours", "points alone")
@@ -160,7 +160,7 @@ def in_stream(
     points = len(sensor.decode(data).points())
     others: Others = {
         **beside_construct(inputs, key),
-        "plain": lambda: Contender(plainly(sensor, data), points),
+        "plain": lambda: Contender(make_plain_decoding(sensor, data), points),
         "by hand": lambda: Contender(lambda: by_us(data), points),
     }
     ours: Callable[[str], Any] = lambda backend: points_of(sensor, data, backend)  # noqa: E731
@@ -196,7 +196,7 @@ def velodyne(inputs: Inputs, key: str, title: str) -> Work:
     rows = inputs.array(key)
     points = len(rows) * 384
     others: Others = {
-        "plain": lambda: Contender(plainly(sensor, rows), points),
+        "plain": lambda: Contender(make_plain_decoding(sensor, rows), points),
         **beside_velodyne_decoder(inputs, key),
     }
     return Work(
@@ -237,7 +237,7 @@ def ouster(inputs: Inputs) -> Work:
             "ouster-sdk": lambda: beside_ouster_sdk(
                 libraries.ouster_scans, frames, metadata, points
             ),
-            "plain": lambda: Contender(plainly(sensor, rows), points),
+            "plain": lambda: Contender(make_plain_decoding(sensor, rows), points),
         },
     )
 
@@ -278,7 +278,7 @@ def in_text(inputs: Inputs, key: str, title: str) -> Work:
     sensor = inputs.sensor(key)
     data = b"".join(inputs.frames(key))
     points = len(sensor.decode(data).points())
-    others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}
+    others: Others = {"plain": lambda: Contender(make_plain_decoding(sensor, data), points)}
     return Work(
         title, "points", points, len(data), lambda backend: points_of(sensor, data, backend), others
     )
