@@ -106,7 +106,8 @@ class Sensor(SensorDescription):
         """Return the bytes of one frame; constants, counts and checksum are filled in.
 
         Args:
-            value: a mapping of all fields, such as the result of `parse`. `values` override it.
+            value: a mapping of all fields, such as the result of `parse`. `values` override it; a
+                field of a nested struct is given by its path: ``**{"flags.valid": 1}``.
             units: whether values are physical; they are rounded to the nearest raw value.
 
         Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from lidarspec.errors import (
 )
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.encode import encode, fill_counts, list_paths
+from lidarspec.frames.field_paths import put_value, split_path
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
 from lidarspec.frames.schema import Schema, make_schema
@@ -39,7 +41,7 @@ def build(
 
     Args:
         value: a mapping of all fields, for example a result of `parse`, or None.
-        values: single fields by name, which replace entries of `value`.
+        values: single fields by path, such as "flags.valid", which replace entries of `value`.
         units: True if the values are physical; they are rounded to the resolution of the fields.
 
     Raises:
@@ -56,7 +58,7 @@ def build(
     checker = _ValueChecker(
         make_schema(declared.tree), list_paths(declared.tree), place, units=units
     )
-    checked = checker.check({**(value or {}), **values}, "")
+    checked = checker.check(_merge_values(value or {}, values), "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
         fill_counts(checked, make_schema(declared.tree))
@@ -76,6 +78,18 @@ def build(
             " digits, or a text contains a separator"
         )
     return data
+
+
+def _merge_values(value: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the fields of `value` with those of `values` in their place."""
+    nested = {name: new for name, new in values.items() if not name.isidentifier()}
+    merged: dict[str, Any] = {**value, **values}
+    if not nested:
+        return merged
+    merged = copy.deepcopy({name: old for name, old in merged.items() if name not in nested})
+    for name, new in nested.items():
+        put_value(merged, split_path(name), new)
+    return merged
 
 
 class _ValueChecker:

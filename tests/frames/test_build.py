@@ -108,3 +108,14 @@ def test_a_settings_list_of_parts_takes_arguments_too() -> None:
         sensor.command("start", host="10.0.0.1", name="on").hex(" ")
         == "02 04 02 6f 6e 06 04 0a 00 00 01"
     )
+
+
+def test_a_path_replaces_a_field_of_a_nested_struct() -> None:
+    sensor = make_command_sensor()
+    parsed = sensor.parse(b"abc\1\2\1\1\3\0\0\0\0", frame="order")
+    data = sensor.build("order", parsed, **{"t.u": 9, "s[1].x": 8, "v[0]": 7, "key": b"xyz"})
+    assert data == b"xyz\7\2\1\x08\x09\0\0\0\0"
+    assert (parsed.t.u, parsed.s[1].x, parsed.v[0]) == (3, 1, 1)
+    assert sensor.build("order", {**parsed, "t": {"u": 0}}, **{"t.w": 1})[7:] == b"\0\0\0\0\1"
+    with pytest.raises(UsageError, match=r"t\.nothing"):
+        sensor.build("order", parsed, **{"t.nothing": 1})

@@ -26,6 +26,8 @@ from typing import Any
 import numpy as np
 from construct import (
     Array,
+    BitsInteger,
+    BitStruct,
     Bytes,
     Const,
     ConstructError,
@@ -179,7 +181,10 @@ CHANNEL = Struct(
 )
 TAIL = (
     "tail_reserved" / Bytes(6),
-    "shutdown" / Int8ul * "bit 0: overheated, about to shut down",
+    "shutdown"
+    / BitStruct(
+        "reserved" / BitsInteger(7), "overheated" / BitsInteger(1) * "1: about to shut down"
+    ),
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",

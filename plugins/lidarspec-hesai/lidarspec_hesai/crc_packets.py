@@ -47,8 +47,12 @@ def make_safety_part(crc: Construct) -> Construct:
     """Return the struct of the functional safety part."""
     return Struct(
         "version" / Int8ul,
-        "status" / Int8ul * "bits 7 to 5 state, 4 and 3 fault type, 2 to 0 counter",
-        "fault_number" / Int8ul * "high half: number of faults; low half: index of this fault",
+        "status"
+        / BitStruct(
+            "state" / BitsInteger(3), "fault_type" / BitsInteger(2), "counter" / BitsInteger(3)
+        ),
+        "fault_number"
+        / BitStruct("count" / BitsInteger(4), "index" / BitsInteger(4) * "of this fault"),
         "fault_code" / Int16ul,
         "reserved" / Bytes(8),
         "crc" / crc,

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from construct import Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
+from construct import BitsInteger, BitStruct, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Fields, Frame, Polar, Scaled
 from lidarspec_hesai.calibration import Calibration, make_nominal_table
@@ -101,7 +101,10 @@ CHANNEL = Struct(
 )
 TAIL = (
     "tail_reserved" / Bytes(5),
-    "mode_flag" / Int8ul * "bit 0: loop of the packet, with dual return",
+    "mode_flag"
+    / BitStruct(
+        "reserved" / BitsInteger(7), "loop" / BitsInteger(1) * "of the packet, with dual return"
+    ),
     "tail_reserved_2" / Bytes(6),
     "return_mode" / RETURN_MODE,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
@@ -119,7 +122,7 @@ def points(f: Fields, channels: Calibration) -> Polar:
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
-    loop = np.where(returns > 1, np.mod(f.mode_flag, 2), block % 2)
+    loop = np.where(returns > 1, f.mode_flag.loop, block % 2)
     fired = (
         FIRST_SHOT_S + SHOT_PERIOD_S * (block // returns) + np.where(loop == 0, 0, 1) * LOOP_DELAY_S
     )

@@ -502,7 +502,8 @@ def test_each_crc_of_a_qt128_is_held(place: int) -> None:
 def test_the_loops_of_a_qt128_take_turns() -> None:
     parsed = QT128.parse(simulate(QT128, 1)[0])
     single = decode(QT128, [QT128.build("data", parsed, return_count=2)]).points()
-    odd = decode(QT128, [QT128.build("data", parsed, return_mode=0x39, mode_flag=1)]).points()
+    values = {"return_mode": 0x39, "mode_flag.loop": 1}
+    odd = decode(QT128, [QT128.build("data", parsed, **values)]).points()
     # channel 65 fires 1.456 us after the shot in the first loop, and 0.6 in the second; shots are
     # 111.11 us apart, the first at 9
     assert [single.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [

@@ -20,7 +20,21 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from construct import Array, Bytes, Const, Enum, Float32l, Int8ul, Int16ul, Int32sl, Int32ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Bytes,
+    ByteSwapped,
+    Const,
+    Enum,
+    Float32l,
+    Int8ul,
+    Int16ul,
+    Int32sl,
+    Int32ul,
+    Struct,
+)
 
 from lidarspec.spec import (
     Address,
@@ -89,6 +103,27 @@ TIMESTAMP = Struct(
 )
 
 
+#: The status of a packet, 32 bits little-endian (livox_def.h, LidarErrorCode).
+LEVEL = Enum(BitsInteger(2), normal=0, warning=1, error=2)
+STATUS_CODE = ByteSwapped(
+    BitStruct(
+        "system" / LEVEL,
+        "reserved" / BitsInteger(13),
+        "time_sync" / Enum(BitsInteger(3), none=0, ptp=1, gps=2, pps=3, abnormal=4),
+        "ptp_signal" / BitsInteger(1) * "1: present",
+        "self_heating" / BitsInteger(1) * "1: on, at a low temperature",
+        "fan" / Enum(BitsInteger(1), normal=0, warning=1),
+        "service_life" / Enum(BitsInteger(1), normal=0, ends_soon=1),
+        "pps_signal" / BitsInteger(1) * "1: present",
+        "firmware" / Enum(BitsInteger(1), normal=0, needs_update=1),
+        "dirt" / Enum(BitsInteger(2), clean=0, dirty_or_blocked=1),
+        "motor" / LEVEL,
+        "voltage" / Enum(BitsInteger(2), normal=0, high=1, extremely_high=2),
+        "temperature" / Enum(BitsInteger(2), normal=0, high_or_low=1, extreme=2),
+    )
+)
+
+
 def make_packet(kind: int, *members: Any) -> Struct:
     """Return the struct of a packet with one type of data."""
     return Struct(
@@ -96,10 +131,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
         "slot" / Int8ul,
         "lidar_id" / Int8ul,
         "reserved" / Int8ul,
-        "status_code"
-        / Int32ul
-        * "bits 0-1 temperature, 2-3 voltage, 4-5 motor, 6-7 dirt ... 30-31 system: 0 normal, 1"
-        " warning, 2 error",
+        "status_code" / STATUS_CODE,
         "timestamp_type" / Enum(Int8ul, **CLOCKS) * "gps_and_pps: a date",
         "data_type" / Const(kind, Int8ul),
         "timestamp" / TIMESTAMP,
@@ -216,7 +248,7 @@ def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulati
 def make_header(ns: int) -> dict[str, Any]:
     """Return the header values of a packet `ns` nanoseconds after power-up."""
     parts = {"low": ns % 2**32, "middle": (ns >> 32) % 2**16, "high": ns >> 48}
-    header = {"slot": 1, "lidar_id": 1, "reserved": 0, "status_code": 0, "timestamp_type": 0}
+    header = {"slot": 1, "lidar_id": 1, "reserved": 0, "timestamp_type": 0}
     return header | {f"timestamp.{name}": part for name, part in parts.items()}
 
 
@@ -259,7 +291,7 @@ POSE = (
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
 STATUS = (
-    "status_code" / Int32ul * "as in point packets; start-up progress in percent while starting"
+    "status_code" / Int32ul * "bits as in point packets; percent of the start-up while starting"
 )
 REQUEST = 0
 REPLY = 1
@@ -322,7 +354,7 @@ CONTROL: dict[str, Frame] = {
             (0, 3),
             RESULT,
             "work_state" / Enum(Int8ul, **STATES),
-            "feature" / Int8ul * "bit 0: rain and fog",
+            "feature" / BitStruct("reserved" / BitsInteger(7), "rain_and_fog" / BitsInteger(1)),
             STATUS,
         )
     ),

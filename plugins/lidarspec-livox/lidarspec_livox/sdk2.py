@@ -212,7 +212,7 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "attitude": (0x0012, ATTITUDE),
     "fov_0": (0x0015, FOV),
     "fov_1": (0x0016, FOV),
-    "fov_enabled": (0x0017, NUMBER * "bit 0: fov_0, bit 1: fov_1"),
+    "fov_enabled": (0x0017, Enum(NUMBER, none=0, fov_0=1, fov_1=2, both=3)),
     "detect_mode": (0x0018, Enum(NUMBER, normal=0, sensitive=1)),
     "io_functions": (0x0019, Bytes(4)),
     "work_mode": (0x001A, Enum(NUMBER, sampling=1, idle=2, ready=9)),

@@ -98,7 +98,7 @@ def points(f: Fields, unit: Unit) -> Polar:
         time=(columns.timestamp - columns[0].timestamp) * 1e-9,
         ring=columns.pixels.index,
         return_index=np.arange(2) if "range2" in bits else None,
-        invalid=(columns.status != VALID) if is_legacy else (columns.status % 2 != 1),
+        invalid=(columns.status != VALID) if is_legacy else (columns.status.valid != 1),
         origin=(
             column_table(starts[..., 0]),
             column_table(starts[..., 1]),
@@ -133,7 +133,7 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
         return {**shared, "columns.status": np.full(unit.columns, VALID)}
     return {
         **shared,
-        "columns.status": np.ones(unit.columns),
+        "columns.status.valid": np.ones(unit.columns),
         "frame_id": numbers[0] // unit.turn % 65536,
         "serial": int(unit.serial or 0),
     }

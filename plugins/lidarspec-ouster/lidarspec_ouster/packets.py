@@ -111,7 +111,8 @@ PROFILES: dict[str, Bits] = {
 }
 
 COLUMNS = 16  # per packet, unless the metadata differ
-VALID = 0xFFFFFFFF  # status of a valid column in LEGACY; other profiles use bit 0
+VALID = 0xFFFFFFFF  # status of a valid column in LEGACY; other profiles use one bit
+COLUMN_STATUS = ByteSwapped(BitStruct("reserved" / BitsInteger(15), "valid" / BitsInteger(1)))
 ENCODER_COUNTS_PER_TURN = 90_112
 LIDAR = 1  # packet type
 IMU = 2  # packet type
@@ -194,9 +195,7 @@ def make_packet(profile: str, rows: int, columns: int) -> Construct:
                 columns, Struct(*column_header, pixels, "status" / Int32ul * "0xffffffff: valid")
             )
         )
-    body = "columns" / Array(
-        columns, Struct(*column_start, "status" / Int16ul * "bit 0: valid", pixels)
-    )
+    body = "columns" / Array(columns, Struct(*column_start, "status" / COLUMN_STATUS, pixels))
     if profile.startswith("FUSA"):
         return Struct("type" / Const(LIDAR, Int8ul), *FUSA_HEADER, *STATE, body, *FOOTER)
     return Checksummed(

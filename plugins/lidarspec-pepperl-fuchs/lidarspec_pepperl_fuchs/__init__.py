@@ -6,9 +6,9 @@ returns the port of the data (TCP), and starts the output with that handle. With
 
 Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as far as the drivers
 of the vendor repeat it: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg, pf_r2000_packet_a,
-_b and _c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg) and the older pepperl_fuchs_r2000
-(packet_structure.h). The range is assumed to be that of an OMD30M. The bits of `status_flags` are
-not named here, because only the manual has them. An R2300 has packets of another type.
+_b and _c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for `status_flags`) and
+the older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be that of an OMD30M. An
+R2300 has packets of another type.
 """
 
 from __future__ import annotations
@@ -94,6 +94,33 @@ SAMPLES_BY_TYPE: Mapping[str, Construct] = {
 }
 
 
+#: 32 bits little-endian; bit 0 is the last field.
+STATUS_FLAGS = ByteSwapped(
+    BitStruct(
+        "reserved_31" / BitsInteger(1),
+        "device_defect" / BitsInteger(1) * "cannot be repaired",
+        "reserved_21" / BitsInteger(9),
+        "overload_error" / BitsInteger(1),
+        "high_temperature_error" / BitsInteger(1),
+        "low_temperature_error" / BitsInteger(1),
+        "lens_contamination_error" / BitsInteger(1),
+        "device_error" / BitsInteger(1) * "any error",
+        "reserved_13" / BitsInteger(3),
+        "overload_warning" / BitsInteger(1),
+        "high_temperature_warning" / BitsInteger(1),
+        "low_temperature_warning" / BitsInteger(1),
+        "lens_contamination_warning" / BitsInteger(1),
+        "device_warning" / BitsInteger(1) * "any warning",
+        "reserved_5" / BitsInteger(3),
+        "skipped_packets" / BitsInteger(1) * "packets before this one were not sent",
+        "unstable_rotation" / BitsInteger(1) * "the scan frequency is not the set one",
+        "invalid_data" / BitsInteger(1),
+        "new_settings" / BitsInteger(1) * "settings changed during this packet",
+        "scan_data_info" / BitsInteger(1) * "any of the four above",
+    )
+)
+
+
 def make_time() -> Construct:
     """Return the struct of a time in the format of NTP, 64 bits, the fraction first."""
     return Struct("fraction" / Scaled(Int32ul, 2.0**-32, "s"), "seconds" / Scaled(Int32ul, 1, "s"))
@@ -110,7 +137,7 @@ def make_packet(letter: str) -> Construct:
         "packet_number" / Int16ul * "counts the packets of a scan, from 1",
         "timestamp_raw" / make_time() * "time of the first sample since power-on",
         "timestamp_sync" / make_time() * "synchronized time of the first sample; 0 without",
-        "status_flags" / Int32ul,
+        "status_flags" / STATUS_FLAGS,
         "scan_frequency" / Scaled(Int32ul, 0.001, "Hz"),
         "num_points_scan" / Int16ul,
         "num_points_packet" / Int16ul,

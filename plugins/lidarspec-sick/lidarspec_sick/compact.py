@@ -58,6 +58,9 @@ ZERO_AZIMUTH_STEPS = 16_384  # the azimuth straight ahead on the wire
 SIMULATED_SPEED_HZ = 20.0  # revolutions per second
 
 
+PROPERTY = BitStruct("reserved" / BitsInteger(7), "reflector" / BitsInteger(1))
+
+
 def make_module(version: int) -> Struct:
     """Return the struct of a module in telegrams of version 3 or 4.
 
@@ -67,7 +70,7 @@ def make_module(version: int) -> Struct:
         this._.beam_content.has_azimuth == 1,
         Scaled(Int16ul, AZIMUTH_STEP_RAD, "rad", -ZERO_AZIMUTH_STEPS * AZIMUTH_STEP_RAD),
     )
-    properties = "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: reflector"
+    properties = "property" / If(this._.beam_content.has_property == 1, PROPERTY)
     echo = Struct(
         "distance" / If(this._._.echo_content.has_distance == 1, Scaled(Int16ul, 0.001, "m")),
         "strength" / If(this._._.echo_content.has_strength == 1, Int16ul),
@@ -152,7 +155,7 @@ def points(f: Fields, version: int) -> Polar:
         elevation=-f.elevation.on("beams[]"),
         intensity=beam.echoes.strength,
         time=(start - f.start_time[0] + (f.stop_time.on("beams[]") - start) * position) * 1e-6,
-        extra={"reflector": beam.property % 2 == 1},
+        extra={"reflector": beam.property.reflector == 1},
     )
 
 

@@ -225,7 +225,7 @@ def test_modules_of_a_multiscan_are_those_published(name: str) -> None:
         for beam in known["first"]:
             found = module.beams[beam["beam"]][beam["layer"]]
             assert [[echo.distance, echo.strength] for echo in found.echoes] == beam["echoes"]
-            assert (found.property, found.azimuth) == (beam["prop"], beam["az_raw"])
+            assert (found.property.reflector, found.azimuth) == (beam["prop"], beam["az_raw"])
 
 
 def test_a_turn_of_an_mrs1000_is_four_layers() -> None:

@@ -168,7 +168,15 @@ ANSWERS = {
     "config": Frame(CONFIG, max_length=7 + 4 + MAX_MODE_NAME_BYTES, plausible=is_config_plausible),
     "config_set": Frame(CONFIG_SET, max_length=7 + 4 + MAX_MODE_NAME_BYTES),
     "accessory": make_reply(
-        0xFF, 4, "flags" / Int32ul * "bit 0: the accessory board drives the motor by PWM"
+        0xFF,
+        4,
+        "flags"
+        / ByteSwapped(
+            BitStruct(
+                "reserved" / BitsInteger(31),
+                "pwm" / BitsInteger(1) * "1: the accessory board drives the motor by PWM",
+            )
+        ),
     ),
 }
 

@@ -82,7 +82,11 @@ HQ = Checksummed(
                 "angle" / Scaled(Int16ul, 90 / 16384, "deg"),
                 "distance" / Scaled(Int32ul, 0.00025, "m") * "0: no return",
                 "quality" / Int8ul,
-                "flag" / Int8ul * "bit 0: first node of a revolution",
+                "flag"
+                / BitStruct(
+                    "reserved" / BitsInteger(7),
+                    "start" / BitsInteger(1) * "1: first node of a revolution",
+                ),
             ),
         ),
         "crc" / Int32ul,
@@ -122,4 +126,4 @@ def node_sweep(i: int) -> Mapping[str, Any]:
 def hq_sweep(i: int) -> Mapping[str, Any]:
     """Return the values of simulated capsule i, ten per revolution."""
     indices = (i * HQ_NODES + np.arange(HQ_NODES)) % HQ_NODES_PER_TURN
-    return {"nodes.angle": indices * 360 / HQ_NODES_PER_TURN, "nodes.flag": indices == 0}
+    return {"nodes.angle": indices * 360 / HQ_NODES_PER_TURN, "nodes.flag.start": indices == 0}

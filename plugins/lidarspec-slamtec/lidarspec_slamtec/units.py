@@ -79,7 +79,7 @@ class Unit:
         return {
             "get_info": (("info", information),),
             "get_samplerate": (("sample_rate", times),),
-            "get_accessory": (("accessory", {"flags": 1}),),
+            "get_accessory": (("accessory", {"flags.pwm": 1}),),
             "express_scan": self.reply_descriptor,
             **dict.fromkeys((*SENSOR_REQUESTS, *MODE_REQUESTS), self.reply_config),
         }

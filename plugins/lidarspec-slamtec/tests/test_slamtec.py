@@ -212,9 +212,9 @@ def test_an_ultra_capsule_by_hand() -> None:
 def test_an_hq_capsule_by_hand() -> None:
     # Angle 4096: 4096 * 90 / 16384 = 22.5 degrees. The CRC-32 of zlib over 777 bytes and three
     # zeros.
-    points = [{"angle": 4096, "distance": 8000, "quality": 20, "flag": 1}] + [
-        {"angle": 0, "distance": 0, "quality": 0, "flag": 0}
-    ] * 95
+    points = [
+        {"angle": 4096, "distance": 8000, "quality": 20, "flag": {"reserved": 0, "start": 1}}
+    ] + [{"angle": 0, "distance": 0, "quality": 0, "flag": {"reserved": 0, "start": 0}}] * 95
     data = A3.build("hq", time_stamp=5, nodes=points)
     assert len(data) == 781
     assert int.from_bytes(data[-4:], "little") == zlib.crc32(data[:-4] + bytes(3))

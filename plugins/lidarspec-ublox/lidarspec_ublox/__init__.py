@@ -104,8 +104,21 @@ NAV_PVT = make_ubx(  # p. 150
     "time_accuracy" / Scaled(Int32ul, 1, "ns"),
     "nano" / Scaled(Int32sl, 1, "ns") * "fraction of the second, may be negative",
     "fix_type" / FIX_TYPES,
-    "flags" / Int8ul * "bit 0: valid fix, bit 1: differential, bits 7-6: carrier phase",
-    "flags2" / Int8ul * "bit 7: time confirmed, 6: date confirmed, 5: confirmation available",
+    "flags"
+    / BitStruct(
+        "carrier_phase" / Enum(BitsInteger(2), none=0, float=1, fixed=2),
+        "heading_valid" / BitsInteger(1) * "1: vehicle_heading is valid",
+        "power_save" / BitsInteger(3) * "state of the power save mode",
+        "differential" / BitsInteger(1),
+        "fix_valid" / BitsInteger(1),
+    ),
+    "flags2"
+    / BitStruct(
+        "time_confirmed" / BitsInteger(1),
+        "date_confirmed" / BitsInteger(1),
+        "confirmation_available" / BitsInteger(1),
+        "reserved" / BitsInteger(5),
+    ),
     "satellites" / Int8ul * "numSV: used in the solution",
     "longitude" / Scaled(Int32sl, 1e-7, "deg"),
     "latitude" / Scaled(Int32sl, 1e-7, "deg"),
@@ -306,7 +319,7 @@ def pvt_sweep(i: int) -> dict[str, Any]:
         **date_values(i, 5),
         **valid,
         "fix_type": 3,
-        "flags": 1,
+        "flags.fix_valid": 1,
         "satellites": 12,
         "latitude": 47.2852395 + i % 100_000 * 1.8e-6,
         "longitude": 8.5652537,

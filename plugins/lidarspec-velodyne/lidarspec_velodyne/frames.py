@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from construct import (
     Array,
+    BitsInteger,
+    BitStruct,
     Bytes,
     Const,
     Construct,
@@ -109,7 +111,13 @@ POSITION = Struct(
     "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "change since the last calibration",
     "adc_age" / Scaled(Int32ul, 1, "s") * "time since the last calibration",
     "adc_reason" / Enum(Int8ul, none=0, power_on=1, manual=2, temperature=3, periodic=4),
-    "adc_status" / Int8ul * "bit 0 calibrating, 1 temperature limit met, 2 time limit met",
+    "adc_status"
+    / BitStruct(
+        "reserved" / BitsInteger(5),
+        "time_limit_met" / BitsInteger(1),
+        "temperature_limit_met" / BitsInteger(1),
+        "calibrating" / BitsInteger(1),
+    ),
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full hour",
     "pps" / Enum(Int8ul, absent=0, synchronizing=1, locked=2, error=3),
     "thermal_status" / Enum(Int8ul, ok=0, shut_down=1),
