@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from lidarspec.frames.schema import make_schema
 from lidarspec.spec.arguments import (
     Address,
     Argument,
+    Choice,
     Count,
     Port,
     Range,
@@ -141,6 +142,9 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
             path=place,
             sensor=sensor.id,
         )
+    if isinstance(declared.kind, Choice):
+        names = {raw: text for text, raw in declared.kind.names.items()}
+        return replace(slot, info=replace(slot.info, labels=names))
     return slot
 
 
@@ -148,7 +152,8 @@ def _template_slot(
     sensor: SensorDescription, template: Template, declared: Argument, argument: str, place: str
 ) -> ArgumentSlot:
     """Return the slot of an argument that is a part of a template."""
-    if argument not in template.names or not isinstance(declared.kind, Range | Text):
+    is_text = isinstance(declared.kind, Range | Text) and not isinstance(declared.kind, Choice)
+    if argument not in template.names or not is_text:
         raise SpecError(
             f"the argument {argument!r} must be in the text {template.text!r}, and have a range or"
             " Text(size)",

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor as Sensor
     from lidarspec.spec.arguments import (
         Address as Address,
+        Choice as Choice,
         Count as Count,
         Port as Port,
         Template as Template,
@@ -136,7 +137,7 @@ _NAMES = {
     "spec.options": ("Learned",),
     "spec.description": ("Frame", "Command", "Relative", "Reported", "Simulation"),
     "spec.enum_values": ("EnumValue",),
-    "spec.arguments": ("Text", "Address", "Port", "Count", "Template"),
+    "spec.arguments": ("Text", "Address", "Port", "Choice", "Count", "Template"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),
     "spec.checksums": (
         "Checksum",

@@ -1,9 +1,9 @@
 """Arguments of commands, and values that are filled in when a command is sent.
 
-An argument is a number in a range, a text, an address, a port or bytes. Each kind describes the
-values that it accepts and packs them into the bytes of the frame. `Count`, `Address`, `Port` and
-`Template` among the `values` of a command are replaced when the command is sent, by a running
-number, by this computer's address or port, and by a text with values that are known then.
+An argument is a number in a range, a named number, a text, an address, a port or bytes. Each kind
+describes the values that it accepts and packs them into the bytes of the frame. `Count`, `Address`,
+`Port` and `Template` among the `values` of a command are replaced when the command is sent, by a
+running number, by this computer's address or port, and by a text with values that are known then.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import functools
 import re
 import string
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import SpecError
@@ -40,6 +40,27 @@ class Port(Range):
 
     low: float = 1
     high: float = 65535
+
+
+@dataclass(frozen=True, init=False)
+class Choice(Range):
+    """A number with names, for a field that serves several commands.
+
+    An example is ``("number", Choice(cartesian=0, spherical=1))``. A field of one command has
+    construct's `Enum` instead.
+
+    Raises:
+        SpecError: without names, or if a value is not an integer.
+    """
+
+    names: Mapping[str, int] = field(hash=False)
+
+    def __init__(self, **names: int) -> None:
+        if not names or not all(isinstance(value, int) for value in names.values()):
+            raise SpecError("Choice(name=number) requires at least one name, and integers")
+        object.__setattr__(self, "low", min(names.values()))
+        object.__setattr__(self, "high", max(names.values()))
+        object.__setattr__(self, "names", names)
 
 
 @dataclass(frozen=True)
@@ -290,7 +311,7 @@ def argument(given: Any) -> Argument:
     """Return the argument that a plugin declared as a tuple.
 
     Examples are ("motor.speed", 5, 15), ("data.host", Address()), ("data.port", Port()), ("name",
-    Text(16)) and ("key", bytes).
+    Text(16)), ("type", Choice(plain=0, dual=1)) and ("key", bytes).
 
     Raises:
         SpecError: for an invalid declaration.
@@ -298,11 +319,11 @@ def argument(given: Any) -> Argument:
     match given:
         case (str(path), int() | float() as low, int() | float() as high):
             return Argument(path, Range(low, high))
-        case (str(path), Text() | Address() | Port() as kind):
+        case (str(path), Text() | Address() | Port() | Choice() as kind):
             return Argument(path, kind)
         case (str(path), kind) if kind is bytes:
             return Argument(path, Octets())
     raise SpecError(
         "an argument must be (path, lowest, highest), (path, Text(16)), (path, Address()), (path,"
-        f" Port()) or (path, bytes), not {given!r:.60}"
+        f" Port()), (path, Choice(off=0, on=1)) or (path, bytes), not {given!r:.60}"
     )

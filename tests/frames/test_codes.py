@@ -25,15 +25,16 @@ from construct import (
 )
 
 import lidarspec as ls
-from lidarspec import Sensor, UsageError
+from lidarspec import Sensor, SpecError, UsageError
 from lidarspec.device.session import Session
 from lidarspec.explaining.assignments import parse_arguments, parse_values
 from lidarspec.explaining.explanation import explain
 from lidarspec.explaining.formatting import describe_argument
+from lidarspec.exports import export
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.spec import Command, EnumValue, Frame, Serial
+from lidarspec.spec import Choice, Command, EnumValue, Frame, Serial
 
 MODE = Enum(Int8ul, idle=1, strongest=0x37, **{"last and strongest": 0x39})
 HEAD = (
@@ -158,6 +159,31 @@ def test_arguments_take_names_within_their_range() -> None:
     assert parse_arguments(SENSOR, "set_mode", ["mode=0x37"]) == {"mode": 0x37}
     assert describe_argument(SENSOR, "choose", "mode") == "idle"
     assert describe_argument(SENSOR, "set_mode", "mode") == "idle|strongest|0..55"
+
+
+def test_a_command_has_names_of_its_own_for_a_shared_field() -> None:
+    shared = Frame(Struct("sync" / Const(b"\xd2"), "number" / Int8ul), direction="out")
+    fan = Choice(off=0, on=1)
+    commands = {
+        "set_fan": Command("set", args={"fan": ("number", fan)}, retries=0),
+        "set_returns": Command("set", args={"returns": ("number", Choice(first=4, dual=6))}),
+    }
+    sensor = dataclasses.replace(COMPILED, frames={"report": FRAMES["report"], "set": shared})
+    sensor = dataclasses.replace(sensor, commands=commands)
+    assert sensor.command("set_fan", fan="on") == sensor.command("set_fan", fan=1) == b"\xd2\1"
+    assert sensor.command("set_returns", returns="dual") == b"\xd2\6"
+    with pytest.raises(UsageError, match="must be off or on"):
+        sensor.command("set_fan", fan="dual")
+    with pytest.raises(UsageError, match=r"7 is outside 4 \.\. 6"):
+        sensor.command("set_returns", returns=7)
+    assert describe_argument(sensor, "set_fan", "fan") == "off|on"
+    assert describe_argument(sensor, "set_returns", "returns") == "first|dual|4..6"
+    assert parse_arguments(sensor, "set_fan", ["fan=on"]) == {"fan": "on"}
+    exported = json.loads(export(sensor, "json"))["commands"]["set_fan"]["args"]["fan"]
+    assert exported["names"] == {"off": 0, "on": 1}
+    for wrong in ({}, {"on": 1.5}):
+        with pytest.raises(SpecError):
+            Choice(**wrong)
 
 
 def test_a_reply_must_have_the_code_that_is_named() -> None:

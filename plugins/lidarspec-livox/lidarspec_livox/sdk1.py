@@ -39,6 +39,7 @@ from construct import (
 from lidarspec.spec import (
     Address,
     Checksummed,
+    Choice,
     Clock,
     ClockState,
     ClockStatus,
@@ -296,8 +297,8 @@ STATUS = (
 REQUEST = 0
 REPLY = 1
 NOTIFICATION = 2
-#: Command set and id of commands without arguments, of commands that set a number, and of commands
-#: that return a number.
+#: Command set and id of commands without arguments, of commands that set a setting, and of commands
+#: that return one.
 INFORMATION = (0, 2)
 DISCONNECT = (0, 6)
 ADDRESS = (0, 9)
@@ -312,6 +313,10 @@ IMU = (1, 8)
 GET_FAN = (1, 5)
 GET_RETURNS = (1, 7)
 GET_IMU = (1, 9)
+#: The values of settings (livox_def.h).
+SWITCH = {"off": 0, "on": 1}
+RETURN_MODES = {"first": 0, "strongest": 1, "dual": 2, "triple": 3}
+IMU_RATES = {"off": 0, "200_hz": 1}
 
 
 DATE = (
@@ -346,7 +351,11 @@ CONTROL: dict[str, Frame] = {
     ),
     "abnormal": Frame(make_message(NOTIFICATION, (0, 7), STATUS)),
     "ack": Frame(make_message(REPLY, None, RESULT)),
-    "number": Frame(make_message(REPLY, None, RESULT, "number" / Int8ul)),
+    "fan": Frame(make_message(REPLY, GET_FAN, RESULT, "fan" / Enum(Int8ul, **SWITCH))),
+    "returns": Frame(
+        make_message(REPLY, GET_RETURNS, RESULT, "mode" / Enum(Int8ul, **RETURN_MODES))
+    ),
+    "imu_rate": Frame(make_message(REPLY, GET_IMU, RESULT, "rate" / Enum(Int8ul, **IMU_RATES))),
     "firmware": Frame(make_message(REPLY, INFORMATION, RESULT, "firmware" / Array(4, Int8ul))),
     "heartbeat_ack": Frame(
         make_message(
@@ -393,14 +402,9 @@ def make_command(
     return Command(frame, reply=reply, **{**defaults, **more})
 
 
-def make_setter(number: tuple[int, int], low: int, high: int) -> Command:
-    """Return a command that sets a setting to a number."""
-    return make_command("set", number=number, args={"number": ("number", low, high)})
-
-
-def make_getter(number: tuple[int, int]) -> Command:
-    """Return a command that requests the number of a setting."""
-    return make_command("ask", "number", number)
+def make_setter(number: tuple[int, int], argument: str, names: Mapping[str, int]) -> Command:
+    """Return a command that sets a setting to one of its named values."""
+    return make_command("set", number=number, args={argument: ("number", Choice(**names))})
 
 
 DONE = {"result": "done"}
@@ -430,15 +434,15 @@ COMMANDS: dict[str, Command] = {
         matches=DONE,
     ),
     "reboot": make_command("reboot", args={"delay": ("delay", 0, 65.535)}, retries=0),
-    "set_coordinates": make_setter(COORDINATES, 0, 1),
-    "set_mode": make_setter(MODE, 1, 3),
-    "set_rain_mode": make_setter(RAIN, 0, 1),
-    "set_fan": make_setter(FAN, 0, 1),
-    "get_fan": make_getter(GET_FAN),
-    "set_returns": make_setter(RETURNS, 0, 3),
-    "get_returns": make_getter(GET_RETURNS),
-    "set_imu": make_setter(IMU, 0, 1),
-    "get_imu": make_getter(GET_IMU),
+    "set_coordinates": make_setter(COORDINATES, "coordinates", {"cartesian": 0, "spherical": 1}),
+    "set_mode": make_setter(MODE, "mode", {"normal": 1, "power_saving": 2, "standby": 3}),
+    "set_rain_mode": make_setter(RAIN, "rain_mode", SWITCH),
+    "set_fan": make_setter(FAN, "fan", SWITCH),
+    "get_fan": make_command("ask", "fan", GET_FAN),
+    "set_returns": make_setter(RETURNS, "returns", RETURN_MODES),
+    "get_returns": make_command("ask", "returns", GET_RETURNS),
+    "set_imu": make_setter(IMU, "rate", IMU_RATES),
+    "get_imu": make_command("ask", "imu_rate", GET_IMU),
     "get_extrinsics": make_command("ask", "extrinsics", EXTRINSICS),
     "set_extrinsics": make_command(
         "set_extrinsics",

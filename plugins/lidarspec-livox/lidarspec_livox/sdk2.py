@@ -41,6 +41,7 @@ from construct import (
 from lidarspec.spec import (
     Address,
     Checksummed,
+    Choice,
     Clock,
     ClockState,
     ClockStatus,
@@ -216,7 +217,7 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "detect_mode": (0x0018, Enum(NUMBER, normal=0, sensitive=1)),
     "io_functions": (0x0019, Bytes(4)),
     "work_mode": (0x001A, Enum(NUMBER, sampling=1, idle=2, ready=9)),
-    "imu_enabled": (0x001C, NUMBER),
+    "imu_enabled": (0x001C, Enum(NUMBER, off=0, on=1)),
     "serial": (0x8000, Bytes(16)),
     "app_version": (0x8002, Array(4, Int8ul)),
     "loader_version": (0x8003, Array(4, Int8ul)),
@@ -482,9 +483,17 @@ def make_setter(
     return make_request(frame, "set_ack", all_values, args=ranges, matches={"result": 0}, **more)
 
 
-def make_number_setter(name: str, low: int, high: int) -> Command:
-    """Return a command that sets a parameter to a number."""
-    return make_setter("set_number", name, args={"number": (low, high)})
+def make_choice_setter(name: str) -> Command:
+    """Return a command that sets a parameter to one of its named values."""
+    key, code = PARAMETERS[name]
+    names = {text: raw for raw, text in code.ksymapping.items()}
+    return make_request(
+        "set_number",
+        "set_ack",
+        {"parameter.key": key},
+        args={name: ("parameter.value.number", Choice(**names))},
+        matches={"result": 0},
+    )
 
 
 def make_host_setter(name: str, port: int, lidar_port: int) -> Command:
@@ -503,11 +512,11 @@ MAX_POSITION_M = 1000.0  # of the attitude
 COMMANDS: dict[str, Command] = {
     "start": make_mode_setter(1, starts=True),
     "stop": make_mode_setter(2, stops=True),
-    "set_point_type": make_number_setter("point_type", 1, 3),
-    "set_scan_pattern": make_number_setter("scan_pattern", 0, 2),
-    "set_detect_mode": make_number_setter("detect_mode", 0, 1),
-    "set_imu": make_number_setter("imu_enabled", 0, 1),
-    "enable_fov": make_number_setter("fov_enabled", 0, 3),
+    "set_point_type": make_choice_setter("point_type"),
+    "set_scan_pattern": make_choice_setter("scan_pattern"),
+    "set_detect_mode": make_choice_setter("detect_mode"),
+    "set_imu": make_choice_setter("imu_enabled"),
+    "enable_fov": make_choice_setter("fov_enabled"),
     "set_address": make_setter(
         "set_net", "lidar_address", args={name: (Address(),) for name in ("ip", "mask", "gateway")}
     ),

@@ -20,7 +20,7 @@ MID360, HAP = ls.sensor("livox-mid360"), ls.sensor("livox-hap")
 MID40, AVIA = ls.sensor("livox-mid40"), ls.sensor("livox-avia")
 FIRST = ("livox-mid40", "livox-mid70", "livox-horizon", "livox-tele15", "livox-avia")
 COMMANDS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "livox1_cmd_issue40": ("livox-avia", "set_returns", {"head.seq": 0, "number": 0}),
+    "livox1_cmd_issue40": ("livox-avia", "set_returns", {"head.seq": 0, "returns": "first"}),
     "livox1_heartbeat": ("livox-mid40", "heartbeat", {"head.seq": 0}),
     "livox1_start_seq8": ("livox-mid40", "start", {"head.seq": 8}),
     "livox2_set_work_mode_sampling": ("livox-mid360", "start", {"head.seq": 1}),
@@ -239,7 +239,7 @@ def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
             told = {"serial": "0TFSIMULATED001", "model": "Mid-40", "firmware": "4.11.0.6"}
         assert device.info == told
         reply = (
-            device.send("set_detect_mode", timeout=30, number=1)
+            device.send("set_detect_mode", timeout=30, detect_mode="sensitive")
             if name != MID40.id
             else device.send("get_information", timeout=30)
         )
