@@ -23,6 +23,7 @@ from lidarspec.drafting.distribution import (
 from lidarspec.drafting.draft import make_draft
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import (
+    BYTE_EXPORTS,
     EXPORTS,
     ExportError,
     describe_left_out,
@@ -256,5 +257,5 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     except ExportError as refused:
         raise suggest(refused, f"lidarspec show {sensor.id}") from None
     emit(text.removesuffix("\n"), output)
-    if left_out := describe_left_out(chosen, kind):
+    if kind in BYTE_EXPORTS and (left_out := describe_left_out(chosen)):
         note(left_out)

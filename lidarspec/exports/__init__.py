@@ -146,10 +146,10 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
     )
 
 
-def describe_left_out(sensor: Sensor, kind: str) -> str:
-    """Return a sentence that names the frame types that an export leaves out; "" if it has all."""
+def describe_left_out(sensor: Sensor) -> str:
+    """Return a sentence that names the frame types that `BYTE_EXPORTS` leave out; "" for none."""
     with_form = _find_wire_forms(sensor)
-    if kind not in BYTE_EXPORTS or not with_form:
+    if not with_form:
         return ""
     return f"left out, because the frames have a wire form: {_join_forms(with_form)}"
 

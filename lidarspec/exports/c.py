@@ -515,7 +515,7 @@ def header(sensor: Sensor) -> str:
     head = _HEAD.format(
         title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H"
     )
-    left_out = describe_left_out(sensor, "c")
+    left_out = describe_left_out(sensor)
     helpers = resources.files("lidarspec.exports").joinpath("c_bytes.h").read_text(encoding="utf-8")
     return "\n".join(
         [

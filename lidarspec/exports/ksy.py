@@ -323,7 +323,7 @@ def ksy(sensor: Sensor) -> str:
         sensor.source,
         f"Made by lidarspec export ksy {sensor.id}",
         "Checksums are not checked",
-        describe_left_out(sensor, "ksy"),
+        describe_left_out(sensor),
     ]
     document = {
         "meta": {"id": name, "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},

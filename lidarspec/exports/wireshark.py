@@ -625,7 +625,7 @@ def dissector(sensor: Sensor) -> str:
         "places": _list_patterns(sensor),
         "frames": [_frame(message, name) for message in by_direction],
     }
-    left_out = describe_left_out(sensor, "wireshark")
+    left_out = describe_left_out(sensor)
     head = _HEAD.format(
         title=title,
         version=__version__,
