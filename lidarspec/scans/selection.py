@@ -406,10 +406,10 @@ class ScanSelector:
             return self._find_utc(scan)
         by_host = self._selection.time == "host"
         if not scan.host_ns and (by_host or scan.sensor.clock is None):
-            raise suggest(
-                UsageError(f"{self._source} has no arrival times"),
-                "repeat with --scans 5:10",
-            )
+            error = UsageError(f"{self._source} has no arrival times")
+            if self._selection.is_timed and scan.sensor.clock is None:
+                raise suggest(error, "repeat with --scans 5:10")
+            raise suggest(error, "repeat with --time sensor")
         if by_host:
             return scan.host_ns
         return scan.stamp_ns

@@ -14,6 +14,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan, Selection, UsageError, simulate
+from lidarspec.errors import suggestion
 from lidarspec.simulation.clock_faults import parse_clock_faults
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
@@ -218,15 +219,16 @@ def test_a_slice_past_the_end_is_an_error_with_the_duration(
 def test_bytes_without_times_have_no_slice(tmp_path: Path) -> None:
     source = tmp_path / "timeless.bin"
     source.write_bytes(b"".join(simulate(ls.sensor("cspc-coin-d4"), 500)))
-    for selection in (Selection(time="host"), Selection(times=(1.0, None))):
+    for selection, command in (
+        (Selection(time="host"), "repeat with --time sensor"),
+        (Selection(times=(1.0, None)), "repeat with --scans 5:10"),
+    ):
         with (
             ls.open(source, "cspc-coin-d4") as device,
-            pytest.raises(
-                UsageError,
-                match=("has no arrival times"),
-            ),
+            pytest.raises(UsageError, match="has no arrival times") as refused,
         ):
             list(device.scans(select=selection))
+        assert suggestion(refused.value) == command
 
 
 @pytest.mark.parametrize(
