@@ -38,20 +38,27 @@ STREAM = 1
 MAX_MODE_NAME_BYTES = 64  # SDK, LidarScanMode
 #: High nibble of the model number -> series, low nibbles of its models; an A2M8 is 28 (SDK,
 #: GetModelNameStringByModelID).
-SERIES = {0x1: ("A1", (8,)), 0x2: ("A2", (4, 6, 7, 8, 12)), 0x3: ("A3", (1,)), 0x4: ("C1", (1,))}
-SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T1", (1,))}
+SERIES = {
+    0x1: ("A1", (8,)),
+    0x2: ("A2", (4, 6, 7, 8, 12)),
+    0x3: ("A3", (1,)),
+    0x4: ("C1", (1,)),
+    0x6: ("S1", (1,)),
+    0x7: ("S2", (1, 2)),
+    0x8: ("S3", (1, 2)),
+    0x9: ("T1", (1,)),
+}
 
 
-def name_model(series: str, low: int) -> str:
+def name_model(series: str, models: tuple[int, ...], low: int) -> str:
     """Return the name of a series, and of the model if the series has several models."""
-    several = {"A2", "S2", "S3"}
-    if series in several:
+    if len(models) > 1:
         return f"RPLIDAR {series}, {series}M{low}"
     return f"RPLIDAR {series}"
 
 
 MODEL_NUMBERS = {
-    name_model(series, low): high << 4 | low
+    name_model(series, models, low): high << 4 | low
     for high, (series, models) in SERIES.items()
     for low in models
 }
@@ -77,8 +84,14 @@ KEYS = {
 KEY = Enum(Int32ul, **KEYS)
 
 #: Streams -> the type of their descriptors.
-STREAMS = {"node": 0x81, "express": 0x82, "hq": 0x83, "ultra": 0x84, "dense": 0x85}
-STREAMS |= {"ultra_dense": 0x86}
+STREAMS = {
+    "node": 0x81,
+    "express": 0x82,
+    "hq": 0x83,
+    "ultra": 0x84,
+    "dense": 0x85,
+    "ultra_dense": 0x86,
+}
 
 #: The configuration values of fixed width, by key.
 VALUES: dict[int, Construct] = {
