@@ -84,7 +84,7 @@ TURNS_BEFORE_EXPOSURE = 3
 
 #: Codes of commands (manual 2.1.3); FC is from the SDK.
 MODES = {"start": 0xF0, "low_exposure": 0xF1, "high_exposure": 0xF2, "stop": 0xF5, "version": 0xFC}
-EXPOSURES = {"high": 1, "low": LOW_EXPOSURE}
+EXPOSURES = {"high": HIGH_EXPOSURE, "low": LOW_EXPOSURE}
 
 COMMAND = Checksummed(
     Struct(
