@@ -182,7 +182,7 @@ def count_returns(f: Fields) -> Any:
     With dual return, an odd packet has the first returns and the next packet has the second returns
     (M1 user guide, 2.1.2).
     """
-    return np.where(f.wave_mode == 0, 2, 1)
+    return np.where(f.wave_mode == WAVE_MODES["dual"], 2, 1)
 
 
 def number_firings(f: Fields, blocks: int) -> Any:
@@ -190,8 +190,8 @@ def number_firings(f: Fields, blocks: int) -> Any:
 
     With dual return, the packets of a pair have the same numbers.
     """
-    packet = f.pkt_psn - 1
-    return np.where(f.wave_mode == 0, np.floor(packet / 2), packet) * blocks + f.blocks.index
+    group = np.floor((f.pkt_psn - 1) / count_returns(f))
+    return group * blocks + f.blocks.index
 
 
 def pace(f: Fields) -> Any:
