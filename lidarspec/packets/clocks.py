@@ -38,7 +38,7 @@ class Unwrapper:
     """
 
     def __init__(self, wraps_at: float | None) -> None:
-        self._period_ns = _to_exact_ns(wraps_at) if wraps_at else 0
+        self._period_ns = to_exact_ns(wraps_at) if wraps_at else 0
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
@@ -120,7 +120,7 @@ class ClockEpoch:
         self.ns: int | None = None
         self._sensor = sensor
         self._clock = clock
-        self._period_ns = _to_exact_ns(clock.wraps_at)
+        self._period_ns = to_exact_ns(clock.wraps_at)
         self._reference = reference
 
     def push(
@@ -312,7 +312,7 @@ def part_times(
     first = np.searchsorted(which, which)
     steps = readings - readings[first]
     if sensor.clock.wraps_at:
-        period_ns = _to_exact_ns(sensor.clock.wraps_at)
+        period_ns = to_exact_ns(sensor.clock.wraps_at)
     else:
         period_ns = 0
     return times + ((steps + period_ns // 2) % period_ns - period_ns // 2 if period_ns else steps)
@@ -334,7 +334,7 @@ def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table)
 
 
 @lru_cache(maxsize=256)
-def _to_exact_ns(seconds: float) -> int:
+def to_exact_ns(seconds: float) -> int:
     """Return seconds as nanoseconds, exact for the shortest decimal form of the number."""
     return int(to_exact(seconds) * 10**9)
 

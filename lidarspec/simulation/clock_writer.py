@@ -30,13 +30,13 @@ from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.schema import without_indices
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clock_status import frame_status
-from lidarspec.packets.clocks import clock_fields, clock_ns, clock_parts, clock_terms
+from lidarspec.packets.clocks import clock_fields, clock_ns, clock_parts, clock_terms, to_exact_ns
 from lidarspec.packets.packet_type import find_clock
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.clock_faults import ClockFaults, ClockTimeline
 from lidarspec.simulation.raw_values import PartRows, write_raw
 from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, Clock, ClockState
-from lidarspec.spec.tree import FieldInfo, to_exact
+from lidarspec.spec.tree import FieldInfo
 
 Times = NDArray[np.int64]
 DAY_NS = DAY_S * 10**9
@@ -114,7 +114,7 @@ class ClockWriter:
         self._sensor = replace(sensor, clock=clock) if clock is not sensor.clock else sensor
         self.period_ns = 0
         if clock.wraps_at is not None:
-            self.period_ns = int(to_exact(clock.wraps_at) * 10**9)
+            self.period_ns = to_exact_ns(clock.wraps_at)
         self._date: _DateFields | None = None
         self._parts = ""
         self._is_shifted = isinstance(clock.source, str)

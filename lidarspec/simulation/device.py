@@ -32,6 +32,7 @@ from lidarspec.simulation.simulator import (
     FrameSimulation,
     FramesWithoutPoints,
     check_clock_faults,
+    find_periodic_rates,
     frame_simulation,
 )
 from lidarspec.spec.arguments import OWN_ADDRESS, OWN_PORT, Address, Port
@@ -89,8 +90,8 @@ class ReceivedCommand:
             for argument in self.command.arguments.values()
             if isinstance(argument.kind, kind)
         ]
-        for path in paths:
-            return _get_flat(self.values, path)
+        if paths:
+            return _get_flat(self.values, paths[0])
         return self.values.get(f"{{{placeholder}}}")
 
 
@@ -209,13 +210,10 @@ class ReplyMaker:
         """
         values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
         fields = get_codec(self._sensor.frames[frame]).schema.fields
-        sent = [
-            one
-            for one in self._sensor.commands.items()
-            if (one[1].frame, one[1].link) == (frame, link)
-        ]
         best: ReceivedCommand | None = None
-        for command_name, command in sent:
+        for command_name, command in self._sensor.commands.items():
+            if command.frame != frame or command.link != link:
+                continue
             texts = _match_command(command, values, fields)
             if texts is None:
                 continue
@@ -472,7 +470,7 @@ class SimulatedDevice:
             self._plug = None
         is_started = not self._waits_for_a_command()
         if is_started or self.sensor.has_points:
-            self._begin_unasked(0.0)
+            self._begin_periodic(0.0)
         if is_started and self.sensor.has_points:
             self._begin(0.0, self.sensor.data_frame)
 
@@ -631,11 +629,7 @@ class SimulatedDevice:
         if command.starts or command.stops:
             self._stream = None
             self._plan = [
-                due
-                for due in self._plan
-                if due.frame
-                and self.sensor.frames[due.frame].simulation.rate
-                and self.sensor.has_points
+                due for due in self._plan if self.sensor.has_points and self._is_periodic(due)
             ]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
@@ -648,7 +642,7 @@ class SimulatedDevice:
         if request.name in self.sensor.simulation.effects:
             self._apply_effect(request.name)
         if command.starts and not self.sensor.has_points:
-            self._begin_unasked(time_ns)
+            self._begin_periodic(time_ns)
         elif command.starts:
             kinds = [
                 name
@@ -675,11 +669,10 @@ class SimulatedDevice:
         if self._stream is not None:
             self._stream.change(self._simulation(self._stream.frame))
 
-    def _begin_unasked(self, at: float) -> None:
+    def _begin_periodic(self, at: float) -> None:
         """Plan the first frame of each type without points that is sent periodically."""
-        for name, frame in self.sensor.incoming.items():
-            if frame.simulation.rate and not frame.data:
-                self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
+        for name in find_periodic_rates(self.sensor):
+            self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
         """Plan the fillers that are sent in a pause, and return the end of the pause."""
@@ -715,6 +708,7 @@ class SimulatedDevice:
         if self._plug is None or now < self._plug:
             return
         if self.present:
-            self.present, self._plug = False, now + int(self.faults.absent * SECOND)
+            self.present = False
+            self._plug = now + int(self.faults.absent * SECOND)
         else:
             self.start(now)

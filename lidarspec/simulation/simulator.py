@@ -40,7 +40,7 @@ from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, align_p
 from lidarspec.frames.frame_table import CompiledTable, Table
 from lidarspec.framing.example_frames import example
 from lidarspec.framing.frame_engine import get_codec
-from lidarspec.packets.clocks import clock_ns
+from lidarspec.packets.clocks import clock_ns, to_exact_ns
 from lidarspec.points.conventions import coordinates, find_direction
 from lidarspec.points.reference_evaluator import list_parts
 from lidarspec.sensor_operations import Sensor
@@ -53,7 +53,6 @@ from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
-from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 #: Number of bits on a serial line for each byte: a start bit, eight data bits and a stop bit.
@@ -81,7 +80,7 @@ PROBE_VALUE = 100
 #: Relative tolerance for rounding errors between a range and the value of its field.
 RANGE_TOLERANCE = 1e-9
 #: Number of periodic frames without points to make together.
-UNASKED_BATCH = 50
+PERIODIC_BATCH = 50
 #: Standard gravity, m/s2.
 GRAVITY = 9.80665
 
@@ -170,11 +169,10 @@ class Measurement:
         cls, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str]
     ) -> Measurement:
         """Return a `PointPlacement` for Cartesian points, else a `Measurement`."""
-        return (
-            PointPlacement
-            if _result(sensor, frame, table)[0].__class__ is Cartesian
-            else Measurement
-        )(sensor, frame, table, given)
+        result, _ = _result(sensor, frame, table)
+        if isinstance(result, Cartesian):
+            return PointPlacement(sensor, frame, table, given)
+        return Measurement(sensor, frame, table, given)
 
     def fill(
         self, table: CompiledTable, numbers: Sequence[int], scene: Scene, times: Floats
@@ -749,7 +747,7 @@ class PacketTimes:
         assert self._sensor.clock is not None
         steps = np.diff(clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))))
         if self._sensor.clock.wraps_at:
-            turn = int(to_exact(self._sensor.clock.wraps_at) * 10**9)
+            turn = to_exact_ns(self._sensor.clock.wraps_at)
             steps = (steps + turn // 2) % turn - turn // 2
         times = np.concatenate([[0], np.cumsum(steps)])
         even = np.asarray(np.rint(np.linspace(0, times[-1], len(times))), np.int64)
@@ -967,19 +965,15 @@ class FramesWithoutPoints:
 
         Frames are made in batches, because a batch takes hardly longer than a single frame.
         """
-        start = number - number % UNASKED_BATCH
+        start = number - number % PERIODIC_BATCH
         if self._batches.get(name, (-1, []))[0] != start:
-            batch = self._make_batch(name, range(start, start + UNASKED_BATCH))
+            batch = self._make_batch(name, range(start, start + PERIODIC_BATCH))
             self._batches[name] = start, batch
         return self._batches[name][1][number - start]
 
-    def iter_unasked(self) -> Iterator[bytes]:
+    def iter_periodic(self) -> Iterator[bytes]:
         """Yield the periodic frames without points, in the order of their times."""
-        rates = {
-            name: frame.simulation.rate
-            for name, frame in self._sensor.incoming.items()
-            if frame.simulation.rate and not frame.data
-        }
+        rates = find_periodic_rates(self._sensor)
         due = heapq.merge(*(_iter_due(name, rate) for name, rate in rates.items()))
         return (self.make_frame(name, number) for _, name, number in due)
 
@@ -1008,6 +1002,15 @@ class FramesWithoutPoints:
         if name not in self._makers:
             self._makers[name] = FrameMaker(self._sensor, name)
         return self._makers[name]
+
+
+def find_periodic_rates(sensor: Sensor) -> dict[str, float]:
+    """Return {type: rate in Hz} of the frames without points that are sent periodically."""
+    return {
+        name: frame.simulation.rate
+        for name, frame in sensor.incoming.items()
+        if frame.simulation.rate and not frame.data
+    }
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
@@ -1054,8 +1057,7 @@ def simulate(
     if not sensor.has_points:
         makers = FramesWithoutPoints(sensor)
         makers.use_timeline(timeline)
-        unasked = makers.iter_unasked()
-        frames = list(itertools.islice(unasked, start, start + packets))
+        frames = list(itertools.islice(makers.iter_periodic(), start, start + packets))
         if not frames and packets:
             raise UsageError(
                 f"{sensor.id} sends no frames periodically, because no frame type declares a `rate`"
@@ -1071,12 +1073,10 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
     if not faults:
         return
     others = FramesWithoutPoints(sensor)
-    unasked = [
-        name for name, frame in sensor.incoming.items() if frame.simulation.rate and not frame.data
-    ]
+    periodic = find_periodic_rates(sensor)
     if sensor.has_points:
         frame_simulation(sensor, sensor.data_frame).clock.check(faults)
-    elif not any(others.find_clock(name).has_clock for name in unasked):
+    elif not any(others.find_clock(name).has_clock for name in periodic):
         raise UsageError(
             f"{sensor.id} sends no frames with a clock, so the clock cannot have faults"
         )
@@ -1086,7 +1086,7 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
     frame = clock.status.frame if clock is not None and clock.status is not None else ""
     if not frame:
         frame_simulation(sensor, sensor.data_frame).clock.check_status()
-    elif frame in unasked:
+    elif frame in periodic:
         others.find_clock(frame).check_status()
     else:
         raise UsageError(
