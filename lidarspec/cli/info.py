@@ -34,7 +34,7 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
                 yield json.dumps(contents.to_dict(), indent=2, allow_nan=False)
             else:
                 yield f"{contents.path}: {contents.kind}, {size(contents.size)}"
-                yield from (f"  {word:<8}  {text}" for word, text in format_contents(contents))
+                yield from format_contents(contents)
             for warning in contents.warnings:
                 note(warning)
             if not any(content.sensors for content in contents.contents):

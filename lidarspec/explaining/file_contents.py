@@ -49,8 +49,11 @@ MAX_BEGINNING_PACKETS = 1 << 18
 MAX_DECODED_BYTES = 1 << 24
 #: Maximum number of senders to list.
 MAX_LISTED_FLOWS = 6
-#: Maximum number of characters in a line about the clock.
-CLOCK_TEXT_WIDTH = 66
+#: Maximum number of characters in a line of the description.
+LINE_WIDTH = 80
+#: Minimum number of characters in the column of labels, for equal columns of several files.
+MIN_LABEL_WIDTH = 8
+COMMAND_LABEL = "next"
 #: A time after all arrivals, ns since 1970.
 _END_NS = (1 << 63) - 1
 #: Transport of a file -> the kind of the file in words.
@@ -346,8 +349,30 @@ def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
         return {}
 
 
-def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
-    """Return the description of a file as (label, text) of each line."""
+def format_contents(contents: FileContents) -> Iterator[str]:
+    """Yield the description of a file in lines: a column of labels, and one of texts.
+
+    Texts are folded between words at `LINE_WIDTH`. Commands are not folded, so that they can be
+    copied.
+    """
+    rows = _make_rows(contents)
+    label_width = max(MIN_LABEL_WIDTH, *(len(label) for label, _ in rows))
+    text_width = LINE_WIDTH - len(_format_row("", "", label_width))
+    for label, text in rows:
+        if label == COMMAND_LABEL:
+            folded = [text]
+        else:
+            folded = textwrap.wrap(text, text_width, break_long_words=False, break_on_hyphens=False)
+        for number, line in enumerate(folded or [""]):
+            yield _format_row("" if number else label, line, label_width)
+
+
+def _format_row(label: str, text: str, label_width: int) -> str:
+    return f"  {label:<{label_width}}  {text}"
+
+
+def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
+    """Return the description of a file as labels and texts."""
     lines = list[tuple[str, str]]()
     if (header := contents.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
@@ -420,10 +445,7 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
     if content.clock:
-        first, *others = textwrap.wrap(printable(content.clock), CLOCK_TEXT_WIDTH)
-        yield "clock", first
-        for line in others:
-            yield "", line
+        yield "clock", printable(content.clock)
     for name, text in content.info.items():
         yield name.replace("_", " "), printable(text)
-    yield "next", content.command
+    yield COMMAND_LABEL, content.command

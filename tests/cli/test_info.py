@@ -16,6 +16,7 @@ from lidarspec.recording.recorders import Recorder
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran, run_json
+from tests.made_captures import frame, pcap
 
 START, STEP = 1_700_000_000 * 10**9, 1_327_104
 
@@ -82,6 +83,20 @@ def test_a_capture_of_a_byte_stream_is_called_so(tmp_path: Path) -> None:
     told = run_json("info", tmp_path / "line.pcap")
     assert (told["kind"], told["packets"]) == ("a capture of a byte stream", 1800)
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
+
+
+def test_the_longest_label_gives_the_width_of_the_column(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcap"
+    sensor = ls.sensor("velodyne-vlp16")
+    packets = [sensor.example("position"), *simulate(sensor, 20)]
+    path.write_bytes(pcap(*map(frame, packets)))
+    heading, *lines = ran("info", path).stdout.splitlines()
+    labels = [line[: len("  temperature")].strip() for line in lines]
+    assert "temperature" in labels
+    assert {"time", "from", "sensor", "clock", "next"} < set(labels)
+    for line in lines:
+        assert line[len("  temperature") :].startswith("  ")
+        assert len(line) <= 80 or str(path) in line
 
 
 def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
