@@ -90,7 +90,7 @@ def test_the_longest_label_gives_the_width_of_the_column(tmp_path: Path) -> None
     sensor = ls.sensor("velodyne-vlp16")
     packets = [sensor.example("position"), *simulate(sensor, 20)]
     path.write_bytes(pcap(*map(frame, packets)))
-    heading, *lines = ran("info", path).stdout.splitlines()
+    _, *lines = ran("info", path).stdout.splitlines()
     labels = [line[: len("  temperature")].strip() for line in lines]
     assert "temperature" in labels
     assert {"time", "from", "sensor", "clock", "next"} < set(labels)
