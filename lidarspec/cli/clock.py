@@ -196,13 +196,12 @@ def _print_report(
         facts: dict[str, Any] = {
             "source": source_clock.source,
             "sensor": source_clock.device.sensor.id,
+            "to_first_s": None if math.isnan(mutual_s) else mutual_s,
         }
-        facts["to_first_s"] = None if math.isnan(mutual_s) else mutual_s
         say(json.dumps({**facts, **report.to_dict()}, allow_nan=False))
         return
     say(f"{source_clock.source}: {source_clock.device.sensor.id}")
-    rows = list(iter_clock_rows(report))
-    if not math.isnan(mutual_s):
-        rows.insert(2, ("", f"{mutual_s * 1e3:+.2f} ms to the first source"))
-    for label, text in rows:
+    for label, text in iter_clock_rows(report):
         say(f"  {label:<8}  {text}")
+        if label == "offset" and not math.isnan(mutual_s):
+            say(f"  {'':<8}  {mutual_s * 1e3:+.2f} ms to the first source")
