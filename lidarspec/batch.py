@@ -1,8 +1,8 @@
 """Convert many files, large files in pieces, in several processes or on a cluster.
 
-In: captures by path, pattern or URL. Out of `convert`: a file of points for each capture (several
-    files if the capture is larger than a piece), and a manifest. Out of `read`: a Dask dataframe
-    with a partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask cluster.
+In: captures by path, pattern or URL. `convert` writes a file of points for each capture (several
+files if the capture is larger than a piece), and a manifest. `read` returns a Dask dataframe with a
+partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask cluster.
 
 A large file is cut by `device.file_scans`. The starts of its pieces are found one after the other:
 a task reads through a piece without computing points, and returns the bookmark of the next piece.

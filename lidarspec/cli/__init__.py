@@ -7,10 +7,10 @@ which suggests the next command. Modules in reading order:
 * `completion`: completion of arguments in the shell.
 * `options`, `inputs`: options that several verbs share, and the input of verbs that read bytes.
 * `terminal`, `output`, `failures`: print to standard output and error; format results as text,
-tables or JSON; report a failure as one message and an exit code.
+  tables or JSON; report a failure as one message and an exit code.
 * `listing`: the lines of an explanation, in colours.
 * `sensors`, `frames`, `build`: list the installed sensors, print the fields of frames, build a
-frame.
+  frame.
 * `read`, `view`: print a live sensor's data as rows or statistics, or draw it.
 * `clock`: report what the clocks of sensors count, and their faults.
 * `recordings`: record a source into a file, and replay it.
