@@ -27,7 +27,7 @@ from sensor_msgs.msg import LaserScan, PointCloud2
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.formats.messages import SCAN
+from lidarspec.formats.messages import CLOUD, SCAN
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 from lidarspec_ros2.topics import make_transform
 
@@ -190,6 +190,26 @@ def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: 
     )  # on through the back, to where the last beam looks a turn on
     client.until(lambda: newest().angle_min == 2.0)
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
+
+
+def test_returns_selects_one_point_of_each_firing(run: Any, client: Client) -> None:
+    clouds = client.listen("points", PointCloud2)
+    source = "sim:robosense-mx?seed=3&rate=0.25"  # two valid returns of each firing
+    run(source, "-s", "robosense-mx", ros=format_parameters(qos="reliable", returns="last"))
+
+    def newest_count() -> int:
+        cloud = message(clouds[-1], CLOUD)
+        return int(cloud.width * cloud.height)
+
+    client.until(lambda: len(clouds) > 1)
+    firings = newest_count()
+    assert client.set("returns", "all") == ""
+    client.until(lambda: newest_count() != firings)
+    assert newest_count() == 2 * firings
+    assert client.set("returns", "nearest") == (
+        "returns must be one of first, last, strongest, all, not 'nearest'"
+    )
+    assert client.value("returns") == "all"
 
 
 def test_an_unknown_parameter_is_reported(run: Any, client: Client) -> None:
