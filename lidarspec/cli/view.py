@@ -86,7 +86,8 @@ from lidarspec.view.terminal_window import Window
     "-o",
     "--output",
     metavar="FILE.rrd|URL",
-    help="With --rerun: write to this file, or send to a running viewer (rerun+http://HOST:9876/proxy).",
+    help="With --rerun: write to this file, or send to a running viewer"
+    " (rerun+http://HOST:9876/proxy).",
 )
 def view(
     source: str,
