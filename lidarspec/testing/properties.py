@@ -121,15 +121,15 @@ class Property:
             try:
                 self.function(subject, *case)
             except ViolationError as error:
-                file = (
-                    str(subject.vectors) if error.code == "LS702" else ""
-                )  # the vectors file has no source
+                file = ""
+                if error.code == "LS702":  # the fault is in the file of vectors
+                    file = str(subject.vectors)
                 findings.append(
                     Finding(error.code, error.what, error.path, subject.sensor.id, file)
                 )
             except AssertionError as error:
-                what = _find_first_line(error)
-                findings.append(Finding(self.rule, what, ".".join(case), subject.sensor.id))
+                reason = _find_first_line(error)
+                findings.append(Finding(self.rule, reason, ".".join(case), subject.sensor.id))
             except SpecError as error:
                 case_path = ".".join(case)
                 path = error.path if error.path.startswith(case_path) else case_path
