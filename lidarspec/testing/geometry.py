@@ -3,14 +3,14 @@
 Four kinds of frames are used:
 
 * Examples: clouds must keep the conventions of `PointCloud`, and tracing `points` gives the source
-fields of each column.
+  fields of each column.
 * Packets of the sensor's `sweep`: directions must be in radians, turn clockwise or
-counter-clockwise throughout, cross the full circle without a jump, and exist if a packet has a
-single point. Clock and counter must increase.
+  counter-clockwise throughout, cross the full circle without a jump, and exist if a packet has a
+  single point. Clock and counter must increase.
 * Frames with an angle that is changed by a few steps: the points must turn as the vendor's axes
-declare.
+  declare.
 * Packets simulated in a room: the decoded points must lie on its walls. Their distances are
-computed by `distance_outside`, not by the simulator.
+  computed by `distance_outside`, not by the simulator.
 
 Measured values are reported (`SensorUnderTest.picture`), so that the author can compare them with
 the manual.
