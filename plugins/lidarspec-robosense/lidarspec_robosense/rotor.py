@@ -116,6 +116,8 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
 #: Codes of DIFOP and of the packets of an M1 (user guides).
 SYNC_MODES = {"internal": 0, "PPS": 1, "PTP": 2, "gPTP": 3}
 SYNC_STATES = {"none": 0, "locked": 1, "timeout": 2}
+#: The mode and the status make one code: mode * CODES_PER_MODE + status.
+CODES_PER_MODE = 4
 WAVE_MODES = {"dual": 0, "strongest": 4, "last": 5, "first": 6}
 RETURN_NUMBERS = {"single": 0, "first": 1, "second": 2}
 SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
@@ -129,17 +131,25 @@ def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
     Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP. PPS comes with a
     GPRMC sentence, whose time is UTC.
     """
-    states = {}
-    for mode, source in enumerate(sources):
+    internal, *others = sources
+    states = {status: ClockState(internal, False, epoch="boot") for status in SYNC_STATES.values()}
+    for mode, source in enumerate(others, start=1):
         if not source:
             continue
-        locked_epoch = "utc" if source == "PPS" else None
-        states[4 * mode] = ClockState(f"{source}, not locked", False, epoch="boot")
-        states[4 * mode + 1] = ClockState(f"locked to {source}", True, epoch=locked_epoch)
-        states[4 * mode + 2] = ClockState(f"{source} lost", False, epoch=locked_epoch)
-    for status in range(3):
-        states[status] = ClockState(sources[0], False, epoch="boot")
-    return ClockStatus(lambda f: 4 * f.time_sync_mode + f.time_sync_status, states, frame="difop")
+        source_epoch = "utc" if source == "PPS" else None
+        first = mode * CODES_PER_MODE
+        states[first + SYNC_STATES["none"]] = ClockState(
+            f"{source}, not locked", False, epoch="boot"
+        )
+        states[first + SYNC_STATES["locked"]] = ClockState(
+            f"locked to {source}", True, epoch=source_epoch
+        )
+        states[first + SYNC_STATES["timeout"]] = ClockState(
+            f"{source} lost", False, epoch=source_epoch
+        )
+    return ClockStatus(
+        lambda f: f.time_sync_mode * CODES_PER_MODE + f.time_sync_status, states, frame="difop"
+    )
 
 
 #: The first 50 bytes of every DIFOP.
