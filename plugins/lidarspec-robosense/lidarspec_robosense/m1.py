@@ -68,9 +68,9 @@ from lidarspec_robosense.rotor import (
 
 BLOCKS = 25
 CHANNELS = 5
-# Packets per frame (rs_driver; M1P user guide: the counter restarts with each frame)
+# Packets per frame with single return; twice as many with dual return (rs_driver; M1P user guide:
+# the counter restarts with each frame)
 SINGLE_RETURN_PACKETS = 630
-DUAL_RETURN_PACKETS = 1260
 FRAME_RATE_HZ = 10  # M1P user guide, page 6
 BLOCK_PERIOD_S = 10e-6 / 3  # the M1P guide's capture has blocks at 0, 3, 7, 10, 13, 17 us
 BLOCK_OFFSETS_S = np.round(np.arange(BLOCKS) * BLOCK_PERIOD_S, 6)  # rounded as by the sensor
@@ -171,11 +171,6 @@ def plausible(f: Fields) -> Any:
     return f.pkt_psn >= 1
 
 
-def packets_per_frame(f: Fields) -> Any:
-    """Return the last number of the counter; only wave mode 0 is dual return."""
-    return np.where(f.wave_mode == 0, DUAL_RETURN_PACKETS, SINGLE_RETURN_PACKETS)
-
-
 def count_returns(f: Fields) -> Any:
     """Return the number of consecutive packets with the returns of the same firings.
 
@@ -183,6 +178,11 @@ def count_returns(f: Fields) -> Any:
     (M1 user guide, 2.1.2).
     """
     return np.where(f.wave_mode == WAVE_MODES["dual"], 2, 1)
+
+
+def packets_per_frame(f: Fields) -> Any:
+    """Return the last number of the counter."""
+    return SINGLE_RETURN_PACKETS * count_returns(f)
 
 
 def number_firings(f: Fields, blocks: int) -> Any:
