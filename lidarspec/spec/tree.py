@@ -1155,6 +1155,10 @@ class OuterScope(Scope):
         return value
 
 
+#: The reason why a number that has a name in an Enum equals no parsed value.
+NAME_IS_COMPARED = "construct compares the name of a code"
+
+
 class UntraceableExpressionError(Exception):
     """Raised if an expression cannot be converted to a formula."""
 
@@ -1202,8 +1206,13 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
             raise UntraceableExpressionError("an expression uses a named value as a number")
-        if pair[one] in known.info.labels:  # construct replaces this number by its name
-            return Symbol(int(symbol == "!="))
+        if pair[one] in known.info.labels:
+            name = known.info.labels[pair[one]]
+            outcome = "never" if symbol == "==" else "always"
+            raise UntraceableExpressionError(
+                f"{known.path} {symbol} {pair[one]} is {outcome} true, because"
+                f" {NAME_IS_COMPARED}; write {known.path} {symbol} {name!r}"
+            )
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
     wrong = next((part for part in pair if not isinstance(part, int | float | Ref | Op)), None)
     if wrong is not None:

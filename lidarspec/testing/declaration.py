@@ -28,7 +28,7 @@ from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
-from lidarspec.spec.tree import Sealed, Struct, infos, nodes
+from lidarspec.spec.tree import NAME_IS_COMPARED, Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, find_fields, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -236,8 +236,11 @@ def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
-        if not _is_reply(subject.sensor, name):  # a reply comes only once, on request
-            yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
+        reason = getattr(engine, "reason", "its layout cannot be computed")
+        if NAME_IS_COMPARED in reason:
+            yield "LS117", reason, name
+        elif not _is_reply(subject.sensor, name):  # a reply comes only once, on request
+            yield "LS116", reason, name
     elif engine.size is not None and engine.size != frame.max_length:
         yield (
             "LS203",

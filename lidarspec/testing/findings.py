@@ -56,6 +56,7 @@ LS113 the struct contains Select or Optional | damaged bytes would select anothe
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
 LS115 an expression of the struct fails | it raises an undocumented exception | make it valid for every header
 LS116 the frame is not compiled | construct parses it, hundreds of times slower | declare fields whose offsets follow from the header
+LS117 a code is compared with its number | construct compares its name, so the condition never changes | compare with the name
 LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"); "" is a pure number
 LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section"
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from construct import (
     BitStruct,
     Bytes,
     Const,
+    Construct,
     Enum,
     GreedyBytes,
     If,
@@ -89,8 +91,8 @@ CHOICES: dict[str, Any] = {
 }
 
 
-#: Python functions that decide on the value of a field.
-UNTRACED = {"a function", "its number"}
+#: Python functions that decide on the value of a field, and numbers that have names.
+UNTRACED = {"a function", "its number", "numbers"}
 
 
 @pytest.mark.parametrize("name", CHOICES)
@@ -219,9 +221,29 @@ def test_exports_omit_unreachable_branches() -> None:
         if isinstance(node, Select)
     ]
     assert [key for key, _ in found.cases] == [2, 3]
-    (found,) = [
-        node
-        for node in nodes(messages(sensor(CHOICES["numbers"]))[0].root)
-        if isinstance(node, Select)
-    ]
-    assert [key for key, _ in found.cases] == [3]
+
+
+@pytest.mark.parametrize(
+    ("body", "advice"),
+    [
+        (If(this.kind == 2, Int8ub), "kind == 2 is never true,.* write kind == 'busy'"),
+        (If(lambda found: found.kind == 2, Int8ub), "write kind == 'busy'"),
+        (IfThenElse(this.kind != 1, Int8ub, Int16ub), "is always true,.* write kind != 'idle'"),
+        (If((this.x > 3) | (this.kind == 2), Int8ub), "write kind == 'busy'"),
+        (Switch(this.kind, {2: Int8ub}), "the case 2 is never selected,.* write 'busy'"),
+    ],
+)
+def test_a_number_that_has_a_name_is_reported(body: Construct, advice: str) -> None:
+    struct = Struct("kind" / KIND, "x" / Int8ub, "body" / body)
+    ours = sensor(struct)
+    for data in (b"\1\2", b"\2\3", b"\2\x07\1", b"\1\2\3", b"\4\0\1\2"):
+        agree(struct, [data])
+    codec = get_codec(ours.frames["data"])
+    assert not codec.is_compiled
+    assert re.search(advice, codec.reason), codec.reason
+
+
+def test_a_number_without_a_name_selects_its_case() -> None:
+    assert is_compiled(
+        sensor(Struct("kind" / KIND, "x" / If(this.kind == 9, Int8ub))).frames["data"]
+    )

@@ -49,6 +49,7 @@ CONSTRUCT = {
     "optional": {"LS113"},
     "bare_errors": {"LS308"},
     "lambda_raises": {"LS115", "LS116"},
+    "code_by_number": {"LS117"},
 }
 #: where pluggy bites, and what else keeps a plugin from being loaded.
 PLUGGY = {

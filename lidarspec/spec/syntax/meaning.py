@@ -435,9 +435,15 @@ class _Builder:
             for case in con.cases
             if case not in labels
         }
+        named = [case for case in con.cases if case in labels and labels[case] not in con.cases]
         odd = [case for case, value in values.items() if not isinstance(value, int)]
-        if odd and not isinstance(key, tree.Untraced):
-            if isinstance(key, tree.Ref) and isinstance(odd[0], str):
+        if (named or odd) and not isinstance(key, tree.Untraced):
+            if named:
+                reason = (
+                    f"the case {named[0]} is never selected, because {tree.NAME_IS_COMPARED};"
+                    f" write {labels[named[0]]!r}"
+                )
+            elif isinstance(key, tree.Ref) and isinstance(odd[0], str):
                 reason = f"{key.path} has no value named {odd[0]!r}"
             else:
                 reason = f"a case for {odd[0]!r}, which is not an integer"
