@@ -235,6 +235,8 @@ def _apply_adapter(info: FieldInfo) -> FieldInfo:
     """Return a field with the type of its decoded values."""
     assert info.adapter is not None
     dtype = info.adapter.dtype
+    if info.adapter.decode_bytes is not None:
+        return info
     kinds = {"i": "int", "f": "float"}
     axes = info.axes[:-1] if info.kind == "bytes" else info.axes
     return replace(

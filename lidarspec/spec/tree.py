@@ -79,6 +79,8 @@ class Adapter:
             `decode` shows which ones.
         is_partial: whether a frame can be invalid because a raw value cannot be decoded.
         form: how the value is stored, as text to display; "" for a plain number.
+        decode_bytes: a function that decodes an array of bytes along the last axis, for columns of
+            decoded bytes; None if columns have the raw bytes or other values.
     """
 
     decode: Callable[[Any], Any]
@@ -87,11 +89,12 @@ class Adapter:
     allowed: tuple[int, ...] | None = None
     is_partial: bool = False
     form: str = ""
+    decode_bytes: Callable[[NDArray[Any]], NDArray[Any]] | None = None
 
     @property
     def has_columns(self) -> bool:
         """Whether columns have the decoded values."""
-        return self.dtype != np.uint8
+        return self.dtype != np.uint8 or self.decode_bytes is not None
 
     def decode_column(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[Any]:
         """Return the decoded values of a column.
@@ -99,6 +102,8 @@ class Adapter:
         Args:
             raw: the raw values, as integers or as bytes along the last axis.
         """
+        if self.decode_bytes is not None:
+            return self.decode_bytes(raw)
         values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         decoded = np.empty(len(values), self.dtype)
         for index, value in enumerate(values):

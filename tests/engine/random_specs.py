@@ -70,11 +70,13 @@ class Drawn:
         size: the maximum size.
         levels: the known fields of each enclosing struct, outermost first.
         interpreted: whether to include parts that only construct can read.
+        adapted: whether to include parts that construct decodes, or reads several fields for.
     """
 
     source: Random
     size: int
     interpreted: bool
+    adapted: bool = False
     levels: list[list[Known]] = field(default_factory=list)
     number: int = 0
 
@@ -146,7 +148,33 @@ class Drawn:
             kinds += [self.array, self.array, self.condition, self.switch]
         if self.interpreted:
             kinds += [self.text, self.draw_computed]
+        if self.adapted:
+            kinds += [self.draw_xor, self.draw_xor, self.draw_focused, self.draw_focused]
         return self.source.choice(kinds)(depth)
+
+    def draw_xor(self, depth: int) -> str:
+        key = self.source.choice(("0x55", repr(self.source.randbytes(3))))
+        word = self.source.choice(WORDS)
+        return self.source.choice(
+            (
+                f"FixedSized({word}.sizeof(), ProcessXor({key}, {word}))",
+                f"FixedSized({self.source.randint(1, 4)}, ProcessXor({key}, GreedyBytes))",
+                f"FixedSized({self.count()}, ProcessXor({key}, GreedyBytes))",
+                f'FixedSized(7, ProcessXor({key}, Struct("x" / Int24ub, "y" / GreedyBytes)))',
+            )
+        )
+
+    def draw_focused(self, depth: int) -> str:
+        word = self.source.choice(WORDS)
+        text = f"Const({self.source.randbytes(1)!r})"
+        return self.source.choice(
+            (
+                f'FocusedSeq("v", {text}, "v" / {word})',
+                f'FocusedSeq("v", "v" / Struct("x" / {word}, "y" / {self.bits("")}), {text})',
+                f'FocusedSeq("v", {text}, "n" / Rebuild(Int8ub, len_(this.v)),'
+                f' "v" / Array(this.n, {word}), {text})',
+            )
+        )
 
     def word(self, depth: int) -> str:
         word, scale = self.source.choice((*WORDS, *ODD)), self.source.choice(SCALES)
@@ -289,13 +317,15 @@ class Drawn:
         return self.source.choice(forms)
 
 
-def spec(number: int, *, interpreted: bool = False) -> str:
+def spec(number: int, *, interpreted: bool = False, adapted: bool = False) -> str:
     """Return the text of the spec with this number.
 
-    If `interpreted`, it may contain parts that only construct can read.
+    Args:
+        interpreted: whether it may contain parts that only construct can read.
+        adapted: whether it may contain ProcessXor and FocusedSeq.
     """
-    source = Random(f"spec {number} {interpreted}")
-    return Drawn(source, 2 + number % 7, interpreted).struct(0)
+    source = Random(f"spec {number} {interpreted}" + " adapted" * adapted)
+    return Drawn(source, 2 + number % 7, interpreted, adapted).struct(0)
 
 
 def make_struct(text: str) -> construct.Construct:

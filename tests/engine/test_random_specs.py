@@ -62,10 +62,14 @@ def declare_sensor(struct: Construct) -> Sensor | None:
 
 
 def try_spec(
-    number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")
+    number: int,
+    *,
+    interpreted: bool = False,
+    adapted: bool = False,
+    backends: Sequence[str] = ("numpy", "construct"),
 ) -> None:
     """Test a spec; add its text to the error of a failure."""
-    text = spec(number, interpreted=interpreted)
+    text = spec(number, interpreted=interpreted, adapted=adapted)
     struct = make_struct(text)
     with contextlib.suppress(construct.SizeofError, KeyError):
         if struct.sizeof() == 0:
@@ -75,7 +79,7 @@ def try_spec(
         return
     try:
         some = frames(ours, struct, number)
-        agree(struct, some, max_length=LONGEST, kept="Rebuild" not in text)
+        agree(struct, some, max_length=LONGEST, kept=adapted or "Rebuild" not in text, more=adapted)
         if is_compiled(ours.frames["data"]):
             clouds_agree(struct, some, max_length=LONGEST, backends=backends)
     except BaseException as error:
@@ -101,12 +105,18 @@ def test_structs_without_layouts_parse_as_by_construct(number: int) -> None:
     try_spec(number, interpreted=True)
 
 
+@pytest.mark.parametrize("number", numbers(8, 40))
+def test_structs_with_adapted_parts_parse_as_by_construct(number: int) -> None:
+    try_spec(number, adapted=True)
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("block", range(20))
 def test_many_more_structs_parse_as_by_construct(block: int) -> None:
     for number in range(100 * block, 100 * block + 100):
         try_spec(number, backends=("numpy", "construct", *JIT))
         try_spec(number, interpreted=True)
+        try_spec(number, adapted=True)
 
 
 def test_most_random_specs_are_compiled_and_have_frames() -> None:

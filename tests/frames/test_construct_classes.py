@@ -56,6 +56,7 @@ from construct import (
     ProcessXor,
     RawCopy,
     Rebuffered,
+    Rebuild,
     RepeatUntil,
     Sequence,
     Struct,
@@ -73,7 +74,7 @@ from construct import (
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.explaining.explanation import explain
 from lidarspec.spec import Checksummed, Fields, Polar, Serial, Sum
-from tests.engine.against_construct import at, sensor
+from tests.engine.against_construct import at, has_all, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
 MARK = b"\x5a\xa5"
@@ -189,6 +190,66 @@ COMPILED: dict[str, Case] = {
     "texts in elements": case("a" / Array(2, PaddedString(2, "ascii")), frames="61006263"),
     "NullStripped": case("a" / FixedSized(4, NullStripped(GreedyBytes)), frames="61620000"),
     "Sequence": case("a" / Sequence(Int8ub, Int16ub), frames="010203"),
+    "FocusedSeq": case("a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub), frames="4b01 4b02"),
+    "FocusedSeq with unnamed parts": case(
+        "a" / FocusedSeq("v", Const(b"<"), "v" / BODY, Const(2, Int16ub), Padding(1)),
+        "b" / Int8ub,
+        frames="3c01020300020004 3c01020300020904",
+    ),
+    "FocusedSeq of an array": case(
+        "a" / FocusedSeq("v", Const(b"<"), "v" / Array(3, Int8ub)), frames="3c010203"
+    ),
+    "FocusedSeq with a count": case(
+        "a"
+        / FocusedSeq(
+            "v", "m" / Const(b"M"), "n" / Rebuild(Int8ub, len_(this.v)), "v" / Array(this.n, TWO)
+        ),
+        "b" / Int8ub,
+        frames="4d020102030405 4d0006",
+    ),
+    "FocusedSeq behind its length": case(
+        "a" / Prefixed(Int8ub, FocusedSeq("v", Const(b"K"), "v" / Int16ub)), frames="034b0102"
+    ),
+    "FocusedSeq under a condition": case(
+        "k" / Int8ub,
+        "a" / If(this.k, FocusedSeq("v", Const(b"K"), "v" / Int16ub)),
+        frames="00 014b0102",
+    ),
+    "FocusedSeq in elements": case(
+        "r" / Array(2, Struct("a" / FocusedSeq("v", Const(b"K"), "v" / Int8ub))),
+        frames="4b014b02",
+    ),
+    "ProcessXor": case(
+        "a" / FixedSized(2, ProcessXor(0x55, GreedyBytes)), "b" / Int8ub, frames="010203 aa5500"
+    ),
+    "ProcessXor of the bytes behind a length": case(
+        "a" / Prefixed(Int8ub, ProcessXor(b"\1\2\3", GreedyBytes)),
+        "b" / Int8ub,
+        frames="040102030405 0005",
+    ),
+    "ProcessXor of a number": case(
+        "a" / FixedSized(2, ProcessXor(b"\1\x80", Int16sb)), frames="0102 ffff"
+    ),
+    "ProcessXor of a struct": case(
+        "a" / Prefixed(Int8ub, ProcessXor(0x55, TWO)), "b" / Int8ub, frames="02010203"
+    ),
+    "ProcessXor of nested structs": case(
+        "a"
+        / FixedSized(
+            9,
+            ProcessXor(
+                b"\1\2\3", Struct("x" / Int16ub, "b" / BODY, "r" / Int8ub[2], "d" / GreedyBytes)
+            ),
+        ),
+        "b" / Int8ub,
+        frames="00010203040506070809 ffffffffffffffffffff",
+    ),
+    "ProcessXor in elements": case(
+        "a" / Array(2, FixedSized(2, ProcessXor(b"\1\2", Int16ub))), frames="01020304"
+    ),
+    "ProcessXor of bytes in elements": case(
+        "a" / Array(2, FixedSized(2, ProcessXor(b"\1\2", GreedyBytes))), frames="01020304"
+    ),
     "NamedTuple of a struct": case("a" / NamedTuple("P", "x y", TWO), frames="0102"),
     "NamedTuple of an array": case("a" / NamedTuple("P", "x y", Int8ub[2]), frames="0102"),
     "a Check without a name": case("a" / Int8ub, Check(this.a < 3), frames="01"),
@@ -295,10 +356,16 @@ PLAIN: dict[str, Case] = {
         frames="0102",
         reason="Checksum",
     ),
-    "FocusedSeq": case(
-        "a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub),
-        frames="4b01",
-        reason="PrefixedArray",
+    "FocusedSeq of another field": case(
+        "n" / Int8ub,
+        "a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Bytes(this._.n)),
+        frames="014b01 004b",
+        reason="PrefixedArray and FocusedSeq must be a named",
+    ),
+    "FocusedSeq in an array": case(
+        "a" / Array(2, FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub)),
+        frames="4b014b02",
+        reason="PrefixedArray and FocusedSeq must be a named",
     ),
     "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
     "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
@@ -306,13 +373,16 @@ PLAIN: dict[str, Case] = {
     "NullTerminated": case(
         "a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001", reason="terminator"
     ),
-    "ProcessXor": case(
-        "a" / FixedSized(2, ProcessXor(0x55, GreedyBytes)),
-        frames="0102",
+    "ProcessXor of a text": case(
+        "a" / Prefixed(Int8ub, ProcessXor(0x55, GreedyString("ascii"))),
+        frames="020102 00",
         reason="transforms bytes",
     ),
-    "ProcessXor of a struct": case(
-        "a" / Prefixed(Int8ub, ProcessXor(0x55, TWO)), frames="020102", reason="transforms bytes"
+    "ProcessXor by a field": case(
+        "k" / Int8ub,
+        "a" / FixedSized(2, ProcessXor(this.k, GreedyBytes)),
+        frames="550102 000102",
+        reason="transforms bytes",
     ),
     "Transformed by a function": case(
         "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
@@ -378,15 +448,6 @@ def bare(value: Any) -> Any:
     if isinstance(value, list):
         return [bare(part) for part in value]
     return value
-
-
-def has_all(found: Any, wanted: Any) -> bool:
-    """Return whether a value has all fields of construct's; it may have more."""
-    if isinstance(wanted, dict):
-        return all(name in found and has_all(found[name], wanted[name]) for name in wanted)
-    if isinstance(wanted, list):
-        return len(found) == len(wanted) and all(map(has_all, found, wanted))
-    return bool(found == wanted) and type(found) is type(wanted)
 
 
 def drop_unread(value: Any) -> Any:

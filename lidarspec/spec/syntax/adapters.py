@@ -11,18 +11,29 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import construct
 import numpy as np
-from construct import BytesInteger, Construct, FormatField, Subconstruct
+from construct import BytesInteger, Construct, Subconstruct
+from numpy.typing import NDArray
 
 from lidarspec.spec import tree
-from lidarspec.spec.syntax.structs import bit_width, children, fixed_size, number_kind
+from lidarspec.spec.syntax.structs import (
+    bit_width,
+    find_xor_key,
+    fixed_size,
+    is_independent,
+    number_kind,
+    to_public,
+)
 
 #: The number of random values to try for a field that is wider than a byte.
 TRIAL_COUNT = 200
+
+#: Parts of variable size are tried with fewer bytes than this.
+MAX_TRIED_BYTES = 8
 
 #: The maximum width of an integer in a column, in bits.
 MAX_INT_BITS = 64
@@ -196,17 +207,21 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
     return data if stripped is None else data.ljust(size, b"\0")
 
 
-def part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode and encode a part of fixed size.
+def part_adapter(con: Construct, *, fills: bool = False) -> tree.Adapter | None:
+    """Return the functions that decode and encode a part that depends only on its own bytes.
 
-    Returns None if only construct can read the part.
+    Args:
+        fills: whether a part without a fixed size is accepted, because another field declares it.
+
+    Returns:
+        None if only construct can read the part.
     """
-    size = _find_independent_size(con)
-    if not size:
+    size = fixed_size(con)
+    if not is_independent(con) or not (size or fills):
         return None
 
     def decode(data: bytes) -> Any:
-        return con.parse(data)
+        return to_public(con.parse(data))
 
     def encode(value: Any, _: int) -> Any:
         return con.build(value)
@@ -214,47 +229,51 @@ def part_adapter(con: Construct) -> tree.Adapter | None:
     import random  # imported here because finding a sensor does not need it
 
     source = random.Random(size)
-    ascii_bytes = bytes(source.choice(b"abcdef") for _ in range(size))
-    raws = [bytes(size), ascii_bytes, *(source.randbytes(size) for _ in range(TRIAL_COUNT))]
+    raws = list[bytes]()
+    for length in [size] if size else range(MAX_TRIED_BYTES):
+        ascii_bytes = bytes(source.choice(b"abcdef") for _ in range(length))
+        raws += [bytes(length), ascii_bytes]
+        raws += (source.randbytes(length) for _ in range(TRIAL_COUNT if size else TRIAL_COUNT // 8))
     trial = _run_trial(raws, decode, encode)
     is_struct = any(isinstance(value, dict) for value in trial.values)
-    if not trial.valid or trial.lost is not None or is_struct:
+    # No examples could be made of a text that is transformed.
+    is_hidden_text = trial.failed and _find_xor(con) is not None
+    if not trial.valid or trial.lost is not None or is_struct or is_hidden_text:
         return None
-    return _make_adapter(decode, encode, trial, is_partial=trial.failed, form=_describe_form(con))
+    adapter = _make_adapter(
+        decode, encode, trial, is_partial=trial.failed, form=_describe_form(con)
+    )
+    return replace(adapter, decode_bytes=_find_byte_decoder(con))
+
+
+def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
+    """Return a function that decodes bytes along the last axis; None if their number may change."""
+    xor = _find_xor(con)
+    if xor is None or not isinstance(xor.subcon, construct.Bytes | type(construct.GreedyBytes)):
+        return None
+    key = find_xor_key(xor)
+    if key is None:
+        return None
+    return functools.partial(_xor_bytes, np.frombuffer(key, np.uint8))
+
+
+def _find_xor(con: Construct) -> construct.ProcessXor | None:
+    """Return the ProcessXor of a part, with or without a size; None without one."""
+    while isinstance(con, construct.FixedSized):
+        con = con.subcon
+    return con if isinstance(con, construct.ProcessXor) else None
+
+
+def _xor_bytes(key: NDArray[np.uint8], raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return raw ^ np.resize(key, raw.shape[-1])
 
 
 def _describe_form(con: Construct) -> str:
     """Return a description of how a part is stored."""
+    xor = _find_xor(con)
+    if xor is not None:
+        return f"{type(xor.subcon).__name__} xor {xor.padfunc!r}"
     if isinstance(con, BytesInteger):
         order = "le" if con.swapped else "be"
         return f"{'int' if con.signed else 'uint'}{8 * int(con.length)} {order}"
     return type(con).__name__
-
-
-#: Constructs that depend only on their own bytes.
-_INDEPENDENT_KINDS = (
-    FormatField,
-    BytesInteger,
-    construct.Bytes,
-    construct.Array,
-    construct.Sequence,
-    construct.Struct,
-    construct.Adapter,
-    construct.NullStripped,
-    construct.FixedSized,
-    construct.Renamed,
-    construct.Const,
-    construct.ProcessXor,
-    type(construct.GreedyBytes),
-)
-
-
-def _find_independent_size(con: Construct) -> int:
-    """Return the fixed size of a part; 0 if it depends on bytes outside of it."""
-    pending = [con]
-    while pending:
-        part = pending.pop()
-        if not isinstance(part, _INDEPENDENT_KINDS):
-            return 0
-        pending += children(part)
-    return fixed_size(con)

@@ -56,6 +56,7 @@ from lidarspec.spec.syntax.replacements import (
 )
 from lidarspec.spec.syntax.structs import (
     author_class,
+    fixed_size,
     is_greedy,
     leaves,
     unwrap,
@@ -749,8 +750,8 @@ class _Builder:
             size = self._text_size(con, place)
             adapter = text_adapter(con)
         else:
-            adapter = part_adapter(con)
-            size = None if adapter is None else int(con.sizeof())
+            adapter = part_adapter(con, fills=place.room is not None)
+            size = fixed_size(con) or place.room
         if adapter is None or size is None:
             return None
         axes = (*info.axes, axis_path(info))
@@ -972,7 +973,8 @@ _OPAQUE_REASONS = {
     "VarInt": "VarInt has no fixed offset: use a WireForm for numbers of variable size",
     "ZigZag": "ZigZag has no fixed offset: use a WireForm for numbers of variable size",
     "FocusedSeq": (
-        "PrefixedArray must be a named member of a Struct: Struct('points' / PrefixedArray(...))"
+        "PrefixedArray and FocusedSeq must be a named member of a Struct, and use no other fields:"
+        " Struct('points' / PrefixedArray(...))"
     ),
     "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",

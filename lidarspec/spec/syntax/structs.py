@@ -40,6 +40,7 @@ from lidarspec.spec.syntax.replacements import (
     CheckedConst,
     CountedBytes,
     CountField,
+    DescribedField,
     ExactFloat,
     Fault,
     FullRange,
@@ -259,10 +260,13 @@ def _expand_macro(con: Construct) -> list[Construct]:
         length = inner.subcon
         prefixed = construct.Prefixed(length.lengthfield, text, length.includelength)
         return _expand_prefixed(con, prefixed)
+    if isinstance(inner, construct.FixedSized | construct.Prefixed):
+        inner = copy.copy(inner)
+        inner.subcon = _distribute_xor(inner.subcon)
     if isinstance(inner, construct.Prefixed):
         return _expand_prefixed(con, inner)
-    if _is_prefixed_array(inner):
-        return _expand_prefixed_array(con, inner)
+    if isinstance(inner, construct.FocusedSeq):
+        return _expand_focused(con, inner)
     if isinstance(inner, construct.Aligned):
         members, span = _expand_padded(con, inner)
         filler = PaddingField(span, modulus=inner.modulus, pattern=inner.pattern)
@@ -275,7 +279,7 @@ def _expand_macro(con: Construct) -> list[Construct]:
         pattern = inner.pattern if is_padded else b"\0"
         filler = PaddingField(span, to=inner.length, pattern=pattern)
         return [*members, _name_field(con, "_padding", filler, "padding of")]
-    return [con]
+    return [construct.Renamed(inner, newname=con.name, newdocs=con.docs)]
 
 
 def _is_pascal_string(con: Construct) -> bool:
@@ -286,9 +290,38 @@ def _is_pascal_string(con: Construct) -> bool:
     )
 
 
-def _is_prefixed_array(con: Construct) -> bool:
-    is_sequence = isinstance(con, construct.FocusedSeq)
-    return is_sequence and [part.name for part in con.subcons] == ["count", "items"]
+def _distribute_xor(con: Construct) -> Construct:
+    """Return a ProcessXor of a struct as a struct with a ProcessXor of each member.
+
+    Any other construct, or a struct with members of unknown size before the last, is returned
+    unchanged.
+    """
+    if not isinstance(con, construct.ProcessXor) or not isinstance(con.subcon, Struct):
+        return con
+    key = find_xor_key(con)
+    members = list[Construct]()
+    for member in con.subcon.subcons:
+        content = _strip_name(member)
+        size = fixed_size(content) if is_independent(content) else 0
+        is_rest = content is construct.GreedyBytes and member is con.subcon.subcons[-1]
+        if key is None or not member.name or not (size or is_rest):
+            return con
+        part = _distribute_xor(construct.ProcessXor(key, content))
+        if size and not isinstance(part, Struct):
+            part = construct.FixedSized(size, part)
+        members.append(construct.Renamed(part, newname=member.name, newdocs=member.docs))
+        start = size % len(key)
+        key = key[start:] + key[:start]
+    return Struct(*members)
+
+
+def find_xor_key(con: construct.ProcessXor) -> bytes | None:
+    """Return the key of a ProcessXor; None if the key is an expression, or empty."""
+    if isinstance(con.padfunc, int):
+        return bytes([con.padfunc])
+    if isinstance(con.padfunc, bytes) and con.padfunc:
+        return con.padfunc
+    return None
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
@@ -324,13 +357,63 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
     return [_name_field(con, "_size", size, "bytes of"), *members]
 
 
-def _expand_prefixed_array(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
-    count, items = (part.subcon for part in inner.subcons)
-    array = Array(construct.this[f"{con.name}_count"], items.subcon)
-    return [
-        _name_field(con, "_count", CountField(count.subcon, con.name), "number of"),
-        construct.Renamed(array, newname=con.name, newdocs=con.docs),
-    ]
+def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
+    """Return the members that replace a FocusedSeq: its value, and a field for each other part.
+
+    The FocusedSeq is returned unchanged if one of its parts uses fields outside of itself, because
+    paths in its expressions have one more level. The only exception is the count of an array, as in
+    construct's PrefixedArray.
+    """
+    focus = inner.parsebuildfrom
+    parts = {part.name: _strip_name(part) for part in inner.subcons}
+    others = [part for part in inner.subcons if part.name != focus]
+    count = _find_count(parts.get(focus), parts, focus)
+    plain = [part for part in inner.subcons if count is None or part.name not in (focus, count)]
+    is_complete = focus in parts and all(part.flagbuildnone for part in others)
+    if not is_complete or not all(map(_is_fixed, plain)):
+        return [con]
+    members = list[Construct]()
+    for number, part in enumerate(inner.subcons, 1):
+        content = _strip_name(part)
+        if part.name == focus and count is not None:
+            array = Array(construct.this[f"{con.name}_{count}"], content.subcon)
+            members.append(construct.Renamed(array, newname=con.name, newdocs=con.docs))
+        elif part.name == focus:
+            members += _expand_content(con, content)
+        else:
+            what = "part of"
+            if count is not None and part.name == count:
+                content = CountField(content.subcon, con.name)
+                what = "number of"
+            name = part.name or f"constant_{number}"
+            members.append(_name_field(con, f"_{name}", content, what))
+    return members
+
+
+def _is_fixed(con: Construct) -> bool:
+    """Return whether a part of fixed size depends only on its own bytes."""
+    return is_independent(con, _DESCRIBED_KINDS) and fixed_size(con) > 0
+
+
+def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: str) -> str | None:
+    """Return the name of the part that is the number of elements of an array in a FocusedSeq.
+
+    Args:
+        parts: the parts of the FocusedSeq, by name.
+        focus: the name of the array.
+    """
+    if not isinstance(array, Array) or not callable(array.count):
+        return None
+    for name, part in parts.items():
+        # The functions of a plugin may raise anything.
+        with contextlib.suppress(Exception):
+            if (
+                isinstance(part, construct.Rebuild)
+                and part.func(Container({focus: [0] * 3})) == 3
+                and array.count(Container({name: 5})) == 5
+            ):
+                return name
+    return None
 
 
 def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct], tuple[str, str]]:
@@ -480,6 +563,48 @@ def fixed_size(con: Construct) -> int:
         return int(con.sizeof())
     except Exception:  # construct raises KeyError if a condition reads a field
         return 0
+
+
+#: Constructs that depend only on their own bytes.
+INDEPENDENT_KINDS = (
+    FormatField,
+    BytesInteger,
+    Bytes,
+    Array,
+    construct.Sequence,
+    Struct,
+    construct.Adapter,
+    construct.NullStripped,
+    construct.FixedSized,
+    construct.Renamed,
+    Const,
+    construct.ProcessXor,
+    type(construct.GreedyBytes),
+)
+
+#: Constructs that depend only on their own bytes, and have an own meaning in a frame tree.
+_DESCRIBED_KINDS = (
+    *INDEPENDENT_KINDS,
+    DescribedField,
+    construct.Padded,
+    construct.Default,
+    construct.Transformed,
+    construct.Restreamed,
+    BitsInteger,
+    type(construct.Flag),
+    type(construct.Pass),
+)
+
+
+def is_independent(con: Construct, kinds: tuple[type, ...] = INDEPENDENT_KINDS) -> bool:
+    """Return whether a part depends only on its own bytes.
+
+    Args:
+        kinds: the constructs that depend only on their own bytes.
+    """
+    if isinstance(con, construct.ProcessXor) and find_xor_key(con) is None:
+        return False
+    return isinstance(con, kinds) and all(is_independent(child, kinds) for child in children(con))
 
 
 def to_public(parsed: Any) -> Any:
