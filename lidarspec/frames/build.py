@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from construct import Container
+from construct import Container, EnumIntegerString
 
 from lidarspec.errors import (
     LidarSpecError,
@@ -61,8 +61,9 @@ def build(
     checked = checker.check(_merge_values(value or {}, values), "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
-        fill_counts(checked, make_schema(declared.tree))
-        return build_plain(declared, checked, place)
+        schema = make_schema(declared.tree)
+        fill_counts(checked, schema)
+        return build_plain(declared, _with_code_names(checked, "", schema), place)
     try:
         struct = encode(layouts, checked, place)
     except LidarSpecError:
@@ -90,6 +91,24 @@ def _merge_values(value: Mapping[str, Any], values: Mapping[str, Any]) -> Mappin
     for name, new in nested.items():
         put_value(merged, split_path(name), new)
     return merged
+
+
+def _with_code_names(value: Any, path: str, schema: Schema) -> Any:
+    """Return values with the codes of Enums in construct's form, a text with a number.
+
+    `Const` and `Switch` of a struct that construct builds compare the names of codes.
+    """
+    if isinstance(value, Mapping):
+        return Container(
+            (name, _with_code_names(member, f"{path}.{name}" if path else name, schema))
+            for name, member in value.items()
+        )
+    if isinstance(value, list):
+        return [_with_code_names(element, path, schema) for element in value]
+    info = schema.all_fields.get(path)
+    if info is None or type(value) is not int or value not in info.labels:
+        return value
+    return EnumIntegerString.new(value, info.labels[value])
 
 
 class _ValueChecker:

@@ -22,6 +22,8 @@ from construct import (
     Int16ul,
     NullTerminated,
     Struct,
+    Switch,
+    this,
 )
 
 import lidarspec as ls
@@ -250,3 +252,17 @@ def test_unknown_codes_are_a_warning_once(tmp_path: Path) -> None:
         list(device.packets("report"))
         assert len(device.warnings) == 1
         assert "report.mode is 99, an unknown code" in device.warnings[0]
+
+
+def test_codes_build_a_struct_that_construct_handles() -> None:
+    """Constants and branches compare the names of codes."""
+    element = Struct(
+        "mode" / Const("idle", MODE), "kind" / MODE, "more" / Switch(this.kind, {"idle": Int8ul})
+    )
+    struct = Struct("count" / Int8ul, "elements" / Array(lambda c: int(c.count) % 3, element))
+    frames = {"plain": Frame(struct, max_length=20)}
+    sensor = dataclasses.replace(SENSOR, frames=frames, commands={}, info={})
+    data = bytes.fromhex("02 01 01 07 01 37")
+    parsed = sensor.parse(data)
+    assert parsed.elements[0].kind == 1
+    assert sensor.build("plain", parsed) == data
