@@ -51,7 +51,7 @@ SIMULATED_PACKETS = 64  # of a scan
 SIGNATURES = (0x56445453, 0x53544456)  # the letters STDV, and STDV as a number, low byte first
 
 DATA = Struct(
-    "signature" / Int32ul * "STDV",
+    "signature" / Int32ul * "the characters STDV",
     "header_version" / Int8ul,
     "header_size" / Const(HEADER_BYTES, Int8ul),
     "flags" / Int16ul,
@@ -65,8 +65,8 @@ DATA = Struct(
         this.count,
         Struct(
             "x" / Scaled(Int16sl, 0.005, "m") * "positive to the right",
-            "y" / Scaled(Int16ul, 0.005, "m") * "ahead",
-            "z" / Scaled(Int16sl, 0.005, "m") * "up",
+            "y" / Scaled(Int16ul, 0.005, "m") * "distance ahead",
+            "z" / Scaled(Int16sl, 0.005, "m") * "positive upwards",
             "reflectivity" / Int8ul,
             "after" / Scaled(Int8ul, 1e-6, "s") * "time since the previous point",
             "channel" / Int8ul,

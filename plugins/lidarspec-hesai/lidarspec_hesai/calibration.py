@@ -23,11 +23,11 @@ from lidarspec.spec import Learned, Points, Sensor
 Table = NDArray[np.float64]
 
 MAX_FILE_BYTES = 1_000_000
-MAX_QUOTED_CHARACTERS = 60  # of a file in a message
+MAX_QUOTED_CHARACTERS = 60  # of a file, in an error message
 MARK = "EEFF"  # above the headings of some files
 HASH = re.compile(r"[0-9a-fA-F]{8,}")  # below the table of some files
-#: The spread of a unit's values may differ from that of the model by this factor. Radians in place
-#: of degrees would differ by a factor of 57.
+#: The spread of a unit's values may differ from that of the model by at most this factor. A file in
+#: radians instead of degrees would differ by a factor of 57.
 MAX_SPREAD_RATIO = 10
 
 

@@ -74,7 +74,7 @@ IMU = Struct(
     "temperature" / Scaled(Int16sl, 0.01, "degC"),
     "acceleration_unit" / Int16ul * "step of an acceleration, millionths of g",
     "rate_unit" / Int16ul * "step of a rate, hundredths of mdeg/s",
-    "time" / Int32ul * "in steps of 25 ns",
+    "time" / Int32ul * "time of the sample, in steps of 25 ns",
     "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU; its axes are not documented",
     "rate" / Array(3, Int16sl),
 )
@@ -132,7 +132,7 @@ def make_packet(
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
-        "first_return" / Int8ul * "return in the first block of a shot",
+        "first_return" / Int8ul * "which return the first block of a shot contains",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
         "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / FLAGS,

@@ -41,7 +41,7 @@ def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) 
         "header_reserved" / Bytes(2),
         "lasers" / Const(lasers, Int8ul),
         "block_count" / Int8ul,
-        "first_return" / Int8ul * "return in the first block of a shot",
+        "first_return" / Int8ul * "which return the first block of a shot contains",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
         "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),

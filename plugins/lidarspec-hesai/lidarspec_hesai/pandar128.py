@@ -160,7 +160,9 @@ def make_tail(speed: float) -> Any:
     return (
         "tail_reserved" / Bytes(9),
         "azimuth_state" / Int16ul * "two bits per block, first block in the highest bits",
-        "operational_state" / Int8ul * "0 high performance; else standard or energy saving",
+        "operational_state"
+        / Int8ul
+        * "0: high performance; other values: standard or energy saving",
         "return_mode" / RETURN_MODE,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,

@@ -103,7 +103,8 @@ TAIL = (
     "tail_reserved" / Bytes(5),
     "mode_flag"
     / BitStruct(
-        "reserved" / BitsInteger(7), "loop" / BitsInteger(1) * "of the packet, with dual return"
+        "reserved" / BitsInteger(7),
+        "loop" / BitsInteger(1) * "loop of the packet, with dual return",
     ),
     "tail_reserved_2" / Bytes(6),
     "return_mode" / RETURN_MODE,

@@ -161,9 +161,9 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
         )
     struct = Struct(
         "command" / Const(command.encode()),
-        make_decimal("first", 4, geometry.end) * "step",
-        make_decimal("last", 4, geometry.end) * "step",
-        make_decimal("cluster", 2) * "steps combined to one distance",
+        make_decimal("first", 4, geometry.end) * "first step",
+        make_decimal("last", 4, geometry.end) * "last step",
+        make_decimal("cluster", 2) * "number of steps combined to one distance",
         *rest,
         "status" / Const(b"99" if is_continuous else b"00"),
         "time" / Scaled(Int32ub, 0.001, "s") * "time at step 0; 24 bits",

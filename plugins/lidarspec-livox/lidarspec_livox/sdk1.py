@@ -76,7 +76,7 @@ from lidarspec_livox.points import (
 
 CRC16 = Crc(16, 0x1021, init=0x9232, refin=True, refout=True)
 CRC32 = Crc(32, 0x04C11DB7, init=0xAFE50D95, refin=True, refout=True, xorout=0xFFFFFFFF)
-MAX_POSITION_M = 1000.0  # of the extrinsics: twice the range of the Tele-15
+MAX_POSITION_M = 1000.0  # limit of the extrinsics: twice the range of the Tele-15
 GPS = 3  # the timestamp type of dates
 #: The types of timestamps (Livox SDK communication protocol 1.3.0).
 TIMESTAMP_TYPES = {
@@ -91,7 +91,7 @@ STATES = {"starting": 0, "normal": 1, "power_saving": 2, "standby": 3, "error": 
 CLOCKS = {"power_up": 0, "ptp": 1, "gps_and_pps": GPS, "pps": 4}
 COMMAND_PORT = 55_501
 DATA_PORT = 56_001
-IMU_PORT = 56_002  # of the host
+IMU_PORT = 56_002  # port of the host
 
 #: The 64 bits of nanoseconds are split into parts that are exact in float64. They can also contain
 #: a date.
@@ -100,7 +100,9 @@ TIMESTAMP = Struct(
     / Int32ul
     * ("low part of nanoseconds; for a date: years since 2000, month, day and hour, a byte each"),
     "middle" / Int16ul,
-    "high" / Int16ul * "with `middle`, for a date: microseconds within the hour",
+    "high"
+    / Int16ul
+    * "high part of nanoseconds; for a date, `middle` and `high` are microseconds of the hour",
 )
 
 
@@ -133,7 +135,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
         "lidar_id" / Int8ul,
         "reserved" / Int8ul,
         "status_code" / STATUS_CODE,
-        "timestamp_type" / Enum(Int8ul, **CLOCKS) * "gps_and_pps: a date",
+        "timestamp_type" / Enum(Int8ul, **CLOCKS) * "gps_and_pps: the timestamp is a date",
         "data_type" / Const(kind, Int8ul),
         "timestamp" / TIMESTAMP,
         *members,
@@ -265,8 +267,8 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
         SOF,
         "version" / Const(1, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
-        "packet_type" / Const(packet_type, Int8ul) * "0 command, 1 reply, 2 message",
-        "seq" / Int16ul * "in a reply, the value of the command",
+        "packet_type" / Const(packet_type, Int8ul) * "0: command, 1: reply, 2: message",
+        "seq" / Int16ul * "message number; a reply repeats that of its command",
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")

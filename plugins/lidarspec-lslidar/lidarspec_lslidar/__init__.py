@@ -67,7 +67,7 @@ MAX_SAMPLES = 200  # of an M10P's packet: more than twice the limit of the drive
 START = Const(b"\xa5\x5a")
 MARK = Const(b"\xa5\x5a\x55")
 END = Const(b"\xfa\xfb")
-PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "of 15 degrees"
+PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "time of a rotation by 15 degrees"
 ANGLE: Construct = Scaled(Int16ub, 0.01, "deg")
 DISTANCE: Construct = Scaled(Int16ub, 0.001, "m") * "0 or FFFF: no return"
 SAMPLE = BitStruct(
@@ -262,7 +262,7 @@ INFO = Frame(
         "compensation"
         / BitStruct(
             "negative" / BitsInteger(1),
-            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "reported, but not applied",
+            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "not applied to points",
         ),
         "reserved" / Bytes(11),
         "end" / END,

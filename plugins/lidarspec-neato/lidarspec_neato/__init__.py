@@ -92,7 +92,9 @@ LFCD = Struct(
             "reserved" / Bytes(2),
         ),
     ),
-    "trailer" / Bytes(2) * "documented as FF minus the sum of all other bytes, twice",
+    "trailer"
+    / Bytes(2)
+    * "not checked; documented as FF minus the sum of all other bytes, in both bytes",
 )
 
 

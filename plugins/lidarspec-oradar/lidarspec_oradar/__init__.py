@@ -3,8 +3,8 @@
 The data frame is that of LDROBOT's LD06; commands and start messages are other ones.
 
 Source: the vendor's SDK as published with oradar_lidar (ordlidar_protocol.h, ord_lidar_driver.cpp,
-utils.h) and its ROS node (oradar_scan_node.cpp, ms200_scan.launch.py). It does not say when the
-time in a frame restarts, so that times are those of the host. The replies to commands are not
+utils.h) and its ROS node (oradar_scan_node.cpp, ms200_scan.launch.py). It does not state when
+the time in a frame restarts, so points have the time of the host. The replies to commands are not
 documented. The messages with serial number and firmware after power-on (AA 55) are not read. The
 simulated number of points per second is assumed.
 """

@@ -75,7 +75,7 @@ class Unit:
             `PointCloud.destagger`.
         beam, lidar, imu: transforms (4, 4) with millimetres: from beam to lidar, from lidar to
             sensor, and from IMU to sensor.
-        samples: samples per IMU packet; 0 for those of LEGACY.
+        samples: samples per IMU packet; 0 for LEGACY packets.
         product, serial: as in the metadata, "" if missing.
         timestamp_mode: the source of the time, a key of `TIME_EPOCHS`; "" if unknown.
         nominal: whether values of the model replace missing values of the unit.

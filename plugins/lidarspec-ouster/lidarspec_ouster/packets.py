@@ -127,7 +127,7 @@ TIME = Scaled(Int64ul, 1, "ns")
 HEADER = (
     "frame_id" / Int16ul * "counter of revolutions",
     "init_id" / Int24ul * "changes with each start and each change of the configuration",
-    "serial" / SERIAL * "prod_sn of the metadata",
+    "serial" / SERIAL * "serial number of the sensor, prod_sn in the metadata",
     "alert_flags" / Int8ul,
     "reserved_13" / Bytes(3),
 )
@@ -136,13 +136,13 @@ FUSA_HEADER = (
     "frame_id" / Int32ul * "counter of revolutions",
     "alert_flags" / Int8ul,
     "reserved_9" / Bytes(2),
-    "serial" / SERIAL * "prod_sn of the metadata",
+    "serial" / SERIAL * "serial number of the sensor, prod_sn in the metadata",
 )
 STATE = (
-    "shutdown_countdown" / Scaled(Int8ul, 1, "s") * "thermal",
+    "shutdown_countdown" / Scaled(Int8ul, 1, "s") * "time until the thermal shutdown",
     "shot_limiting_countdown" / Scaled(Int8ul, 1, "s"),
     "shutdown_state" / Int8ul * "in the low 4 bits",
-    "shot_limiting_state" / Int8ul * "4 bits",
+    "shot_limiting_state" / Int8ul * "in the low 4 bits",
     "reserved_20" / Bytes(12),
 )
 FOOTER = ("reserved_footer" / Bytes(24), "crc" / Int64ul)
@@ -192,7 +192,10 @@ def make_packet(profile: str, rows: int, columns: int) -> Construct:
         return Struct(
             "columns"
             / Array(
-                columns, Struct(*column_header, pixels, "status" / Int32ul * "0xffffffff: valid")
+                columns,
+                Struct(
+                    *column_header, pixels, "status" / Int32ul * "0xffffffff: the column is valid"
+                ),
             )
         )
     body = "columns" / Array(columns, Struct(*column_start, "status" / COLUMN_STATUS, pixels))

@@ -117,8 +117,8 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
     """Return a measure of the similarity of every fourth row, from 0 to 1.
 
-    It is the smallest mean range of the rows with one remainder modulo four, divided by the
-    largest. It is -1 if unused bits are set in many pixels.
+    Rows are grouped by their index modulo four. The result is the smallest mean range of a group,
+    divided by the largest; -1 if unused bits are set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]

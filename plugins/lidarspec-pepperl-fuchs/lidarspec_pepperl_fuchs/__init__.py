@@ -83,11 +83,11 @@ SAMPLES_BY_TYPE: Mapping[str, Construct] = {
     "A": Struct("distance" / Scaled(Int32ul, MM, "m") * "FFFFFFFF: no echo"),
     "B": Struct(
         "distance" / Scaled(Int32ul, MM, "m") * "FFFFFFFF: no echo",
-        "amplitude" / Int16ul * "below 32: an error",
+        "amplitude" / Int16ul * "below 32: error code",
     ),
     "C": ByteSwapped(
         BitStruct(
-            "amplitude" / BitsInteger(12) * "below 32: an error",
+            "amplitude" / BitsInteger(12) * "below 32: error code",
             "distance" / Scaled(BitsInteger(20), MM, "m") * "FFFFF: no echo",
         )
     ),
@@ -133,8 +133,8 @@ def make_packet(letter: str) -> Construct:
         "packet_type" / Const(ord(letter), Int16ul),
         "packet_size" / SizeOf(Int32ul),
         "header_size" / OneOf(Int16ul, HEADER_SIZES) * "a multiple of 4",
-        "scan_number" / Int16ul * "counts scans",
-        "packet_number" / Int16ul * "counts the packets of a scan, from 1",
+        "scan_number" / Int16ul * "scan counter",
+        "packet_number" / Int16ul * "number of the packet in its scan, from 1",
         "timestamp_raw" / make_time() * "time of the first sample since power-on",
         "timestamp_sync" / make_time() * "synchronized time of the first sample; 0 without",
         "status_flags" / STATUS_FLAGS,

@@ -36,9 +36,8 @@ from lidarspec.spec import (
 FIRINGS = 50
 LASERS = 8
 POSITIONS_PER_TURN = 10_400
-FINE_STEP_VERSION = (
-    5  # the first version of packets with steps of 10 um; before it they are of 10 mm
-)
+#: The first packet version with distance steps of 10 um; earlier versions have 10 mm.
+FINE_STEP_VERSION = 5
 FIRING_PERIOD_S = LASERS / 420_000
 #: The seconds from the time of the packet to each firing.
 FIRING_TIMES_S = (np.arange(FIRINGS) - (FIRINGS - 1)) * FIRING_PERIOD_S
@@ -56,7 +55,7 @@ DISTANCES: Construct = Array(
     LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; 10 mm per step before version 5"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
-#: A version mismatch is that of software and firmware.
+#: version_mismatch: the versions of software and firmware do not match.
 STATUS = Enum(Int16ub, good=0, version_mismatch=1, watchdog=2)
 
 

@@ -130,7 +130,7 @@ DATA = Struct(
     *TIME,
     "reserved_30" / Bytes(1),
     "lidar_type" / Enum(Const(AIRY_TYPE, Int8ub), Airy=AIRY_TYPE),
-    "lidar_model" / Const(MODEL_96, Int8ub) * "1 48 lasers, 2 96 lasers, 3 192 lasers",
+    "lidar_model" / Const(MODEL_96, Int8ub) * "1: 48 lasers, 2: 96 lasers, 3: 192 lasers",
     "reserved_33" / Bytes(5),
     "temperature" / TEMPERATURE,
     "top_temperature" / TEMPERATURE,
@@ -145,7 +145,7 @@ DATA = Struct(
             "channels" / Array(HALF_LASERS, Struct("echo" / ECHO, "intensity" / Int8ub)),
         ),
     ),
-    "tail" / Bytes(6) * "reserved, and 00 FF",
+    "tail" / Bytes(6) * "reserved bytes, then 00 FF",
     "reserved_end" / Bytes(16),
 )
 DIFOP = Struct(

@@ -121,7 +121,7 @@ def make_packet(rows: Construct) -> Struct:
         "temperature" / TEMPERATURE,
         "reserved_40" / Bytes(2),
         "blocks" / rows,
-        "tail" / Bytes(6) * "reserved, and 00 FF",
+        "tail" / Bytes(6) * "reserved bytes, then 00 FF",
     )
 
 

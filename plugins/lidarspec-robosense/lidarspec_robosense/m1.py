@@ -78,18 +78,20 @@ SIMULATED_LINE_FIRINGS = 125  # per line, which gives 126 lines 0.2 degrees apar
 
 HEADER_START: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
-    "pkt_psn" / Int16ub * "packet counter within the frame; M1: 1 to 630, with dual return to 1260",
+    "pkt_psn"
+    / Int16ub
+    * "packet counter within the frame; M1: 1 to 630, or to 1260 with dual return",
     "protocol_version" / Int16ub,
     "wave_mode" / Enum(Int8ub, **WAVE_MODES),
     "time_sync_mode" / Enum(Int8ub, **SYNC_MODES),
     *TIME,
     "reserved" / Bytes(10),
-    "lidar_type" / Int8ub * "of an M1: 0x10",
+    "lidar_type" / Int8ub * "0x10: M1",
 )
 #: Firmware -> temperature of the mirror. "current": as in the M1P user guide and rs_driver; "2021":
 #: as in rs_driver of April 2021; "": unknown.
 TEMPERATURES: dict[str, Construct] = {
-    "": "mems_tmp" / Int8ub * "degC + 80, or signed degC, by firmware",
+    "": "mems_tmp" / Int8ub * "degC + 80 or signed degC; the firmware decides which",
     "current": "mems_tmp" / Scaled(Int8ub, 1, "degC", offset=-80),
     "2021": "mems_tmp" / Scaled(Int8sb, 1, "degC"),
 }
@@ -100,7 +102,7 @@ BLOCKS_AND_TAIL: tuple[Construct, ...] = (
         BLOCKS,
         Struct(
             "time_offset" / Scaled(Int8ub, 1e-6, "s") * "added to the time of the packet",
-            "return_seq" / Enum(Int8ub, **RETURN_NUMBERS) * "the first is nearer",
+            "return_seq" / Enum(Int8ub, **RETURN_NUMBERS) * "the first return is the nearer one",
             "channels"
             / Array(
                 CHANNELS,

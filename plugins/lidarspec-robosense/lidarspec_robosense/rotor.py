@@ -273,7 +273,8 @@ def laser_angles(f: Fields) -> tuple[Any, Any]:
 def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     """Return the points of blocks with one firing of all lasers.
 
-    With dual return, two blocks are one firing, which began `late` blocks before the packet.
+    With dual return, two blocks are one firing. `late` is the number of blocks of the first firing
+    that are in the previous packet.
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index

@@ -117,7 +117,7 @@ def make_packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
         "reserved_8" / Bytes(12),
         *time,
         "lidar_type" / Enum(Int8ub, **{"RS-LiDAR-16": RS16_TYPE, "RS-LiDAR-32": RS32_TYPE}),
-        "series" / Int8ub * "3 in an RS-Bpearl version 4",
+        "series" / Int8ub * "3: RS-Bpearl version 4",
         "version" / Int8ub * "4 in an RS-Bpearl version 4",
         "reserved_33" / Bytes(5),
         "temperature" / TEMPERATURE,

@@ -104,7 +104,7 @@ def make_packet(
 
 
 RADIUS = "radius" / Scaled(Int16ub, 0.005, "m") * "0: no return"
-ATTRIBUTE = "attribute" / Enum(Int8ub, normal=1, noise=2) * "of an E1"
+ATTRIBUTE = "attribute" / Enum(Int8ub, normal=1, noise=2) * "values as documented for the E1"
 ONE_RETURN = (RADIUS, *UNIT_VECTOR, "intensity" / Int8ub, ATTRIBUTE)
 TWO_RETURNS = (
     RADIUS,
@@ -155,7 +155,7 @@ E1_DIFOP = Struct(
     "frame_rate" / Scaled(Int8ub, 1, "Hz"),
     "return_mode"
     / Enum(Int8ub, farthest=0, strongest=4, nearest=7, second_strongest=8)
-    * "9 to 11: two of these",
+    * "9 to 11: dual return, two of these returns",
     "time_sync_mode" / Enum(Int8ub, **{"internal": 0, "E2E L2": 2, "gPTP": 3}),
     "time_sync_status" / Enum(Int8ub, failed=0, success=1, timeout=2),
     *TIME,

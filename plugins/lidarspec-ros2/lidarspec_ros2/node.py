@@ -196,7 +196,7 @@ class LidarNode(LifecycleNode):
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish scans, packets and IMU samples until the node stops or the input ends."""
         speed = self._settings["replay_speed"]
-        # Without a limit of `ahead`, all read data updates the clock before a scan is published.
+        # `ahead=None`: all data that was read updates the clock before a scan is published.
         feed = LiveScans(device, played=speed > 0, speed=speed, ahead=None)
         next_diagnostics = time.monotonic()
         scan_end = 0.0
@@ -373,7 +373,7 @@ class LidarNode(LifecycleNode):
 
 
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
-    """Return when to wake for the end of the next scan, by `time.monotonic`.
+    """Return the time of `time.monotonic` at which to wake for the end of the next scan.
 
     The time is a little too early. If a scan is late, the result is the normal polling time.
     """

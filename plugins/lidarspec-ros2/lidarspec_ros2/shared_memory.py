@@ -47,8 +47,8 @@ MIN_SEGMENT_BYTES = 4_000_000
 SEGMENT_STEP_BYTES = 1_000_000
 #: Minimum clouds that fit into a segment: one is read while the next is written.
 MIN_CLOUDS = 2
-#: Clouds that a new segment has room for, and the number if memory is short. With dual return it is
-#: half as many.
+#: Number of single-return clouds for which a new segment has room; FEWER_CLOUDS if memory is short.
+#: With dual return, clouds are larger and the room is for half as many.
 CLOUDS = 8
 FEWER_CLOUDS = 4
 #: The size of clouds if no sensor is named: 78,000 points a scan.

@@ -113,7 +113,7 @@ PIXEL = ByteSwapped(
         "strength" / BitsInteger(8) * "reflectance or intensity, see flags; 255: reflector",
         "radius"
         / Scaled(BitsInteger(17), 0.005, "m")
-        * "times 2 with long distances; 0: no return",
+        * "to be doubled if `long` is 1; 0: no return",
     )
 )
 
@@ -143,7 +143,7 @@ def make_packet(returns: int) -> Struct:
         / ByteSwapped(
             BitStruct(
                 "reserved" / BitsInteger(2),
-                "long" / BitsInteger(1) * "1: long distances",
+                "long" / BitsInteger(1) * "1: radii are to be doubled",
                 "last_four" / BitsInteger(1),
                 "first_part" / BitsInteger(1),
                 "locked" / BitsInteger(1),

@@ -24,18 +24,18 @@ STRING = ("size" / Int16ub, "text" / Bytes(this.size))
 RANGE = (
     "sectors" / Int16ub,
     "step" / Scaled(Int32ub, 1e-4, "deg"),
-    "start" / Scaled(Int32sb, 1e-4, "deg") * "counter-clockwise; 90 is straight ahead",
+    "start" / Scaled(Int32sb, 1e-4, "deg") * "first angle, counter-clockwise; 90 is straight ahead",
     "stop" / Scaled(Int32sb, 1e-4, "deg"),
 )
 CONTENT = (
-    "echoes" / Int8ub * "sum of 1: DIST1, 2: DIST2, 4: DIST3, and so on",
+    "echoes" / Int8ub * "bit 0: DIST1, bit 1: DIST2, bit 2: DIST3, and so on",
     "reserved" / Int8ub,
-    "strength" / Int8ub * "1: with RSSI",
-    "wide" / Int8ub * "1: 16-bit RSSI",
+    "strength" / Int8ub * "1: scans contain RSSI",
+    "wide" / Int8ub * "1: RSSI has 16 bits",
     "unit" / Int8ub,
     "encoders" / Int16ub,
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
-    "interval" / Int16ub * "1: each scan, 2: every second scan",
+    "interval" / Int16ub * "1: every scan is sent, 2: every second scan",
 )
 #: The reasons for a refused command, numbered from 1 (8014631, error codes).
 ERRORS = (

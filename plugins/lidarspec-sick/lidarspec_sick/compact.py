@@ -88,11 +88,11 @@ def make_module(version: int) -> Struct:
         "echo_count" / Int32ul,
         "start_time" / Array(this.layer_count, Scaled(Int64ul, 1, "us")),
         "stop_time" / Array(this.layer_count, Scaled(Int64ul, 1, "us")),
-        "elevation" / Array(this.layer_count, Scaled(Float32l, 1, "rad")) * "downwards",
+        "elevation" / Array(this.layer_count, Scaled(Float32l, 1, "rad")) * "positive downwards",
         "first_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
         "last_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
         *(["scale" / Float32l] if version == 4 else []),
-        "next_size" / Int32ul * "bytes of the next module; 0 in the last one",
+        "next_size" / Int32ul * "size of the next module in bytes; 0 in the last one",
         "available" / Int8ul,
         "echo_content"
         / BitStruct(
@@ -119,7 +119,7 @@ def make_telegram(version: int) -> Construct:
         "counter" / Int64ul,
         "sent" / Scaled(Int64ul, 1, "us"),
         "version" / Const(version, Int32ul),
-        "size" / Int32ul * "bytes of the first module",
+        "size" / Int32ul * "size of the first module in bytes",
         "modules" / Parts(make_module(version), size=this.size, following=this.next_size),
         "crc" / Int32ul,
     )

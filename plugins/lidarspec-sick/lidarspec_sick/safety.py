@@ -76,14 +76,14 @@ DATAGRAM = Struct(
     "major" / Int8ub,
     "minor" / Int8ub,
     "total_length" / Int32ul * "bytes of the message",
-    "identification" / Int32ul * "counts messages",
-    "fragment_offset" / Int32ul * "offset of this part in the message",
+    "identification" / Int32ul * "message counter",
+    "fragment_offset" / Int32ul * "offset of this datagram in the message, in bytes",
     "reserved" / Bytes(4),
 )
 
 
 def make_block(offsets: range | None = None) -> Struct:
-    """Return the struct of the place of a block in a message; zeros if it is not sent.
+    """Return the struct with offset and size of a block; both are 0 if it is not sent.
 
     Args:
         offsets: the possible offsets; None for all.
@@ -93,7 +93,7 @@ def make_block(offsets: range | None = None) -> Struct:
 
 
 BEAM = Struct(
-    "distance" / Scaled(Int16ul, MM, "m") * "times `factor`",
+    "distance" / Scaled(Int16ul, MM, "m") * "to be multiplied by `factor`",
     "reflectivity" / Int8ul,
     "status"
     / BitStruct(
@@ -102,7 +102,7 @@ BEAM = Struct(
         "contamination" / BitsInteger(1),
         "reflector" / BitsInteger(1),
         "glare" / BitsInteger(1),
-        "infinite" / BitsInteger(1) * "no echo",
+        "infinite" / BitsInteger(1) * "1: no echo",
         "valid" / BitsInteger(1),
     ),
 )
@@ -115,13 +115,13 @@ MESSAGE = Struct(
     "plug_serial" / Int32ul * "serial number of the system plug",
     "channel" / Int8ul,
     "reserved" / Bytes(3),
-    "sequence" / Int32ul * "counts messages",
-    "scan_number" / Int32ul * "counts scans",
+    "sequence" / Int32ul * "message counter",
+    "scan_number" / Int32ul * "scan counter",
     "date"
     / Scaled(Int16ul, SECONDS_PER_DAY, "s", EPOCH_DAYS * SECONDS_PER_DAY)
     * "days since 1972-01-01",
     "reserved_2" / Bytes(2),
-    "time" / Scaled(Int32ul, 0.001, "s") * "since midnight",
+    "time" / Scaled(Int32ul, 0.001, "s") * "time since midnight",
     "blocks"
     / Struct(
         "system_state" / make_block(),
@@ -133,13 +133,15 @@ MESSAGE = Struct(
     "system_state" / Bytes(this.blocks.derived.offset - HEADER_BYTES),
     "derived"
     / Struct(
-        "factor" / Int16ul * "of distances",
+        "factor" / Int16ul * "factor of all distances",
         "beams" / Int16ul,
         "scan_time" / Scaled(Int16ul, 0.001, "s"),
         "reserved" / Bytes(2),
-        "start_angle" / Scaled(Int32sl, ANGLE_STEP_DEG, "deg") * "90: ahead",
+        "start_angle"
+        / Scaled(Int32sl, ANGLE_STEP_DEG, "deg")
+        * "first angle; 90 is straight ahead",
         "step" / Scaled(Int32sl, ANGLE_STEP_DEG, "deg"),
-        "interval" / Scaled(Int32ul, 1e-6, "s") * "from beam to beam",
+        "interval" / Scaled(Int32ul, 1e-6, "s") * "time from beam to beam",
     ),
     "derived_rest"
     / Bytes(this.blocks.measurement.offset - this.blocks.derived.offset - DERIVED_BYTES),

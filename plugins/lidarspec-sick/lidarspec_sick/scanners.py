@@ -45,7 +45,9 @@ ANGLE_TOLERANCE_DEG = 1e-4
 
 @dataclass(frozen=True)
 class Kind:
-    """The possible settings of a family of models; a simulated scanner has the first.
+    """The possible settings of a family of models.
+
+    A simulated scanner has the first rate and the first step.
 
     Attributes:
         rates: the possible scans per second.

@@ -73,9 +73,9 @@ def make_channel(
     """Return the field of a channel with this content.
 
     Args:
-        content: the content on the wire.
+        content: the name of the content, as sent.
         values: the type of a sample.
-        first: whether it is the first channel; all others have its number of values.
+        first: whether it is the first channel, whose number of values all others have.
         name: the name of the field, by default the content in lower case.
     """
     count = this.count if first else this._.dist1.count
@@ -83,7 +83,9 @@ def make_channel(
         "content" / Const(content.encode()),
         "scale" / Float32b,
         "offset" / Float32b,
-        "start" / Scaled(Int32sb, 1e-4, "deg") * "counter-clockwise; 90 is straight ahead",
+        "start"
+        / Scaled(Int32sb, 1e-4, "deg")
+        * "first angle, counter-clockwise; 90 is straight ahead",
         "step" / Scaled(Int16ub, 1e-4, "deg"),
         "count" / (Int16ub if first else Rebuild(Int16ub, count)),
         "samples" / Array(count, values),
@@ -111,7 +113,7 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "serial" / Int32ub,
         "status"
         / Array(2, Enum(Int8ub, ok=0, error=1, pollution_warning=2, pollution_error=4))
-        * "the second value counts",
+        * "the second value is the status of the device",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
         "time" / Scaled(Int32ub, 1, "us") * "start of the scan, since power-up",
@@ -125,11 +127,11 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "beam_rate" / Scaled(Int32ub, 100, "Hz"),
         "encoder_count" / Int16ub,
         "encoders" / Array(this.encoder_count, Struct("position" / Int32sb, "speed" / Int16sb)),
-        "channels" / Int16ub * "of 16 bits",
+        "channels" / Int16ub * "number of 16-bit channels",
         make_channel("DIST1", DISTANCE, first=True),
         *others,
         *(part.name / If(this.channels == 2 * echoes, part.subcon) for part in strengths),
-        "channels8" / Int16ub * "of 8 bits",
+        "channels8" / Int16ub * "number of 8-bit channels",
         *(
             part.name / If(this.channels8 >= number, part.subcon)
             for number, part in enumerate(strengths8, 1)

@@ -130,11 +130,11 @@ DATA = Struct(
     "magic" / Const(bytes([2, 1, 4, 3, 6, 5, 8, 7])),
     "version"
     / Int32ul
-    * "SDK version: major, minor, bugfix and build, one byte each, highest first",
+    * "SDK version: one byte each for major, minor, bugfix and build, major highest",
     "length" / SizeOf(Int32ul),
     "platform" / Const(PLATFORM, Int32ul),
     "frame_number" / Int32ul,
-    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "clock cycles; restarts at 21.5 s",
+    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "time of a cycle counter, which restarts at 21.5 s",
     "detected" / Int32ul * "number of points",
     "tlv_count" / Int32ul,
     "subframe" / Int32ul,
@@ -143,10 +143,18 @@ DATA = Struct(
         {
             "points": POINTS_PART,
             "range_profile": make_part(
-                2, 2, "magnitudes" / Array(this.length // 2, Int16ul) * "log2, Q9"
+                2,
+                2,
+                "magnitudes"
+                / Array(this.length // 2, Int16ul)
+                * "logarithm to base 2, in steps of 1/512",
             ),
             "noise_profile": make_part(
-                3, 2, "magnitudes" / Array(this.length // 2, Int16ul) * "log2, Q9"
+                3,
+                2,
+                "magnitudes"
+                / Array(this.length // 2, Int16ul)
+                * "logarithm to base 2, in steps of 1/512",
             ),
             "statistics": STATISTICS,
             "side_info": SIDE_INFO_PART,

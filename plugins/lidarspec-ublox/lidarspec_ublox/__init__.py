@@ -92,7 +92,7 @@ NAV_PVT = make_ubx(  # p. 150
     "day" / Int8ul,
     "hour" / Int8ul,
     "minute" / Int8ul,
-    "second" / Int8ul * "to 60, a leap second",
+    "second" / Int8ul * "0 to 60; 60 is a leap second",
     "valid"
     / BitStruct(
         "reserved" / BitsInteger(4),
@@ -119,18 +119,18 @@ NAV_PVT = make_ubx(  # p. 150
         "confirmation_available" / BitsInteger(1),
         "reserved" / BitsInteger(5),
     ),
-    "satellites" / Int8ul * "numSV: used in the solution",
+    "satellites" / Int8ul * "numSV: satellites used in the solution",
     "longitude" / Scaled(Int32sl, 1e-7, "deg"),
     "latitude" / Scaled(Int32sl, 1e-7, "deg"),
-    "height" / Scaled(Int32sl, 0.001, "m") * "above the ellipsoid",
-    "height_msl" / Scaled(Int32sl, 0.001, "m") * "above mean sea level",
+    "height" / Scaled(Int32sl, 0.001, "m") * "height above the ellipsoid",
+    "height_msl" / Scaled(Int32sl, 0.001, "m") * "height above mean sea level",
     "horizontal_accuracy" / Scaled(Int32ul, 0.001, "m"),
     "vertical_accuracy" / Scaled(Int32ul, 0.001, "m"),
     "velocity_north" / Scaled(Int32sl, 0.001, "m/s"),
     "velocity_east" / Scaled(Int32sl, 0.001, "m/s"),
     "velocity_down" / Scaled(Int32sl, 0.001, "m/s"),
     "ground_speed" / Scaled(Int32sl, 0.001, "m/s"),
-    "heading" / Scaled(Int32sl, 1e-5, "deg") * "of motion",
+    "heading" / Scaled(Int32sl, 1e-5, "deg") * "direction of motion",
     "speed_accuracy" / Scaled(Int32ul, 0.001, "m/s"),
     "heading_accuracy" / Scaled(Int32ul, 1e-5, "deg"),
     "position_dop" / Scaled(Int16ul, 0.01, ""),
@@ -152,7 +152,7 @@ NAV_TIMEUTC = make_ubx(  # p. 168
     "day" / Int8ul,
     "hour" / Int8ul,
     "minute" / Int8ul,
-    "second" / Int8ul * "to 60, a leap second",
+    "second" / Int8ul * "0 to 60; 60 is a leap second",
     "valid"
     / BitStruct(
         "standard" / Enum(BitsInteger(4), usno=3, european=5, soviet_union=6, ntsc=7),
@@ -166,10 +166,10 @@ NAV_TIMEUTC = make_ubx(  # p. 168
 TIM_TP = make_ubx(  # p. 183
     b"\x0d\x01",
     16,
-    "time_of_week" / Scaled(Int32ul, 0.001, "s") * "of the next pulse",
+    "time_of_week" / Scaled(Int32ul, 0.001, "s") * "time of the week of the next pulse",
     "sub_millisecond" / Scaled(Int32ul, 1e-3 / 2**32, "s"),
     "quantization_error" / Scaled(Int32sl, 1e-12, "s"),
-    "week" / Int16ul * "of the time base",
+    "week" / Int16ul * "week of the next pulse",
     "flags"
     / BitStruct(
         "reserved" / BitsInteger(3),
@@ -192,13 +192,13 @@ SET_MESSAGE = make_ubx(  # UBX-CFG-MSG, p. 54
     3,
     "message_class" / Int8ul,
     "message_id" / Int8ul,
-    "rate" / Int8ul * "once every so many solutions, 0: never",
+    "rate" / Int8ul * "solutions per message; 0: never sent",
 )
 SET_RATE = make_ubx(  # UBX-CFG-RATE, p. 75
     b"\x06\x08",
     6,
-    "period" / Scaled(Int16ul, 0.001, "s") * "between measurements",
-    "cycles" / Int16ul * "measurements for each solution",
+    "period" / Scaled(Int16ul, 0.001, "s") * "time between measurements",
+    "cycles" / Int16ul * "measurements per solution",
     "time_reference" / Enum(Int16ul, utc=0, gps=1, glonass=2, beidou=3, galileo=4),
 )
 POLL_PVT = make_ubx(b"\x01\x07", 0)
@@ -228,13 +228,13 @@ RMC = Struct(  # p. 23
     "north_south" / Bytes(1),
     "longitude" / Float64b * "dddmm.mmmmm",
     "east_west" / Bytes(1),
-    "speed" / Scaled(Float32b, 1852 / 3600, "m/s") * "knots on the wire",
+    "speed" / Scaled(Float32b, 1852 / 3600, "m/s") * "sent in knots",
     "course" / Scaled(Float32b, 1, "deg"),
     "date" / Bytes(6) * "ddmmyy",
-    "variation" / Scaled(Float32b, 1, "deg") * "magnetic",
+    "variation" / Scaled(Float32b, 1, "deg") * "magnetic variation",
     "variation_east_west" / Bytes(1),
-    "mode" / Bytes(1) * "posMode, from NMEA 2.3 on",
-    "navigation_status" / Bytes(1) * "V: no such output; from NMEA 4.1 on",
+    "mode" / Bytes(1) * "posMode of the manual; sent from NMEA 2.3 on",
+    "navigation_status" / Bytes(1) * "V: no navigational status is provided; sent from NMEA 4.1 on",
 )
 GGA = Struct(
     "talker" / Bytes(2) * "GP: GPS, GN: several systems",
@@ -245,14 +245,14 @@ GGA = Struct(
     "longitude" / Float64b * "dddmm.mmmmm",
     "east_west" / Bytes(1),
     "quality" / Enum(Int8ub, none=0, fix=1, differential=2, rtk=4, float_rtk=5, dead_reckoning=6),
-    "satellites" / Int8ub * "used in the solution, 0 to 12",
+    "satellites" / Int8ub * "satellites used in the solution, 0 to 12",
     "horizontal_dop" / Float32b,
-    "altitude" / Scaled(Float64b, 1, "m") * "above mean sea level",
+    "altitude" / Scaled(Float64b, 1, "m") * "height above mean sea level",
     "altitude_unit" / Bytes(1),
-    "separation" / Scaled(Float32b, 1, "m") * "of geoid and ellipsoid",
+    "separation" / Scaled(Float32b, 1, "m") * "difference between ellipsoid and mean sea level",
     "separation_unit" / Bytes(1),
-    "age" / Scaled(Float32b, 1, "s") * "of differential corrections",
-    "station" / Bytes(4) * "of differential corrections",
+    "age" / Scaled(Float32b, 1, "s") * "age of the differential corrections",
+    "station" / Bytes(4) * "station of the differential corrections",
 )
 OTHER_NMEA = Struct("address" / Bytes(5), "content" / Bytes(MAX_SENTENCE_BYTES - 12))
 

@@ -8,9 +8,10 @@ focal distances. The vertical offsets that follow from the focal distance are do
 VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z differs by up to
 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
 
-Sources contradict each other on the firing times of a VLS-128: ros-drivers has one idle slot after
-eight groups and 8.7 us before the packet's time, velodyne_decoder two and 7 us, which this module
-follows; directions differ by 0.01 degrees.
+Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot follows
+eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder, two idle
+slots follow eight groups, and it is 7 us before. This module follows velodyne_decoder; directions
+differ by 0.01 degrees.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ VLS128_ELEVATION = (
     3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84,
     -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
 )
-# of each group of eight lasers, which fire together
+# offsets of eight lasers that fire together, the same in each group
 VLS128_OFFSET = (-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354)
 # fmt: on
 
@@ -198,7 +199,7 @@ VLS128_FRAMES = {
             BANK,
             0.004,
             Enum(Int8ul, strongest=0x37, last=0x38),
-            Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
+            Const(VLS128_PRODUCT, Int8ul) * "0xA1: VLS-128",
         ),
         data=True,
         plausible=is_plausible_single,
@@ -210,7 +211,7 @@ VLS128_FRAMES = {
             BANK,
             0.004,
             Const(DUAL, Int8ul),
-            Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
+            Const(VLS128_PRODUCT, Int8ul) * "0xA1: VLS-128",
             blocks=8,
         ),
         data=True,

@@ -4,13 +4,13 @@ The azimuth of a block is that of its first firing; the others lie on the way to
 proportion to their time. With dual return two consecutive blocks hold the two returns of the same
 firings and share an azimuth, so the next azimuth is two blocks ahead.
 
-The rule for the last block applies if there is no next block, or if it is further than the sensor
-can have rotated. Packets have no counter, so such a step is the sign of a loss; a sector masked in
-the sensor's settings looks the same. The rules are:
+The rule for the last block applies if there is no next block, or if its azimuth is further ahead
+than the sensor can have rotated. Packets have no counter, so such a step is the only sign of a lost
+packet; a sector masked in the sensor's settings looks the same. The rules are:
 
 * "previous", the default: the last good step is used again, as ros-drivers and nebula do for the
-  last block of every packet; velodyne_decoder uses the mean of the packet. On real packets these
-  differ by up to 0.04 degrees.
+  last block of every packet; velodyne_decoder uses the mean of the packet. On real packets the
+  two differ by up to 0.04 degrees.
 * "invalid": these firings have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and
@@ -41,7 +41,7 @@ class Firings:
     Attributes:
         elevation: degrees, (32,), of the laser of each slot of a block; (blocks, 32) if blocks hold
             different lasers.
-        delay: seconds from the first firing with the same azimuth to that of each slot, shaped as
+        delay: seconds from the first firing with the same azimuth to each slot's firing, shaped as
             `elevation`.
         period: seconds from one azimuth to the next.
         focal_distance: metres; lasers leave the lens at different heights and cross at this

@@ -57,7 +57,9 @@ def make_packet(
     """
     channel = Struct(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
-        "intensity" / Int8ul * "calibrated reflectivity: up to 100 diffuse, above retroreflective",
+        "intensity"
+        / Int8ul
+        * "calibrated reflectivity; up to 100: diffuse target, above: retroreflector",
     )
     block = Struct(
         "flag" / flag,
@@ -94,20 +96,22 @@ POSITION = Struct(
     / Array(
         3,
         Struct(
-            "gyro"
-            / Int16ul
-            * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
-            "temperature" / Scaled(Int16ul, 1, "") * "as gyro; 0.1453 degC, from 25 degC",
-            "accel_x" / Int16ul * "as gyro; 0.001221 g",
-            "accel_y" / Int16ul * "as gyro; 0.001221 g",
+            "gyro" / Int16ul * "HDL-32E: low 12 bits, signed, in steps of 0.09766 deg/s; VLP-16: 0",
+            "temperature"
+            / Scaled(Int16ul, 1, "")
+            * "HDL-32E: low 12 bits, signed, in steps of 0.1453 degC from 25 degC; VLP-16: 0",
+            "accel_x" / Int16ul * "HDL-32E: low 12 bits, signed, in steps of 0.001221 g; VLP-16: 0",
+            "accel_y" / Int16ul * "HDL-32E: low 12 bits, signed, in steps of 0.001221 g; VLP-16: 0",
         ),
     ),
     "reserved" / Bytes(149),
     "top_board_temperature"
     / Scaled(Int8ul, 1, "degC")
-    * "all readings except time, PPS and NMEA require firmware since 2018",
+    * "firmware before 2018 reports only timestamp, pps and nmea",
     "bottom_board_temperature" / Scaled(Int8ul, 1, "degC"),
-    "adc_temperature" / Scaled(Int8ul, 1, "degC") * "at the last calibration of the ADC",
+    "adc_temperature"
+    / Scaled(Int8ul, 1, "degC")
+    * "temperature at the last calibration of the ADC",
     "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "change since the last calibration",
     "adc_age" / Scaled(Int32ul, 1, "s") * "time since the last calibration",
     "adc_reason" / Enum(Int8ul, none=0, power_on=1, manual=2, temperature=3, periodic=4),
@@ -121,7 +125,7 @@ POSITION = Struct(
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full hour",
     "pps" / Enum(Int8ul, absent=0, synchronizing=1, locked=2, error=3),
     "thermal_status" / Enum(Int8ul, ok=0, shut_down=1),
-    "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "at the last thermal shutdown",
+    "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "temperature at the last thermal shutdown",
     "power_up_temperature" / Scaled(Int8ul, 1, "degC"),
     "nmea"
     / Bytes(NMEA_BYTES)
@@ -160,7 +164,7 @@ def is_plausible_dual(f: Fields) -> Any:
 def is_plausible_position(f: Fields) -> Any:
     """Return whether the PPS state is known and the NMEA sentence is text.
 
-    Bytes of a data packet are not text there, because they contain flags.
+    In a data packet, the bytes in place of the sentence are not text, because they contain flags.
     """
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
@@ -247,7 +251,7 @@ PUCK_FRAMES = {
 }
 VLP32C_FRAMES = {
     "data": Frame(
-        make_packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"),
+        make_packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28: VLP-32C"),
         data=True,
         plausible=is_plausible_vlp32c,
     ),

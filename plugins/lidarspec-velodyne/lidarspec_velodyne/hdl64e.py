@@ -181,7 +181,7 @@ DATA = Struct(
     "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time of the first firing, since the full hour",
     "status_type"
     / Enum(Int8ul, **{name: ord(letter) for name, letter in STATUS_LETTERS.items()})
-    * "an ASCII letter",
+    * "ASCII letter that selects the meaning of status_value",
     "status_value" / Int8ul,
 )
 

@@ -298,7 +298,7 @@ class Broadcast:
     def _read(self, read: Callable[[], None]) -> None:
         """Read from the feed.
 
-        After a move beyond the end of a file, its selection of no packets is not an error.
+        A move beyond the end of a file selects no packets, which is not an error here.
         """
         try:
             read()
@@ -393,7 +393,10 @@ class Broadcast:
         }
 
     def _find_clock_offset(self, clock: ClockReport) -> float | None:
-        """Return by how much the sensor's clock is ahead, s; without a date since the start."""
+        """Return the seconds by which the sensor's clock is ahead; None if unknown.
+
+        If the clock has no date, the result is relative to the start of the reading.
+        """
         if not math.isnan(clock.error_s):
             return clock.error_s
         samples = self._feed.clock.samples

@@ -363,7 +363,9 @@ class OpenPage:
 
     def _send_command(self, request: Mapping[str, Any]) -> None:
         name, arguments = _command(request)
-        self._commands.add(PageRequest("send", name, lambda: self._answers.sent(name, arguments)))
+        self._commands.add(
+            PageRequest("send", name, lambda: self._answers.send_command(name, arguments))
+        )
 
     def _record(self, request: Mapping[str, Any]) -> None:
         switch = self._broadcast.switch

@@ -178,7 +178,7 @@ class PageMessages:
             explanation = explain(data, sensor, sensor.commands[name].frame).to_dict()
         return {"is": "composed", "command": name, "hex": data.hex(), "explanation": explanation}
 
-    def sent(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
+    def send_command(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
         """Send a command, and return the reply in words.
 
         Raises:

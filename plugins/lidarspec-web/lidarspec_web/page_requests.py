@@ -19,7 +19,7 @@ MESSAGES_AT_ONCE = 100
 MESSAGES_PER_S = 100.0
 #: Number of waiting requests above which no message of the page is read.
 MAX_WAITING = 16
-#: Maximum pause between two requests of a lane.
+#: Maximum pause between two requests of a queue.
 MAX_REST_S = 0.1
 ANSWER_THREADS = 4
 

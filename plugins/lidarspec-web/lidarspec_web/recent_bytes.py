@@ -236,8 +236,8 @@ class RecentBytes:
     def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
         """Return one explanation of a damaged piece, as `Explanation.to_dict`.
 
-        It has the rows of each damaged frame in it, with the change that would explain the damage,
-        and of the bytes between them.
+        It has the rows of each damaged frame in the piece, with the change that would explain the
+        damage, and the rows of the bytes between these frames.
         """
         parts = list(
             explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.datagram))
