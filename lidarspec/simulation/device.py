@@ -433,6 +433,8 @@ class SimulatedDevice:
         self._powered = 0
         self._time = 0.0
         self._plug: int | None = None
+        self._late: list[tuple[str, str, bytes]] = []
+        self._late_until = 0
         self._timeline = ClockTimeline(self.faults.clock)
         self._fragmenter: Fragmenter | None = None
         link = sensor.links.get("data")
@@ -464,6 +466,8 @@ class SimulatedDevice:
         self._timeline = ClockTimeline(self.faults.clock, now + self.utc_offset_ns)
         self._replies.use_timeline(self._timeline)
         self.present = True
+        self._late = []
+        self._late_until = 0
         if self.faults.unplug:
             self._plug = now + int(self.faults.unplug * SECOND)
         else:
@@ -508,6 +512,10 @@ class SimulatedDevice:
         self._timeline.jump_ns += round(seconds * SECOND)
         self._replies.use_timeline(self._timeline)
 
+    def delay_output(self, seconds: float, now: int) -> None:
+        """Send the data of the next seconds late, all at the end of this time."""
+        self._late_until = now + round(seconds * SECOND)
+
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
         """Process received bytes, or a received datagram, at the time `now`."""
         self._switch_plug(now)
@@ -543,6 +551,11 @@ class SimulatedDevice:
                 out += [(link, frame, data) for frame, data in arrived]
             elif arrived:
                 out.append((link, "", b"".join(data for _, data in arrived)))
+        self._late += out
+        if now < self._late_until:
+            return []
+        out = self._late
+        self._late = []
         return out
 
     def _split_messages(self, packets: list[Packet]) -> list[Packet]:

@@ -321,6 +321,11 @@ class Served(ClosingContext):
         if failures:
             raise failures[0]
 
+    def delay(self, seconds: float) -> None:
+        """Let the data of the next seconds arrive late, all at the end of this time."""
+        get_now = self._clock or time.monotonic_ns
+        self._call_in_thread(lambda: self.device.delay_output(seconds, get_now()))
+
     def advance(self, seconds: float) -> None:
         """Advance the virtual clock, and wait until all data that is due was sent.
 

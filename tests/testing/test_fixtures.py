@@ -45,6 +45,57 @@ def test_in_virtual_time_a_second_of_data_comes_at_once(name: str, to: str, rate
         assert device.stats.bytes_skipped == 0
 
 
+@pytest.mark.parametrize(("name", "to", "rate"), PLACES)
+def test_late_data_come_at_once(name: str, to: str, rate: int) -> None:
+    sensor = ls.sensor(name)
+    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
+    with (
+        virtual_port(sensor, to=place, virtual_time=True) as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        frames = device.stats.frames
+        port.advance(0.5)
+        in_time = port.device.sent[sensor.data_frame]
+        read_until(device, lambda: frames[sensor.data_frame] == in_time)
+        port.delay(1.0)
+        port.advance(0.8)
+        assert not len(next(device.packets(wait=0.2)))
+        assert frames[sensor.data_frame] == in_time
+        port.advance(0.4)
+        sent = port.device.sent[sensor.data_frame]
+        assert sent - in_time > rate
+        read_until(device, lambda: frames[sensor.data_frame] == sent)
+
+
+@pytest.mark.parametrize(("name", "to", "rate"), PLACES)
+def test_an_unplugged_sensor_comes_back(name: str, to: str, rate: int) -> None:
+    sensor = ls.sensor(name)
+    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
+    with (
+        virtual_port(sensor, to=place, virtual_time=True) as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        port.advance(0.2)
+        port.unplug()
+        port.advance(1.0)
+        port.plug()
+        port.advance(0.5)
+        read_until(device, lambda: device.stats.frames[sensor.data_frame] > rate * 0.6)
+        assert device.stats.frames[sensor.data_frame] < rate
+
+
+def test_datagrams_are_lost_and_late() -> None:
+    sensor = ls.sensor("robosense-m1")
+    place = f"udp://127.0.0.1:{free_port()}"
+    faults = Faults(loss=0.02, reorder=3)
+    with (
+        virtual_port(sensor, to=place, faults=faults, virtual_time=True) as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        port.advance(0.5)
+        read_until(device, lambda: device.stats.lost > 10)
+
+
 @posix
 def test_time_stands_still_without_advance() -> None:
     with virtual_port(STL, virtual_time=True) as port, ls.open(port.path, STL) as device:
