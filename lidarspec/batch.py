@@ -123,7 +123,7 @@ class FilePiece:
 
     @property
     def settings(self) -> Record:
-        """The settings that its result depends on, besides the file and the piece number."""
+        """The settings that affect its result, without the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
             name: str(value)
@@ -397,7 +397,7 @@ class Manifest:
         return []
 
     def clear(self, piece: FilePiece) -> None:
-        """Remove the outputs of a file that has changed, or whose settings have."""
+        """Remove the outputs of a file if the file or the settings have changed."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if (

@@ -50,7 +50,7 @@ class SourceClock:
         self._batches = _iter_batches(device)
 
     def read(self) -> None:
-        """Read what has arrived, or the next part of a file.
+        """Read the data that has arrived, or the next part of a file.
 
         Raises:
             LidarSpecError: if the source fails, or sends no frame for too long.
@@ -64,7 +64,7 @@ class SourceClock:
         self._timeout.check()
 
     def report(self) -> ClockReport:
-        """Return what is known about the clock.
+        """Return the findings about the clock so far.
 
         Raises:
             LidarSpecError: if no packet has arrived.
@@ -188,7 +188,7 @@ def _iter_batches(device: Device) -> Iterator[Iterable[Packets]]:
 def _print_report(
     source_clock: SourceClock, report: ClockReport, first: ClockReport, *, as_json: bool
 ) -> None:
-    """Print what is known about one clock, and its offset from the first one."""
+    """Print the findings about one clock, and its offset from the first clock."""
     mutual_s = math.nan
     if report is not first:
         mutual_s = report.error_s - first.error_s

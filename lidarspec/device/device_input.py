@@ -173,7 +173,7 @@ class DeviceInput(Protocol):
         """
 
     def mark(self) -> int:
-        """Return a count of the data that has arrived, as an argument for `has_decoded_until`."""
+        """Return a mark for `has_decoded_until`: a count of the data that has arrived."""
         return 0
 
     def has_decoded_until(self, mark: int) -> bool:

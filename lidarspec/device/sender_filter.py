@@ -63,7 +63,7 @@ class SenderCheck:
     def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
         """Return the port that alternates with `sender` for frames of a type.
 
-        None if there is none; `sender` is then stored as the current port.
+        If no port alternates with it, returns None and stores `sender` as the current port.
         """
         port = self._current.setdefault(name, sender)
         previous = self._previous.setdefault(name, {})

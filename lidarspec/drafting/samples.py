@@ -148,7 +148,7 @@ class ChecksumMatch:
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums of which one would match, as a power of ten."""
+        """How many wrong checksums one has to try until one matches by chance: "1e+09"."""
         return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property

@@ -1,4 +1,4 @@
-"""Describe a sensor's clock in words: what it counts, and how it runs."""
+"""Describe a sensor's clock in words: its epoch, state, drift and offset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
 
 
 def describe_time_source(report: ClockReport) -> str:
-    """Return what a clock counts, and its state."""
+    """Return the epoch and the state of a clock in words."""
     counted = _describe_epoch(report)
     if report.state:
         return f"{counted}; {report.state}"
@@ -43,7 +43,10 @@ def _describe_epoch(report: ClockReport) -> str:
 
 
 def describe_offset(report: ClockReport) -> str:
-    """Return the offset from the host's clock, without the difference of the time scales."""
+    """Return the offset from the host's clock in words.
+
+    The difference of the time scales is subtracted.
+    """
     if math.isnan(report.error_s):
         return f"{report.offset_s:+.3f} s to the host, from an arbitrary start"
     text = f"{report.error_s * 1e3:+.2f} ms"

@@ -116,7 +116,7 @@ class FieldValue:
 
     @property
     def has_meaning(self) -> bool:
-        """Whether the text says more than the raw value: a unit, or the name of a code."""
+        """Whether the text has more than the raw value: a unit, or the name of a code."""
         return bool(self.unit or self.label) or self.is_unknown
 
     def contains_bit(self, offset: int, bit: int) -> bool:
@@ -465,7 +465,7 @@ def describe_losses(sensor: Sensor) -> str:
 
 
 def describe_declared_clock(clock: Clock) -> str:
-    """Return the fields of a clock, and what it counts, in Markdown."""
+    """Return the fields and the epoch of a clock, in Markdown."""
     names = [clock.source] if isinstance(clock.source, str) else clock.source
     if callable(names):
         fields = "calculated from the packet"

@@ -182,7 +182,7 @@ class TracedColumn(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values that are known while the function runs: the values of the sample packets."""
+        """The values of the sample packets, with which the function is traced."""
         return self.node.sample.array
 
     def __array_ufunc__(
@@ -364,7 +364,7 @@ def _check_raw(schema: Schema, path: str) -> None:
 def _fold_table_rows(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
-    """Apply a function to the rows of tables, instead of to the rows that are looked up.
+    """Apply a function to whole tables, before their rows are looked up.
 
     This is possible if the operands are rows of tables at the same indices, numbers, or a row that
     all packets share. Sines and cosines of directions in a table are then computed once.

@@ -112,7 +112,7 @@ def find_fault(examined: ExaminedFrame) -> Fault | None:
 
 
 def find_shortage(examined: ExaminedFrame) -> Fault | None:
-    """Return the fault because of which a frame has no values; None if it has values.
+    """Return the fault that prevents parsing of a frame; None if it can be parsed.
 
     Raises:
         Exception: any error of an expression of the struct.

@@ -630,7 +630,7 @@ class LayoutRefusal:
         by_constant: whether a constant is wrong. If it is False and `error` is None, the frame is
             too long.
         constants: if the frame is too long, the constants before the part that is too long. If one
-            of them is wrong in a candidate, this is the reason for the candidate.
+            of them is wrong in a candidate, the wrong constant is the fault of that candidate.
     """
 
     error: PluginError | None = None
@@ -646,7 +646,7 @@ class Layout:
         size: the size of the frames in bytes.
         leaves: the position of each field, by path.
         constants: the constant bits, as (mask, value) by offset.
-        seals: the checksums, inner ones first.
+        seals: the checksums, inner checksums first.
         places: the byte range of each named part outside arrays.
         branches: the branch that each `When` and `Select` takes.
         following: pairs of a field and its value, if the value follows from the header. The values

@@ -494,7 +494,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield fields with values that follow from constants and selectors, and the values."""
+        """Yield (field, value) for values that follow from constants and selectors."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -1071,9 +1071,9 @@ class HeaderTree:
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants found by a walk, without those that all frames begin with.
+        """Return the constants of a walk that the search has not checked yet.
 
-        Candidates were already checked for the latter.
+        The search checks the constants that all frames begin with.
         """
         return {
             offset: bits

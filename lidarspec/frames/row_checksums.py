@@ -463,9 +463,9 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word the sums of `_sum_words` that the word is XORed onto.
+    """Return for each word the sums of `_sum_words` into which the word is XORed.
 
-    Bit n of a value stands for the sum that is advanced by n bytes, for n from 0 to 7.
+    If bit n of a value is set, n from 0 to 7, they include the sum that is advanced by n bytes.
     """
     found = [1]
     while len(found) < number:

@@ -102,7 +102,7 @@ class ExaminedFrame:
         root: the tree of the frame type.
         data: the bytes.
         known: the layout, or the `HeaderWalk` with the layout up to the error in `failure`.
-        failure: the error because of which there is no layout: `UnknownSelectorError` if the bytes
+        failure: the error that prevented a layout: `UnknownSelectorError` if the bytes
             are truncated, `TooLongError`, `UnknownPartError`, or an error of an expression. None if
             there is a layout.
         start: the offset of a part in the frame; 0 for a frame.
@@ -136,7 +136,7 @@ class ExaminedFrame:
         yield from cursor.visit(self.root, "", self.prefix)
 
     def seals(self) -> Iterator[PlacedSeal]:
-        """Yield the checksums whose structs are complete, inner ones first."""
+        """Yield the checksums of complete structs, inner checksums first."""
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
         for seal in self.known.seals:
             if seal.end <= len(self.data):

@@ -367,7 +367,7 @@ class Candidates:
         return Frames.make_empty(self.buffer)
 
     def _find_waiting(self, kinds: Sequence[int]) -> list[Frames]:
-        """Return the candidates of some types whose constants have not all arrived.
+        """Return the candidates of these types whose last constant has not arrived yet.
 
         At each offset, only the candidate of the first type is returned.
         """
@@ -432,7 +432,7 @@ class Candidates:
 
 
 def select_live(candidates: Frames, *, final: bool) -> Frames:
-    """Return the valid candidates and, unless `final`, the incomplete ones."""
+    """Return the valid candidates and, unless `final`, the incomplete candidates."""
     if candidates.is_sound:
         return candidates
     is_live = candidates.status <= (VALID if final else SHORT)

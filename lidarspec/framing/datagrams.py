@@ -195,7 +195,7 @@ class _DatagramBatch:
     def _count_rejected(
         self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
     ) -> Frames:
-        """Count invalid datagrams, and check again those for which the plugin has failed.
+        """Count invalid datagrams; if the plugin failed for a datagram, check it again.
 
         Returns:
             The datagrams up to the first frame that changes the active types.
@@ -218,7 +218,10 @@ class _DatagramBatch:
         return frames
 
     def _check_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
-        """Return one datagram as a frame; count the reason and return None if it is invalid."""
+        """Return one datagram as a frame.
+
+        If it is invalid, counts the reason and returns None.
+        """
         rejected = 0
         start = datagram.starts
         size = datagram.sizes

@@ -182,7 +182,7 @@ class ClockMonitor:
         return events
 
     def report(self) -> ClockReport:
-        """Return what is known now."""
+        """Return the findings so far."""
         offset_s = error_s = drift_ppm = jitter_ms = math.nan
         if self._pieces:
             offset_s = self._offset_s
@@ -304,7 +304,10 @@ class ClockMonitor:
         )
 
     def _find_error_s(self) -> float:
-        """Return the offset without the difference of the time scales, s; nan without a date."""
+        """Return the error of the clock, s; nan if the clock has no date.
+
+        It is the offset from the host's clock minus the difference of their time scales.
+        """
         epoch = self._epoch
         if epoch == "hour":
             return (self._offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2

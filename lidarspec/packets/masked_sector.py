@@ -186,7 +186,7 @@ class SectorFinder:
             self._seen[(angles * BINS).astype(np.intp) % BINS] = True
 
     def add_gap(self, start: float, stop: float, step: float) -> list[int]:
-        """Compare a gap with earlier ones, and set `sector` if it recurs.
+        """Compare a gap with earlier gaps, and set `sector` if it recurs.
 
         Args:
             start: the angle of the packet before the gap, in turns.
@@ -317,7 +317,7 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def find_unlost(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """Compare a loss with earlier ones, and mark all of them as masked if it recurs.
+        """Compare a loss with earlier losses, and mark all of them as masked if it recurs.
 
         Args:
             row: the row of the packet after the loss.

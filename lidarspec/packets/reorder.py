@@ -97,7 +97,7 @@ class Reorder:
         return [self._mark_breaks(packets, before)]
 
     def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
-        """Sort packets into the held ones, and release all that have no gap before them.
+        """Sort packets into the held packets, and release all that have no gap before them.
 
         Args:
             packets: the held packets, followed by the packets that arrived after them.

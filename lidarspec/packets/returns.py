@@ -29,7 +29,9 @@ MAX_PLACES_LATE = 64
 def read_groups(
     rule: PacketCounter, batch: Batch, index: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the group of each packet, its place in the group, and the size of the group, (n,).
+    """Return group, place in the group and group size of each packet, (n,) each.
+
+    A group is identified by the index of its first packet.
 
     Args:
         index: the index of each packet, (n,).

@@ -194,7 +194,7 @@ class Plan:
         )
 
     def is_exact(self, name: str) -> bool:
-        """Return whether a column is computed in float64 in the written order, then rounded."""
+        """Return whether a column is computed in float64 as written, and then rounded."""
         return self.exact or name == "intensity" or name in self.extra
 
     def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
@@ -365,7 +365,7 @@ _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDic
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
-    """Return the plan for a group of frames, or the error that explains why it has none.
+    """Return the plan for a group of frames, or the reason why it has none.
 
     The layout keeps the result.
     """

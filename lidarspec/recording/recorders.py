@@ -196,7 +196,7 @@ class FrameRecorder(BackgroundWriter):
         self._put(self._writing.head(USER_LINKS[0]))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record received bytes; sent ones are left out."""
+        """Record received bytes; ignore sent bytes."""
         if direction == "in":
             self._at = chunk.at or self._at
             if chunk.gap:
@@ -238,7 +238,7 @@ class RawRecorder(BackgroundWriter):
         super().__init__(path, None, overwrite=overwrite)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record received bytes; sent ones are left out."""
+        """Record received bytes; ignore sent bytes."""
         if direction == "in":
             self._put(chunk.data, len(chunk.data))
 

@@ -154,7 +154,7 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts of the scan with the losses before packets, without the packets."""
+        """Return the scan's counts plus the losses before some packets; exclude the packets."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),

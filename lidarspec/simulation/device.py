@@ -344,7 +344,7 @@ class _FrameStream:
         return self._next
 
     def change(self, frame_simulation: FrameSimulation) -> None:
-        """Continue with another simulation, from its frame 0 on, after the frames made so far."""
+        """Continue with frame 0 of another simulation, after the frames made so far."""
         self._made = frame_simulation
         self._next = 0
 

@@ -240,13 +240,13 @@ class Clock:
             )
 
     def epoch_in(self, state: ClockState | None) -> str:
-        """Return what the clock counts in a state; None if the state is unknown."""
+        """Return the epoch of the clock in a state; None is an unknown state."""
         if state is not None and state.epoch is not None:
             return state.epoch
         return self.epoch
 
     def epoch_at(self, time_ns: int, state: ClockState | None) -> str:
-        """Return what the clock counts in a state, at a time that it shows, ns."""
+        """Return the epoch of the clock in a state, when its reading is `time_ns`."""
         epoch = self.epoch_in(state)
         if epoch == "hour" and time_ns >= FIRST_DATE_NS:
             return "utc"  # another frame has completed the hour

@@ -289,7 +289,7 @@ def _find_first_line(error: BaseException) -> str:
 def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
     """Return the finding for an undocumented exception.
 
-    Its file and line are those in the plugin where the exception was raised, if any.
+    The finding has the file and line at which the plugin raised the exception, if any.
     """
     locations = [
         location

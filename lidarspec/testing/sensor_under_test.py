@@ -35,8 +35,8 @@ def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
 def pick_offsets(length: int, source: random.Random, count: int = CUT_OFFSETS) -> list[int]:
     """Return offsets at which a frame is cut.
 
-    These are all offsets of a short frame, or `count` random offsets of a long frame and those near
-    its ends.
+    A short frame is cut at all offsets. A long frame is cut at `count` random offsets, and near its
+    ends.
     """
     if length <= MAX_SHORT_BYTES * count // CUT_OFFSETS:
         return list(range(length))

@@ -76,7 +76,7 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return the struct with these values; invalid values are replaced by valid ones.
+        """Return the struct with these values; replace invalid values by valid values.
 
         Returns None if no valid struct with the values of the fixed fields is found.
 

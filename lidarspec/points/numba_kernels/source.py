@@ -621,7 +621,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
 
 
 def _find_cos_sin_angles(expressions: Iterable[Any]) -> set[Node]:
-    """Return the angles of which both cosine and sine are in the expressions."""
+    """Return each angle whose cosine and sine both occur in the expressions."""
     nodes = list(traverse(*expressions))
     cosines, sines = (
         {node.args[0] for node in nodes if node.function is function}

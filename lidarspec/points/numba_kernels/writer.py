@@ -479,7 +479,10 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Return the text of a lookup of an expression of one field; None without a window."""
+        """Return the lookup that replaces an expression of one field.
+
+        Returns None if `find_window` has no result for the field.
+        """
         leaf = self.layout.leaves.get(source.path)
         field_window = find_window(leaf) if leaf is not None else None
         if leaf is None or field_window is None:
