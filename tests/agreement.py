@@ -50,7 +50,7 @@ def assert_same_packets(one: Packets, other: Packets, *, by_reason: bool = True)
     assert list_counters(one.stats, by_reason=by_reason) == list_counters(
         other.stats, by_reason=by_reason
     )
-    for axis, node in one.table.schema.parts.items():
+    for axis, node in one.table.schema.separate_parts.items():
         assert same(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
         for kind in node.kinds:
             parts = f"{axis}.{kind.name}".rstrip(".")

@@ -269,6 +269,7 @@ def _parts(node: tree.PartSequence) -> dict[str, Any]:
             "name": kind.name,
             "part": node_data(kind.element),
             "following": formula_data(node.following(kind)),
+            **({} if kind.until is None else {"until": formula_data(kind.until)}),
         }
         for kind in node.kinds
     ]

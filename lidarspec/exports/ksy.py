@@ -456,6 +456,9 @@ class _KaitaiWriter:
             else:
                 condition = f"{number(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
+        elif kind.until is not None:
+            ends = tree.write(kind.until, lambda ref: f"_.{ref.path}", _OPERATIONS)
+            more |= {"repeat": "until", "repeat-until": ends}
         self._add_typed(kaitai, node.name, kind.element, scope, **more)
 
     def _add_typed(

@@ -346,6 +346,8 @@ class _TableWriter:
     def _parts(self, node: tree.PartSequence) -> Table:
         kinds = []
         for kind in node.kinds:
+            if kind.until is not None:
+                raise ExportError(f"{node.axis}: the end is found by the values of elements")
             magic = [
                 [offset, mask, value]
                 for offset, (mask, value) in sorted(

@@ -357,6 +357,8 @@ def _check_raw(schema: Schema, path: str) -> None:
     """Raise UntraceableError unless a field is sent as a number."""
     if path in schema.derived:
         raise UntraceableError(f"{path} is computed from other fields, and not sent")
+    if schema.find_sequence(path) is not None:
+        raise UntraceableError(f"{path} is in an array of elements of different size")
     if schema.fields[path].adapter is not None:
         raise UntraceableError(f"a Python function makes the values of {path}")
 

@@ -70,8 +70,9 @@ def _check_traced(formula: object) -> None:
 def _check_part(kind: tree.Kind, path: str) -> None:
     """Raise `NotCompilableError` if a kind of parts cannot be compiled."""
     try:
-        for ref in () if kind.following is None else tree.refs(kind.following):
-            check_control(ref.info)
+        for formula in (kind.following, kind.until):
+            for ref in () if formula is None else tree.refs(formula):
+                check_control(ref.info)
         check_compilable(kind.root)
     except NotCompilableError as reason:
         raise NotCompilableError(f"{path}.{reason.path}".rstrip("."), reason.reason) from None

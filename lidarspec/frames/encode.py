@@ -99,12 +99,17 @@ class _Encoder:
         fill_counts(self._given, self._schema)
         parts = dict[str, list[bytes]]()
         for axis, node in self._schema.parts.items():
+            if node.is_array and get_member(self._given, axis, None) is None:
+                continue  # the header decides whether the frame has the array
             parts[axis] = self._encode_parts(node)
             self._totals[node.total.path] = sum(map(len, parts[axis]))
         layout = self._layout()
         for seal in layout.seals:
             for leaf in seal.leaves:
                 self._checksums.add(leaf.info.path)
+        for axis in layout.regions:
+            if axis not in parts:
+                raise self._make_missing_error(axis)
         self._collect(self._layouts.root, self._given, "", self._prefix, layout)
         row = np.zeros((1, layout.size), np.uint8)
         for path, leaf in layout.leaves.items():
@@ -206,9 +211,11 @@ class _Encoder:
             following = len(encoded[0])
         total = sum(map(len, encoded))
         fields = self._schema.columns
-        fill_in(node.count, self._given, len(encoded), fields, node.axis)
-        fill_in(node.size, self._given, following, fields, node.axis)
-        fill_in(node.within, self._given, total, fields, node.axis)
+        rules = ((node.count, len(encoded)), (node.size, following), (node.within, total))
+        for formula, value in rules:
+            if node.is_array and formula is not None:
+                remove_held(formula, self._given, fields)
+            fill_in(formula, self._given, value, fields, node.axis)
         return encoded
 
     def _collect(self, node: Node, value: Any, path: str, shown: str, layout: Layout) -> None:
@@ -477,10 +484,16 @@ def fill_counts(given: Container, table: Schema) -> None:
         counted.add(path)
         if axis in table.branched and get_member(given, path, None) is not None:
             continue  # the branch, and so the formula of the length, is not known yet
-        if table.fields[path].held:
-            holder, name = _find_holder(given, path)
-            holder.pop(name, None)
+        remove_held(count, given, table.fields)
         fill_in(count, given, len(array), table.fields, axis)
+
+
+def remove_held(formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]) -> None:
+    """Remove the field that a formula depends on, if it is always computed."""
+    path = None if formula is None else counting_field(formula, fields)
+    if path is not None and fields[path].held:
+        holder, name = _find_holder(given, path)
+        holder.pop(name, None)
 
 
 def fill_in(

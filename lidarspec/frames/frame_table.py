@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from lidarspec.frames.parts import FoundParts
 
 
+#: The reason why an array in elements has no length for each frame.
+VARYING_LENGTH = "its length varies within one frame, which cannot be one column"
+
+
 class Table(Protocol):
     """The raw columns of n frames of one type."""
 
@@ -101,12 +105,16 @@ class CompiledTable:
         self.groups = [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
         self._walks: dict[str, list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]] = {}
+        self._arrays: dict[str, _Elements] = {}
 
     def __len__(self) -> int:
         return self._length
 
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.columns[path]
+        sequence = self.schema.find_sequence(path)
+        if sequence is not None:
+            return self._raw_of_elements(sequence, path)
         dtype = info.dtype or np.dtype(object)  # a computed constant may be any object
         if len(self.groups) == 1:
             group = self.groups[0]
@@ -145,6 +153,9 @@ class CompiledTable:
     def present(self, path: str) -> NDArray[np.bool_] | None:
         if not self.schema.columns[path].optional:
             return None
+        sequence = self.schema.find_sequence(path)
+        if sequence is not None:
+            return self._present_of_elements(sequence, path)
         there = np.zeros(len(self), np.bool_)
         for group in self.groups:
             is_empty = any(
@@ -154,6 +165,9 @@ class CompiledTable:
         return there
 
     def counts(self, axis: str) -> NDArray[np.intp]:
+        sequence = self.schema.find_sequence(axis)
+        if sequence is not None:
+            return self._counts_of_elements(sequence, axis)
         counts = np.zeros(len(self), np.intp)
         for group in self.groups:
             counts[group.where] = group.layout.lengths.get(axis, 0)
@@ -164,7 +178,77 @@ class CompiledTable:
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
+        sequence = self.schema.find_sequence(axis)
+        if axis == sequence:
+            return int(self.counts(axis).max(initial=0))
+        if sequence is not None:
+            return self._elements(sequence).table.length(axis[len(sequence) + 1 :])
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
+
+    def _elements(self, axis: str) -> _Elements:
+        """Return the elements of an array that differ in size. The result is cached."""
+        if axis not in self._arrays:
+            table, owners = self.parts(axis)
+            counts = np.bincount(owners, minlength=len(self)).astype(np.intp)
+            starts = np.cumsum(counts) - counts
+            ranks = np.arange(len(owners)) - starts[owners]
+            self._arrays[axis] = _Elements(table, owners, ranks, counts)
+        return self._arrays[axis]
+
+    def _raw_of_elements(self, axis: str, path: str) -> NDArray[Any]:
+        """Return the raw values of a field in an array of elements that differ in size."""
+        base, indices = without_indices(path)
+        if indices:
+            return _take_element(self, self.raw(base), base, indices)[0]
+        info = self.schema.columns[path]
+        elements = self._elements(axis)
+        dtype = info.dtype or np.dtype(object)
+        lengths = [self.length(each) for each in info.axes]
+        column = np.full((len(self), *lengths), None if dtype.hasobject else 0, dtype)
+        elements.store(column, elements.table.raw(path[len(axis) + 1 :]))
+        return column
+
+    def _present_of_elements(self, axis: str, path: str) -> NDArray[np.bool_] | None:
+        """Return which frames, or which elements, have a field of an array."""
+        base, indices = without_indices(path)
+        if indices:
+            return _present_element(self, base, indices)
+        elements = self._elements(axis)
+        there = elements.table.present(path[len(axis) + 1 :])
+        if there is None:
+            there = np.ones(len(elements.table), np.bool_)
+        # A frame whose elements all lack the field lacks it itself, and an empty array has it.
+        has_array = np.zeros(len(self), np.bool_)
+        for group in self.groups:
+            has_array[group.where] = axis in group.layout.regions
+        inner = tuple(range(1, there.ndim))
+        is_whole = there.all(inner)
+        is_lacking = ~there.any(inner)
+        numbers = elements.counts
+        whole: NDArray[np.bool_] = (
+            np.bincount(elements.owners[is_whole], minlength=len(self)) == numbers
+        )
+        lacking = np.bincount(elements.owners[is_lacking], minlength=len(self)) == numbers
+        whole &= has_array
+        if np.all(whole | lacking):
+            return whole
+        axes = self.schema.columns[path].axes[: there.ndim]
+        column = np.zeros((len(self), *map(self.length, axes)), np.bool_)
+        elements.store(column, there)
+        column[whole] = True
+        return column
+
+    def _counts_of_elements(self, axis: str, path: str) -> NDArray[np.intp]:
+        """Return the length of an array of elements that differ in size, or of an array in it."""
+        elements = self._elements(axis)
+        if path == axis:
+            return elements.counts
+        lengths = elements.table.counts(path[len(axis) + 1 :])
+        counts = np.zeros(len(self), np.intp)
+        counts[elements.owners] = lengths
+        if np.any(counts[elements.owners] != lengths):
+            raise SpecError(VARYING_LENGTH, path=path)
+        return counts
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -273,6 +357,29 @@ class CompiledTable:
         return CompiledTable(
             tables[0].schema, [_merge_groups(groups) for groups in groups_by_layout.values()]
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Elements:
+    """The elements of an array that differ in size, as a table of parts.
+
+    Attributes:
+        table: the elements of all frames, in stream order.
+        owners: the index of the frame that contains each element, (k,).
+        ranks: the index of each element in its frame, (k,).
+        counts: the number of elements in each frame, (n,).
+    """
+
+    table: CompiledTable
+    owners: NDArray[np.intp]
+    ranks: NDArray[np.intp]
+    counts: NDArray[np.intp]
+
+    def store(self, column: NDArray[Any], values: NDArray[Any]) -> None:
+        """Store the values of the elements in a padded column of the frames."""
+        inner = (slice(0, length) for length in values.shape[1:])
+        corner: Any = (self.owners, self.ranks, *inner)
+        column[corner] = values
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,7 +500,7 @@ class ParsedTable:
     def raw(self, path: str) -> NDArray[Any]:
         info, (base, indices) = self.schema.columns[path], without_indices(path)
         if indices:
-            return self._take_element(self.raw(base), base, indices)[0]
+            return _take_element(self, self.raw(base), base, indices)[0]
         values = [
             _collect_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed
         ]
@@ -422,19 +529,7 @@ class ParsedTable:
             return None
         axes, (base, indices) = self.schema.columns[path].axes, without_indices(path)
         if indices:
-            base_present = self.present(base)
-            elements, inside = self._take_element(
-                self.raw(base) if base_present is None or base_present.ndim == 1 else base_present,
-                base,
-                indices,
-            )
-            if base_present is None:
-                return inside
-            return (
-                inside & base_present
-                if base_present.ndim == 1
-                else add_axes(inside, elements.ndim - 1) & elements
-            )
+            return _present_element(self, base, indices)
         there = [
             _find_present(_collect_values(parsed, path.split("."), len(axes)))
             for parsed in self._parsed
@@ -446,43 +541,10 @@ class ParsedTable:
             _copy_value(column, index, one)
         return column
 
-    def _take_element(
-        self, column: NDArray[Any], path: str, indices: Mapping[str, int]
-    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return one element of a field's arrays, and whether each frame has it, (n,).
-
-        Args:
-            column: the values of the whole field, (n, *lengths).
-            path: the path of the field, without indices.
-            indices: the index in each axis that is removed. A negative index counts from the end.
-        """
-        inside = np.ones(len(self), np.bool_)
-        axes = self.schema.columns[path].axes
-        for axis in sorted(indices, key=axes.index, reverse=True):
-            place = 1 + axes.index(axis)
-            counts = self.counts(axis)
-            element_indices = indices[axis] + (counts if indices[axis] < 0 else 0)
-            inside &= (element_indices >= 0) & (element_indices < counts)
-            if not column.shape[place]:
-                return (
-                    np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype),
-                    inside,
-                )
-            element_indices = np.broadcast_to(
-                np.clip(element_indices, 0, column.shape[place] - 1), len(self)
-            )
-            column = np.take_along_axis(
-                column, add_axes(element_indices, column.ndim - 1), place
-            ).squeeze(place)
-        return np.where(add_axes(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
-
     def counts(self, axis: str) -> NDArray[np.intp]:
         lengths = self._lengths(axis)
         if any(len(frame_lengths) > 1 for frame_lengths in lengths):
-            raise SpecError(
-                "its length varies within one frame, which cannot be one column",
-                path=axis,
-            )
+            raise SpecError(VARYING_LENGTH, path=axis)
         return np.array([max(frame_lengths, default=0) for frame_lengths in lengths], np.intp)
 
     def length(self, axis: str) -> int:
@@ -541,6 +603,52 @@ class ParsedTable:
         return ParsedTable(
             tables[0].schema, parsed, [frame for table in tables for frame in table._frames]
         )
+
+
+def _take_element(
+    table: Table, column: NDArray[Any], path: str, indices: Mapping[str, int]
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Return one element of a field's arrays, and whether each frame has it, (n,).
+
+    Args:
+        column: the values of the whole field, (n, *lengths).
+        path: the path of the field, without indices.
+        indices: the index in each axis that is removed. A negative index counts from the end.
+    """
+    inside = np.ones(len(table), np.bool_)
+    axes = table.schema.columns[path].axes
+    for axis in sorted(indices, key=axes.index, reverse=True):
+        place = 1 + axes.index(axis)
+        counts = table.counts(axis)
+        element_indices = indices[axis] + (counts if indices[axis] < 0 else 0)
+        inside &= (element_indices >= 0) & (element_indices < counts)
+        if not column.shape[place]:
+            return (
+                np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype),
+                inside,
+            )
+        element_indices = np.broadcast_to(
+            np.clip(element_indices, 0, column.shape[place] - 1), len(table)
+        )
+        column = np.take_along_axis(
+            column, add_axes(element_indices, column.ndim - 1), place
+        ).squeeze(place)
+    return np.where(add_axes(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
+
+
+def _present_element(table: Table, path: str, indices: Mapping[str, int]) -> NDArray[np.bool_]:
+    """Return whether each frame has one element of a field's arrays, (n,)."""
+    base_present = table.present(path)
+    is_of_frames = base_present is None or base_present.ndim == 1
+    column = table.raw(path) if is_of_frames else base_present
+    assert column is not None
+    elements, inside = _take_element(table, column, path, indices)
+    if base_present is None:
+        return inside
+    if is_of_frames:
+        return inside & base_present
+    there: NDArray[np.bool_] = add_axes(inside, elements.ndim - 1) & elements
+    return there
 
 
 def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:

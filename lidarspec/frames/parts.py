@@ -393,17 +393,36 @@ class _PartWalk:
         formula = kind.node.following
         offsets = self._ends[which]
         self._ends[which] = offsets + layout.size
+        if kind.node.until is not None:
+            is_last = self._evaluate_all(kind, layout, kind.node.until, offsets)
+            self._announced[which] = np.where(is_last == 0, ANY, 0)
+            self._status[which[is_last < 0]] = LENGTH
+            return
         if formula is None:
             return
-        if isinstance(formula, tree.Ref) and formula.path in layout.leaves:
-            announced = layout.leaves[formula.path].read(self._buffer, offsets)[1].astype(np.int64)
-        else:
-            announced = np.array(
-                [self._evaluate(kind, layout, formula, offset) for offset in offsets.tolist()],
-                np.int64,
-            )
+        announced = self._evaluate_all(kind, layout, formula, offsets)
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
+
+    def _evaluate_all(
+        self, kind: PartKind, layout: Layout, formula: tree.Formula, offsets: Offsets
+    ) -> NDArray[np.int64]:
+        """Return the value of a formula in each part; -1 if the formula raises an error."""
+        asked = tree.refs(formula)
+        is_simple = isinstance(formula, tree.Ref) or (
+            isinstance(formula, tree.Op) and all(map(_is_comparison, tree.parts(formula)))
+        )
+        if is_simple and all(ref.path in layout.leaves for ref in asked):
+            columns = {
+                ref.path: layout.leaves[ref.path].read(self._buffer, offsets)[1].astype(np.int64)
+                for ref in asked
+            }
+            values = tree.arrays(formula, columns, np.int64)
+            return np.broadcast_to(values, len(offsets)).astype(np.int64)
+        return np.array(
+            [self._evaluate(kind, layout, formula, offset) for offset in offsets.tolist()],
+            np.int64,
+        )
 
     def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, offset: int) -> int:
         """Return the value of a formula in one part; -1 if the formula raises an error."""
@@ -422,6 +441,11 @@ class _PartWalk:
         except Exception as error:
             self._errors.append(PluginError.of(error, "struct"))
             return -1
+
+
+def _is_comparison(formula: tree.Formula) -> bool:
+    """Return whether a part of a formula is a field, a number or a comparison."""
+    return not isinstance(formula, tree.Op) or formula.symbol in tree.COMPARISONS
 
 
 def match_constants_at(

@@ -107,7 +107,8 @@ class Schema:
         arrays: the declared length of each array, by path: a number if all frames have the same
             length, else a formula of header fields, or None if only construct can determine it.
         parts: the parts (frames within the frame), by path.
-        inside: the fields of the parts, by their path in the frame.
+        inside: the fields of the parts, by their path in the frame. The fields of the elements of
+            an array (`PartSequence.is_array`) are also in `fields`.
         derived: the values without bytes of their own, by path.
     """
 
@@ -160,13 +161,18 @@ class Schema:
         )
 
     @cached_property
+    def separate_parts(self) -> Mapping[str, PartSequence]:
+        """The parts with columns of their own, by path: all but the elements of arrays."""
+        return {axis: node for axis, node in self.parts.items() if not node.is_array}
+
+    @cached_property
     def scan_names(self) -> Mapping[str, FieldInfo]:
         """The fields of the frame and its parts, by the names that scans and clocks use.
 
         The path of a field in a part includes the name of the kind of part: "tags.points.angle".
         """
         names = dict(self.fields)
-        for axis, node in self.parts.items():
+        for axis, node in self.separate_parts.items():
             for kind in node.kinds:
                 before = f"{axis}.{kind.name}".rstrip(".")
                 names |= {
@@ -183,7 +189,7 @@ class Schema:
         Raises:
             UnknownField: if there are several kinds of parts and the path has no name of a kind.
         """
-        for axis, node in self.parts.items():
+        for axis, node in self.separate_parts.items():
             if path == axis or path.startswith(f"{axis}."):
                 names = [kind.name for kind in node.kinds]
                 rest = path[len(axis) + 1 :]
@@ -221,6 +227,16 @@ class Schema:
                 rule="LS214",
             )
         return found[0]
+
+    def find_sequence(self, path: str) -> str | None:
+        """Return the array of parts that contains a field, or that is the path; None without."""
+        if not self.parts:
+            return None
+        base = without_indices(path)[0]
+        for axis, node in self.parts.items():
+            if node.is_array and (base == axis or base.startswith(f"{axis}.")):
+                return axis
+        return None
 
     def outer(self, axis: str) -> list[str]:
         """Return the arrays that contain an array."""
@@ -360,6 +376,9 @@ def _walk(
         case Block():
             _add_block(node, fields, arrays, optional=optional)
         case PartSequence():
+            if node.is_array:
+                _add_count(arrays, node.axis, node.count, optional=optional)
+                _walk(node.kinds[0].element, fields, arrays, derived, optional=optional)
             return
     for child in children(node):
         is_optional = optional or isinstance(node, When | Select)

@@ -296,6 +296,9 @@ def describe_end(node: tree.PartSequence) -> str:
         return f"{format_formula(node.count)} parts of variable size"
     if node.within is not None:
         return f"parts that fill {format_formula(node.within)} bytes"
+    until = node.kinds[0].until
+    if until is not None:
+        return f"parts up to the first with {format_formula(until)}"
     assert node.size is not None
     following = ", ".join(
         dict.fromkeys(

@@ -262,7 +262,9 @@ def make_of_values(
 def _remove_lengths(values: Any, root: Node) -> Any:
     """Return the values of a frame without the counts and lengths that `build` fills in."""
     for node in make_schema(root).parts.values():
-        rules = (node.count, node.size, node.within)
+        # The count of an array was drawn together with the array.
+        count = None if node.is_array else node.count
+        rules = (count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
         for kind, part in (
             (kind, part) for part in get_member(values, node.axis, []) for kind in node.kinds

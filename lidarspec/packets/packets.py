@@ -158,11 +158,9 @@ class Packets:
         Raises:
             UnknownField: if the frame does not have the array.
         """
-        if array in self.table.schema.parts:
-            found = (
-                self.table.parts(array, kind.name)[1]
-                for kind in self.table.schema.parts[array].kinds
-            )
+        separate_parts = self.table.schema.separate_parts
+        if array in separate_parts:
+            found = (self.table.parts(array, kind.name)[1] for kind in separate_parts[array].kinds)
             return sum(
                 (np.bincount(which, minlength=len(self)) for which in found),
                 np.zeros(len(self), np.intp),
@@ -170,7 +168,7 @@ class Packets:
         if array not in self.table.schema.arrays:
             raise UnknownField(
                 array,
-                {*self.table.schema.arrays, *self.table.schema.parts},
+                {*self.table.schema.arrays, *separate_parts},
                 place=f"{self.sensor.id} {self.frame}",
             )
         return self.table.counts(array)
@@ -274,7 +272,7 @@ class Packets:
         place = self.table.schema.within(path)
         if place is None:
             raise UnknownField(
-                path, self.table.schema.parts, place=f"{self.sensor.id} {self.frame}"
+                path, self.table.schema.separate_parts, place=f"{self.sensor.id} {self.frame}"
             )
         axis, kind, below = place
         table, which = self.table.parts(axis, kind)

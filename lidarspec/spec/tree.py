@@ -726,12 +726,15 @@ class Kind:
             "_.".
         following: the formula of the size of the next part in bytes, by fields of `root`; 0 after
             the last part. None if parts do not declare the size of the next part.
+        until: a condition that only the last part meets (construct's RepeatUntil), by fields of
+            `root`; None without such a condition.
     """
 
     name: str
     element: Node
     root: Node
     following: Formula | None
+    until: Formula | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -747,6 +750,8 @@ class PartSequence:
         within: the total size of all parts in bytes, or None.
         outer: the fields of the outer frame that formulas of the parts use.
         total: the total size of all parts as a field, for the formulas after the parts.
+        is_array: whether the parts are the elements of an array that differ in size. The fields of
+            the elements are then columns of the outer frame.
     """
 
     name: str
@@ -757,6 +762,7 @@ class PartSequence:
     within: Formula | None
     outer: tuple[Ref, ...]
     total: FieldInfo
+    is_array: bool = False
 
     def following(self, kind: Kind) -> Formula | None:
         """Return the formula of the size of the part after a part of this kind.

@@ -83,12 +83,6 @@ COMPILED: dict[str, Any] = {
         "a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)
     ),
     "as many as a byte says": Struct("a" / Bytes(2), "b" / Array(this.a[1] % 3, Int16ub)),
-}
-INTERPRETED: dict[str, Any] = {
-    "of what is not there": If(lambda found: found.y is None, Int8ub),
-    "terminated": TEXT,
-    "terminated ones": Array(this.k, TEXT),
-    "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
     "elements of several lengths": Array(this.k, Struct("n" / Int8ub, "x" / Bytes(this.n % 3))),
     "arrays of several lengths": Array(
         this.k, Struct("n" / Int8ub, "x" / Array(this.n % 3, Int16ub))
@@ -98,6 +92,12 @@ INTERPRETED: dict[str, Any] = {
     "behind a case": Switch(
         this.k, {3: Array(2, Struct("n" / Int8ub, "x" / Int8ub, "y" / If(this.n == 9, Int8ub)))}
     ),
+}
+INTERPRETED: dict[str, Any] = {
+    "of what is not there": If(lambda found: found.y is None, Int8ub),
+    "terminated": TEXT,
+    "terminated ones": Array(this.k, TEXT),
+    "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
     "the length of an array": Struct(
         "a" / Array(this._.k, Struct("b" / Int8ub)), "c" / Array(len_(this.a), Int8ub)
     ),
@@ -471,7 +471,10 @@ def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str)
         (Transformed(Int16ub, invert, 2, invert, 2), "in `points`"),
         (FixedSized(8, CString("ascii")), "use Bytes(n)"),
         (Computed(lambda found: int(found.k) * 2), "use an expression of numbers"),
-        (Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub))), "Parts(struct, count)"),
+        (
+            Array(2, Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub)))),
+            "Parts(struct, count)",
+        ),
         (Array(2, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct"),
     ],
 )

@@ -53,6 +53,7 @@ from construct import (
     PascalString,
     Peek,
     Prefixed,
+    PrefixedArray,
     ProcessXor,
     RawCopy,
     Rebuffered,
@@ -73,7 +74,7 @@ from construct import (
 
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.explaining.explanation import explain
-from lidarspec.spec import Checksummed, Fields, Polar, Serial, Sum
+from lidarspec.spec import Checksummed, Fields, Polar, Scaled, Serial, Sum
 from tests.engine.against_construct import at, has_all, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
@@ -250,6 +251,92 @@ COMPILED: dict[str, Case] = {
     "ProcessXor of bytes in elements": case(
         "a" / Array(2, FixedSized(2, ProcessXor(b"\1\2", GreedyBytes))), frames="01020304"
     ),
+    "If in elements": case(
+        "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Int8ub))),
+        "b" / Int8ub,
+        frames="00010203 000001 01020304ff",
+    ),
+    "counts in elements": case(
+        "n" / Int8ub,
+        "r" / Array(this.n, Struct("n" / Int8ub, "v" / Array(this.n, Int16ub))),
+        "b" / Int8ub,
+        frames="02000100020a 0003 0102000100020b",
+    ),
+    "Switch in elements": case(
+        "r" / Array(2, Struct("k" / Int8ub, "v" / Switch(this.k, {1: TWO, 2: Int8ub}))),
+        frames="0101020201 0000",
+    ),
+    "texts in elements of an array": case(
+        "r" / Array(2, Struct("t" / PascalString(Int8ub, "ascii"), "k" / Int8ub)),
+        frames="0161010001 0000026162ff",
+    ),
+    "elements of elements that differ": case(
+        "r"
+        / Array(
+            2,
+            Struct(
+                "n" / Int8ub,
+                "s" / Array(this.n, Struct("k" / Int8ub, "v" / If(this.k > 1, Int16ub))),
+                "z" / Int8ub,
+            ),
+        ),
+        frames="020102000301000a 00010002",
+    ),
+    "elements that ask the frame": case(
+        "n" / Int8ub,
+        "r" / Array(2, Struct("k" / Int8ub, "v" / Bytes(this.k * this._.n))),
+        frames="0201616200 00ff02",
+    ),
+    "scales in elements": case(
+        "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Scaled(Int8ub, 0.5, "m")))),
+        frames="000101 01050101",
+    ),
+    "elements under a condition": case(
+        "k" / Int8ub,
+        "r" / If(this.k, Array(2, Struct("n" / Int8ub, "v" / Bytes(this.n)))),
+        "b" / Int8ub,
+        frames="0001 0101610007",
+    ),
+    "PrefixedArray of elements that differ": case(
+        "r" / PrefixedArray(Int8ub, Struct("n" / Int8ub, "v" / Bytes(this.n))),
+        "b" / Int8ub,
+        frames="020161000a 0001",
+    ),
+    "GreedyRange of elements that differ": case(
+        "r" / Prefixed(Int8ub, GreedyRange(Struct("n" / Int8ub, "v" / Bytes(this.n)))),
+        "b" / Int8ub,
+        frames="030161000a 0001 020000ff",
+    ),
+    "Checksummed in an array": case(
+        "r" / Array(2, Checksummed(TWO, field="y", algorithm=Sum())), frames="01010202"
+    ),
+    "Checksummed in elements that differ": case(
+        "r"
+        / Array(
+            2,
+            Checksummed(
+                Struct("n" / Int8ub, "v" / Bytes(this.n), "s" / Int8ub), field="s", algorithm=Sum()
+            ),
+        ),
+        frames="0161620000 00000000 0000010203",
+    ),
+    "RepeatUntil of structs": case(
+        "a" / RepeatUntil(lambda one, found, context: one.x == 0, TWO),
+        "b" / Int8ub,
+        frames="0102000304 000405",
+    ),
+    "RepeatUntil by an expression": case(
+        "k" / Int8ub,
+        "a" / RepeatUntil(obj_.n == 0, Struct("n" / Int8ub, "v" / Bytes(this.n))),
+        "b" / Int8ub,
+        frames="0501610262630009 050009",
+    ),
+    "RepeatUntil by this": case("a" / RepeatUntil(this.x >= 3, TWO), frames="010200030304 0300"),
+    "RepeatUntil by the frame": case(
+        "k" / Int8ub,
+        "a" / RepeatUntil(lambda one, found, context: one.x == context.k, TWO),
+        frames="030102000303ff",
+    ),
     "NamedTuple of a struct": case("a" / NamedTuple("P", "x y", TWO), frames="0102"),
     "NamedTuple of an array": case("a" / NamedTuple("P", "x y", Int8ub[2]), frames="0102"),
     "a Check without a name": case("a" / Int8ub, Check(this.a < 3), frames="01"),
@@ -388,28 +475,18 @@ PLAIN: dict[str, Case] = {
         "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
     ),
     "LazyBound of itself": case("a" / NODE, frames="00 020100", reason="contains itself"),
-    "If in elements": case(
-        "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Int8ub))),
-        frames="000102 0000",
-        reason="Parts(struct, count) supports this",
-    ),
-    "counts in elements": case(
-        "r" / Array(2, Struct("n" / Int8ub, "v" / Array(this.n, Int8ub))),
-        frames="000102 0000",
-        reason="Parts(struct, count) supports this",
-    ),
-    "Checksummed in an array": case(
-        "r" / Array(2, Checksummed(TWO, field="y", algorithm=Sum())),
-        frames="01010202",
-        reason="a checksum inside an array",
-    ),
     "RepeatUntil": case(
         "a" / RepeatUntil(obj_ == 0, Int8ub), "b" / Int8ub, frames="01020003 0003", reason="Parts"
     ),
-    "RepeatUntil of structs": case(
-        "a" / RepeatUntil(lambda one, found, context: one.x == 0, TWO),
-        frames="01020003 0004",
+    "RepeatUntil by the elements before": case(
+        "a" / RepeatUntil(lambda one, found, context: len(found) == 2, TWO),
+        frames="01020003",
         reason="Parts",
+    ),
+    "If in elements of elements": case(
+        "r" / Array(2, Array(1, Struct("k" / Int8ub, "v" / If(this.k, Int8ub)))),
+        frames="000102 0000",
+        reason="Parts(struct, count) supports this",
     ),
     "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
     "GreedyBytes": case("a" / GreedyBytes, frames="616263 61", reason="rest", is_rest=True),

@@ -205,6 +205,12 @@ MEASURED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
         f"02{POINTS} ee",
         dict(v_count=2, v_padding=b"\xee"),
     ),
+    "in elements that differ": (
+        ["v" / Array(2, Struct("x" / Prefixed(Int8ub, GreedyBytes)))],
+        dict(v=[dict(x=b"a"), dict(x=b"")]),
+        "0161 00",
+        {},
+    ),
 }
 INTERPRETED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = {
     "of a text": (
@@ -218,12 +224,6 @@ INTERPRETED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = 
         dict(v=bytes(130)),
         "8201" + "00" * 130,
         dict(v_size=130),
-    ),
-    "in elements that differ": (
-        ["v" / Array(2, Struct("x" / Prefixed(Int8ub, GreedyBytes)))],
-        dict(v=[dict(x=b"a"), dict(x=b"")]),
-        "0161 00",
-        {},
     ),
 }
 ALL = {**MEASURED, **INTERPRETED}

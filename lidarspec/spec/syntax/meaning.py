@@ -14,7 +14,7 @@ import functools
 import operator
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -206,7 +206,12 @@ class _Builder:
             inside = place.with_changes(axes=(*info.axes, axis), default=None)
             if inside.offset is not None:
                 inside = replace(inside, offset=_return_no_offset)
-            return tree.Repeat(name, axis, count, self.node(inner.subcon, inside), info.default)
+            element = self.node(inner.subcon, inside)
+            if _differ_in_layout(element, axis):
+                sequence = self._make_sequence(inner.subcon, element, place, count=count)
+                if sequence is not None:
+                    return sequence
+            return tree.Repeat(name, axis, count, element, info.default)
         if isinstance(inner, Partition):
             return self._parts(inner, place)
         if isinstance(inner, construct.IfThenElse):
@@ -552,10 +557,10 @@ class _Builder:
     def _fill_with_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return the node for the elements that fill a part.
+        """Return the node for the elements that fill a part, or end with a certain element.
 
-        The node is an array if all elements have the same fixed size. Otherwise only construct can
-        read it.
+        The node is an array if all elements have the same fixed size, or else a sequence of parts.
+        If neither is possible, only construct can read it.
         """
         axis = axis_path(place.info)
         element = self.node(
@@ -568,6 +573,12 @@ class _Builder:
         )
         size = tree.size(element)
         kind = author_class(con)
+        if isinstance(con, construct.RepeatUntil) or not isinstance(size, int):
+            until = getattr(con, "predicate", None)
+            within = place.room if until is None else None
+            sequence = self._make_sequence(con.subcon, element, place, within=within, until=until)
+            if sequence is not None:
+                return sequence
         if isinstance(con, construct.RepeatUntil) or place.room is None:
             return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
@@ -617,10 +628,68 @@ class _Builder:
             place.name, axis, tuple(kinds), count, size, within, tuple(outer), total
         )
 
+    def _make_sequence(
+        self,
+        con: Construct,
+        element: tree.Node,
+        place: _Context,
+        *,
+        count: tree.Formula | None = None,
+        within: tree.Formula | None = None,
+        until: Any = None,
+    ) -> tree.PartSequence | None:
+        """Return the elements of an array as a sequence of parts.
+
+        Returns None if an element is not a struct, is in another array, or cannot be compiled.
+
+        Args:
+            con: the element.
+            element: the node of the element.
+            until: the predicate of construct's RepeatUntil, or None.
+        """
+        info = place.info
+        is_struct = isinstance(element, tree.Struct | tree.Sealed)
+        rules = [rule for rule in (count, within, until) if rule is not None]
+        if not is_struct or not place.name or info.axes or place.scope is None or len(rules) != 1:
+            return None
+        try:
+            root, rule = self._make_part_frame(
+                con, until and functools.partial(_ask_predicate, until), place
+            )
+        except SpecError:  # a length of a part outside of the element
+            return None
+        ends = None if rule is None else tree.Op("!=", (rule, 0))
+        asked = [ref for formula in _iter_formulas(root, ends) for ref in tree.refs(formula)]
+        outer = [tree.Ref(ref.path[2:], ref.info) for ref in asked if ref.path.startswith("_.")]
+        is_traced = not any(
+            isinstance(part, tree.Untraced)
+            for formula in _iter_formulas(root, ends)
+            for part in tree.parts(formula)
+        )
+        is_plain = any(isinstance(node, tree.Opaque) for node in tree.nodes(root))
+        is_known = all(ref.info.kind == "int" and not ref.info.axes for ref in outer)
+        if is_plain or not is_traced or not is_known:
+            return None
+        axis = axis_path(info)
+        total = _describe_integer(
+            tree.FieldInfo(f"{info.path}.size", info.axes, docs="bytes of all elements")
+        )
+        return tree.PartSequence(
+            place.name,
+            axis,
+            (tree.Kind("", element, root, None, ends),),
+            count,
+            None,
+            within,
+            tuple(dict.fromkeys(outer)),
+            total,
+            is_array=True,
+        )
+
     def _make_part_frame(
         self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
-        """Return a part as a frame of its own, and the size of the part after it."""
+        """Return a part as a frame of its own, and the value of an expression of its fields."""
 
         def around(builder: _Builder) -> _Context:
             assert place.scope is not None
@@ -833,6 +902,40 @@ def _is_whole(formula: tree.Formula) -> bool:
         return True
     divisor = formula.args[1]
     return isinstance(divisor, int | float) and divisor > 0
+
+
+def _differ_in_layout(element: tree.Node, axis: str) -> bool:
+    """Return whether the elements of an array have checksums, or different layouts."""
+    return any(
+        isinstance(node, tree.Sealed)
+        or any(
+            axis in ref.info.axes for formula in tree.formulas(node) for ref in tree.refs(formula)
+        )
+        for node in tree.nodes(element)
+    )
+
+
+def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tree.Formula]:
+    """Yield the formulas of all nodes and fields of a frame, and others that are not None."""
+    for node in tree.nodes(root):
+        yield from tree.formulas(node)
+        for info in tree.infos(node):
+            for formula in (info.rebuilt, info.default):
+                if isinstance(formula, tree.Ref | tree.Op | tree.Untraced):
+                    yield formula
+    yield from (formula for formula in others if formula is not None)
+
+
+def _ask_predicate(predicate: Any, scope: tree.Scope) -> Any:
+    """Return the value of the predicate of a RepeatUntil for an element.
+
+    The list of the earlier elements is not available.
+    """
+    if isinstance(predicate, ExprMixin):
+        return _trace(predicate, scope)
+    if callable(predicate):
+        return predicate(scope, None, scope.parent)
+    return predicate
 
 
 def _return_no_offset() -> None:
