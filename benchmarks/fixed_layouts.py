@@ -79,7 +79,7 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "rad",
         -compact.ZERO_AZIMUTH_STEPS * compact.AZIMUTH_STEP_RAD,
     )
-    beam = Struct("echoes" / Array(echoes, echo), "property" / Int8ul, azimuth)
+    beam = Struct("echoes" / Array(echoes, echo), "property" / compact.PROPERTY, azimuth)
     struct = Struct(
         compact.MAGIC,
         "command" / Const(1, Int32ul),

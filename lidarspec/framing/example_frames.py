@@ -266,9 +266,9 @@ def _remove_lengths(values: Any, root: Node) -> Any:
         count = None if node.is_array else node.count
         rules = (count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
-        for kind, part in (
-            (kind, part) for part in get_member(values, node.axis, []) for kind in node.kinds
-        ):
+        # A condition or a case may leave out all parts.
+        parts = get_member(values, node.axis, None) or []
+        for kind, part in ((kind, part) for part in parts for kind in node.kinds):
             own = () if kind.following is None else refs(kind.following)[:1]
             for path in (ref.path for ref in own):
                 _remove_field(part, path)

@@ -7,7 +7,7 @@ from construct import Const, Enum, If, Int8ul, Struct, this
 from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sensor
 
-ACK = Struct(
+STATE = Struct(
     "header" / Const(b"\x17\x71\x44\x99"),
     "mode" / Enum(Int8ul, idle=1, fast=3),
     "speed" / If(this.mode == 3, Int8ul),
@@ -16,5 +16,5 @@ ACK = Struct(
 
 @hookimpl
 def lidarspec_sensors():
-    frames = {**sensor().frames, "ack": Frame(ACK, max_length=6)}
+    frames = {**sensor().frames, "state": Frame(STATE, max_length=6)}
     return [sensor(frames=frames)]

@@ -33,7 +33,7 @@ SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 SPOKEN = [name for name in SHAPED if name != "shape-text" and not is_recoded(SHAPES[name])]
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "spec-json.md"
 #: keys below which names stand that each spec chooses.
-NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels"}
+NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels", "names"}
 
 
 def list_exportable() -> list[Sensor]:
