@@ -42,6 +42,8 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             for part in node.parts:
                 if len(part.indices) > 1:
                     raise NotCompilableError(part.info.path, "an array of arrays of bits")
+        case tree.When() | tree.Select():
+            _check_alternatives(node)
     for formula in tree.formulas(node):
         _check_traced(formula)
         for ref in tree.refs(formula):
@@ -59,6 +61,39 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
         else:
             below = path
         _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
+
+
+def _check_alternatives(node: tree.When | tree.Select) -> None:
+    """Raise `NotCompilableError` if an array of parts has the name of something else.
+
+    `build` takes the parts of an array before it knows which alternative the frame has.
+    """
+    alternatives = tree.children(node)
+    for alternative in alternatives:
+        others = [other for other in alternatives if other is not alternative]
+        is_only_one = all(isinstance(other, tree.Empty) for other in others)
+        names = {path for other in others for path in _list_names(other)}
+        for part in tree.nodes(alternative):
+            if not isinstance(part, tree.PartSequence) or not part.is_array:
+                continue
+            is_direct = part is alternative
+            if part.axis in names or (is_direct and not is_only_one):
+                raise NotCompilableError(
+                    part.axis, "an array of parts, where another case has something else"
+                )
+
+
+def _list_names(node: tree.Node) -> set[str]:
+    """Return the paths of all fields and arrays of a node, and the paths that contain them."""
+    paths = {info.path for part in tree.nodes(node) for info in tree.infos(part)}
+    paths |= {
+        part.axis for part in tree.nodes(node) if isinstance(part, tree.Repeat | tree.PartSequence)
+    }
+    names = set[str]()
+    for path in paths:
+        steps = path.split(".")
+        names |= {".".join(steps[:count]) for count in range(1, len(steps) + 1)}
+    return names
 
 
 def _check_traced(formula: object) -> None:

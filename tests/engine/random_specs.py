@@ -192,8 +192,8 @@ class Drawn:
         return self.source.choice(
             (
                 "NullTerminated(GreedyBytes)",
-                "Prefixed(Int8ub, GreedyBytes)",
-                "FixedSized(3, GreedyBytes)",
+                "NullTerminated(GreedyBytes, term=b'\\x07')",
+                "Array(2, NullTerminated(GreedyBytes))",
             )
         )
 

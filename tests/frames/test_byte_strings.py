@@ -98,6 +98,13 @@ INTERPRETED: dict[str, Any] = {
     "terminated": TEXT,
     "terminated ones": Array(this.k, TEXT),
     "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
+    "parts where another case has an array": Switch(
+        this.k,
+        {
+            1: Array(2, Struct("n" / Int8ub, "x" / Bytes(this.n % 3))),
+            2: Array(3, Struct("n" / Int8ub, "x" / Bytes(1))),
+        },
+    ),
     "the length of an array": Struct(
         "a" / Array(this._.k, Struct("b" / Int8ub)), "c" / Array(len_(this.a), Int8ub)
     ),
