@@ -515,7 +515,7 @@ class ParsedTable:
         try:
             for index, value in enumerate(values):
                 _copy_value(column, index, value)
-        except (IndexError, TypeError, ValueError):
+        except (IndexError, OverflowError, TypeError, ValueError):
             if info.dtype is None:
                 return _make_object_column(values)
             raise SpecError(

@@ -190,11 +190,7 @@ class Drawn:
 
     def text(self, depth: int) -> str:
         return self.source.choice(
-            (
-                "NullTerminated(GreedyBytes)",
-                "NullTerminated(GreedyBytes, term=b'\\x07')",
-                "Array(2, NullTerminated(GreedyBytes))",
-            )
+            ("NullTerminated(GreedyBytes)", "NullTerminated(GreedyBytes, term=b'\\x07')")
         )
 
     def draw_computed(self, depth: int) -> str:
