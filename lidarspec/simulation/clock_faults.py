@@ -12,7 +12,7 @@ texts are supported:
 | `pps@10s` | it counts a pulse twice: one second ahead |
 | `leap@10s` | it repeats a second, as UTC does in a leap second |
 | `unlock=5s@10s` | its status is "not locked" for 5 s; without a duration, for ever |
-| `restart@10s` | it starts again as after power-on, not locked |
+| `restart@10s` | it starts again as after power-on, without a date and not locked |
 """
 
 from __future__ import annotations
@@ -171,13 +171,13 @@ class ClockTimeline:
         """Whether the clock has no faults and has not jumped."""
         return not self.faults and not self.jump_ns
 
-    def shift(self, readings: Times, times: Times, first_reading: int) -> Times:
+    def shift(self, readings: Times, times: Times, power_on_reading: int) -> Times:
         """Return the readings of the clock with the faults, (n,) ns, not wrapped.
 
         Args:
             readings: the readings without faults, (n,) ns.
             times: the time of each reading since power-on, (n,) ns.
-            first_reading: the reading at power-on without faults, ns.
+            power_on_reading: the reading after a restart, ns.
         """
         faults = self.faults
         shifted: Times = readings
@@ -188,7 +188,7 @@ class ClockTimeline:
             restart_ns = round(restart * SECOND_NS)
             has_restarted = times >= restart_ns
             start[has_restarted] = restart_ns
-            shifted = np.where(has_restarted, first_reading + times - restart_ns, shifted)
+            shifted = np.where(has_restarted, power_on_reading + times - restart_ns, shifted)
         drifted = np.rint(faults.drift_ppm * 1e-6 * (times - start)).astype(np.int64)
         shifted = shifted + drifted + self.jump_ns
         for step_s, size in faults.steps:

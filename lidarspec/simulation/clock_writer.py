@@ -52,6 +52,10 @@ MAX_STATUS_FIELDS = 2
 #: Time difference that is added in order to test whether a clock can be written, ns. It is larger
 #: than a second.
 TEST_SHIFT_NS = 1_500_000_000
+#: The date that a sensor counts from after power-on without a source of time, if it sends year,
+#: month and day: 2000-01-01, ns since 1970 (user manuals of the Hesai Pandar64 and PandarXT,
+#: appendix B, "virtual UTC").
+POWER_ON_DATE_NS = 946_684_800 * 10**9
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,21 @@ class ClockWriter:
     def read(self, table: CompiledTable) -> Times:
         """Return the readings of the clock, (n,) ns."""
         return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_)))
+
+    def find_power_on_reading(self, frame: CompiledTable) -> int:
+        """Return the reading after power-on without a source of time, ns.
+
+        It is 2000-01-01 if the frames have a year, a month and a day. The other clocks begin with
+        their lowest reading.
+
+        Args:
+            frame: a table of one frame, whose fields of the clock are overwritten.
+        """
+        if self._date is not None:
+            return POWER_ON_DATE_NS
+        for field in self._fields:
+            write_raw(frame, field.path, np.array(0))
+        return int(self.read(frame).item())
 
     def write(self, table: CompiledTable, readings: Times) -> None:
         """Write readings, (n,) ns, into the frames; wrap them if the clock wraps."""
@@ -302,7 +321,11 @@ class FrameClock:
                     raise
         self.has_clock = self._writer is not None
         if self._writer is not None:
-            self._first_reading = self._writer.read(self._first).item()
+            self._power_on_reading = self._writer.read(self._first).item()
+            if self._power_on_reading >= FIRST_DATE_NS:
+                # The simulated sensor begins at a date as if it were set. A restart loses it.
+                first = _copy_first(self._first)
+                self._power_on_reading = self._writer.find_power_on_reading(first)
 
     @cached_property
     def _status(self) -> StatusWriter | None:
@@ -355,7 +378,7 @@ class FrameClock:
         if timeline.is_perfect:
             return
         if self._writer is not None:
-            readings = timeline.shift(self._writer.read(table), times, self._first_reading)
+            readings = timeline.shift(self._writer.read(table), times, self._power_on_reading)
             self._writer.write(table, readings)
             if timeline.faults.follows:
                 self._write_dates(table, readings)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec import Sensor, UsageError, simulate
+from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.simulation.clock_faults import ClockFaults, parse_clock_faults
 from lidarspec.simulation.device import SECOND, SimulatedDevice
@@ -26,6 +27,7 @@ from lidarspec.spec import (
     Simulation,
     unix_time,
 )
+from lidarspec.spec.timing import DATED_EPOCHS
 from tests.shapes import SHAPES
 from tests.shapes.synced import FREE, HOLDOVER, LOCKED, PERIOD_NS, STATES
 
@@ -127,6 +129,53 @@ def test_faults_change_the_times_from_their_beginning_on() -> None:
     shape = replace(SYNCED, simulation=Simulation(sweep_from_ten_seconds))
     for text, offsets in expected.items():
         np.testing.assert_allclose(find_offsets(shape, text), offsets, atol=2e-9, err_msg=text)
+
+
+EPOCH_2024_NS = 1_704_067_200 * SECOND
+
+
+def sweep_from_2024(i: int) -> dict[str, Any]:
+    assert SYNCED.simulation.sweep is not None
+    return {**SYNCED.simulation.sweep(i), "time": i * PERIOD_NS + EPOCH_2024_NS}
+
+
+@pytest.mark.parametrize("epoch", ["utc", "tai", "gps", "boot", "hour", ""])
+def test_a_restarted_clock_begins_without_its_date(epoch: str) -> None:
+    wraps_at = 3600 if epoch == "hour" else None
+    simulation = Simulation(sweep_from_2024 if epoch in DATED_EPOCHS else SYNCED.simulation.sweep)
+    sensor = replace(SYNCED, clock=Clock("time", wraps_at, epoch=epoch), simulation=simulation)
+    times = read_times(sensor, "restart@0.5s")
+    np.testing.assert_array_equal(times[:250], read_times(sensor, None)[:250])
+    np.testing.assert_array_equal(times[250:], np.arange(250) * PERIOD_NS)
+
+
+def test_a_restarted_clock_with_a_calendar_begins_in_2000() -> None:
+    packets = make_dated().decode(
+        simulate(make_dated(), PACKETS, clock=parse_clock_faults("restart@0.5s"))
+    )
+    date = [packets[name].tolist()[250] for name in ("year", "month", "day", "hour", "minute")]
+    assert date == [100, 1, 1, 0, 0]
+    np.testing.assert_array_equal(
+        packets.time_ns[250:], 946_684_800 * SECOND + np.arange(250) * PERIOD_NS
+    )
+
+
+@pytest.mark.parametrize(
+    "name", ["hesai-xt32", "seyond-falcon", "robosense-rs16", "sick-microscan3"]
+)
+def test_a_restart_of_a_sensor_is_named(name: str) -> None:
+    """It is neither a step of the clock nor a wrong date."""
+    sensor = ls.sensor(name)
+    sent_ns = read_times(sensor, None, 4000)
+    sent_ns -= sent_ns[0]
+    half_s = sent_ns[-1] / 2e9
+    packets = sensor.decode(simulate(sensor, 4000, clock=parse_clock_faults(f"restart@{half_s}s")))
+    packets.host_ns = 1_785_283_200 * SECOND + sent_ns
+    monitor = ClockMonitor(sensor)
+    monitor.add(packets)
+    report = monitor.report()
+    assert [event.code for event in report.events if event.code != "lock_lost"] == ["restart"]
+    assert not {"jump", "wrong_date"} & {finding.code for finding in report.findings}
 
 
 def sweep_from_ten_seconds(i: int) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def rotation_values(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -
         microseconds=round(1e6 * (i + 1) * blocks / (per_turn * rate_hz))
     )
     date = {
-        "year": now.year - 2000,
+        "year": now.year - 1900,
         **{name: getattr(now, name) for name in ("month", "day", "hour", "minute", "second")},
     }
     return {
