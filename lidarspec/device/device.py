@@ -126,13 +126,18 @@ class Device(ClosingContext):
 
         Examples are a truncated file, silence, a baud rate that is probably wrong, a small receive
         buffer, frames of another sensor, unknown codes, scans without an end, times without a date,
-        a nominal calibration, changes of the source of UTC, and errors of the plugin.
+        lost returns, a nominal calibration, changes of the source of UTC, and errors of the plugin.
         """
         stats = self.stats
         warnings = [*self._input.warnings, *self._check_first_frames()]
         for text in (stats.unended, stats.undated, stats.masked):
             if text:
                 warnings.append(f"{self.source}: {text}")
+        if stats.incomplete_returns:
+            warnings.append(
+                f"{self.source}: some firings lack a return, because packets were lost"
+                " (stats counts incomplete_returns)"
+            )
         if stats.nominal:
             warnings.append(_describe_nominal(self.sensor))
         if self._selector is not None:

@@ -94,6 +94,7 @@ class SensorContent:
             sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
+        incomplete_returns: number of groups of packets in that part in which a return is lost.
         verb: the verb of the command line that shows the data.
         info: the facts that the sensor reports about itself in that part, by name.
         clock: the sensor's clock in that part, in words; "" if it sends no time.
@@ -104,6 +105,7 @@ class SensorContent:
     share: float | None = None
     options: str = ""
     reading: MeterReading | None = None
+    incomplete_returns: int = 0
     verb: str = "view"
     info: Mapping[str, str] = field(default_factory=dict)
     clock: str = ""
@@ -328,7 +330,7 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 
 
 def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
-    """Return `reading`, `info` and `clock` of the beginning of a file.
+    """Return `reading`, `incomplete_returns`, `info` and `clock` of the beginning of a file.
 
     Returns an empty dict if the frames cannot be decoded.
     """
@@ -342,6 +344,7 @@ def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
                 clock = describe_clock(live.clock.report())
             return {
                 "reading": live.meter.summary(device.stats),
+                "incomplete_returns": device.stats.incomplete_returns,
                 "info": device.info,
                 "clock": clock,
             }
@@ -444,6 +447,12 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
             lost = f", lost {reading.loss_rate:.3%}"
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
+    if content.incomplete_returns:
+        yield (
+            "returns",
+            f"incomplete in {content.incomplete_returns} groups of packets, because packets were"
+            " lost",
+        )
     if content.clock:
         yield "clock", printable(content.clock)
     for name, text in content.info.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from lidarspec import Selection, SpecError, UsageError
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.firings import MISSING, choose_returns, group_firings
+from lidarspec.transports.protocol import Chunk
 from tests.shapes import SHAPES
 from tests.shapes.pairs import CHANNELS, DUAL_MODE, FIRINGS, LAST_NUMBER
 
@@ -74,6 +76,19 @@ def test_a_lost_half_is_missing_and_counted() -> None:
     assert returns["valid"][2, ..., 0].all()
     assert np.isnan(returns["range"][4, ..., 0]).all()
     assert (packets.stats.lost, packets.stats.incomplete_returns) == (4, 2)
+
+
+@pytest.mark.parametrize("lost", [(), (5, 8, 12, 13)])
+def test_lost_halves_are_one_warning(lost: tuple[int, ...], tmp_path: Path) -> None:
+    path = tmp_path / "pairs.lsr"
+    with ls.Recorder(path, PAIRS) as recorder:
+        for index in range(40):
+            if index not in lost:
+                recorder.write(Chunk(make_packet(index), 10**18 + index * 10**7))
+    with ls.open(path, PAIRS) as device:
+        list(device.packets())
+        found = [text for text in device.warnings if "incomplete_returns" in text]
+    assert len(found) == bool(lost)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])

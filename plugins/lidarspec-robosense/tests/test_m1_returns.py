@@ -83,6 +83,21 @@ def test_a_lost_half_is_counted(packets: list[bytes]) -> None:
     assert np.flatnonzero(decoded.returns()["missing"].any(axis=(1, 2, 3))).tolist() == [20]
 
 
+def test_lost_halves_are_in_the_contents_of_a_file(packets: list[bytes], tmp_path: Path) -> None:
+    for name, sent, count in (
+        ("whole.hex", packets[:40], 0),
+        ("lossy.hex", packets[:9] + packets[10:20] + packets[21:40], 2),
+    ):
+        path = tmp_path / name
+        path.write_text("\n\n".join(packet.hex() for packet in sent))
+        command = [sys.executable, "-m", "lidarspec", "info", str(path)]
+        text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        line = f"returns incomplete in {count} groups of packets, because packets were lost"
+        assert (line in " ".join(text.split())) == (count > 0)
+        text = subprocess.run([*command, "--json"], check=True, capture_output=True, text=True)
+        assert json.loads(text.stdout)["contents"][0]["incomplete_returns"] == count
+
+
 @pytest.mark.parametrize(("which", "metres"), [("first", NEAR_M), ("last", FAR_M)])
 def test_a_frame_has_one_point_of_each_firing(
     packets: list[bytes], which: str, metres: float

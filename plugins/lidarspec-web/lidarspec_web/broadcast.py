@@ -388,6 +388,7 @@ class Broadcast:
             **reading.to_dict(),
             "clock_offset_s": self._find_clock_offset(clock),
             "lost": stats.lost,
+            "incomplete_returns": stats.incomplete_returns,
             "disconnects": stats.disconnects,
             "latency_s": latency_s,
         }

@@ -327,6 +327,25 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
         assert not visit.errors
 
 
+def test_lost_halves_of_dual_returns_are_a_figure(browser: Any, tmp_path: Path) -> None:
+    sensor = ls.sensor("robosense-m1")
+    packet = sensor.parse(sensor.example("data"))
+    numbers = [number for number in range(1, 1261) if number % 100]  # 12 second halves are lost
+    path = tmp_path / "dual.hex"
+    frames = [
+        sensor.build("data", packet, pkt_psn=number, wave_mode=0, microseconds=number * 79)
+        for number in numbers
+    ]
+    path.write_text("\n\n".join(frame.hex() for frame in frames))
+    with serve(str(path), "-s", sensor.id) as link:
+        visit = Visit(browser, link)
+        visit.until(
+            lambda: "Incomplete returns" in visit.page.content(), "the figure is not on the page"
+        )
+        visit.context.close()
+        assert not visit.errors
+
+
 def test_a_page_reports_a_restarted_server(browser: Any) -> None:
     """The new server has a new token: its printed link shows the page."""
     with socket.create_server(("127.0.0.1", 0)) as free:

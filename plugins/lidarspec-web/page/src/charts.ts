@@ -46,6 +46,7 @@ const FIGURES: [string, (figures: Figures) => string | null][] = [
   ["Valid points", ({ points, valid }) => (!points || valid == null ? null : `${((100 * valid) / points).toFixed(1)} %`)],
   ["Bytes skipped", ({ skipped_rate }) => (skipped_rate == null ? null : `${(100 * skipped_rate).toFixed(2)} %`)],
   ["Packets lost", ({ lost }) => (lost == null ? null : whole.format(lost))],
+  ["Incomplete returns", ({ incomplete_returns: groups }) => (groups ? whole.format(groups) : null)],
   ["Longest gap", ({ longest_gap_s: gap }) => (gap == null ? null : `${(1e3 * gap).toFixed(1)} ms`)],
   ["Disconnects", ({ disconnects }) => (disconnects ? whole.format(disconnects) : null)],
 ];
