@@ -17,7 +17,7 @@ from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Checksum, Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Filled
 from lidarspec.spec.links import Link, Udp
-from lidarspec.spec.timing import ClockStatus, Split
+from lidarspec.spec.timing import ClockStatus, PacketCounter, Split
 from lidarspec.spec.wire_forms import WireForm
 
 #: Version of the format. A version that removes a key, or changes its meaning, has a new number.
@@ -39,7 +39,6 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
     Raises:
         ExportError: if a frame contains Python code that data cannot represent.
     """
-    sequence = sensor.sequence
     return {
         "lidarspec": VERSION,
         **facts(
@@ -52,15 +51,12 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
             "source",
             "range_limits",
             "vendor_axes",
+            "returns",
         ),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
         "scan": _scan(sensor.scan),
         "clock": _clock(sensor),
-        "sequence": (
-            sequence
-            and facts(sequence, "field", "first")
-            | {"last": None if callable(sequence.last) else sequence.last}
-        ),
+        "sequence": _sequence(sensor.sequence),
         "fillers": sensor.fillers.hex(),
         "frames": {message.name: _frame(message) for message in messages(sensor, on_wire=False)},
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
@@ -73,6 +69,14 @@ def _scan(rule: Split | None) -> dict[str, Any] | None:
     if rule is None:
         return None
     return {"rule": type(rule).__name__, **dataclasses.asdict(rule)}
+
+
+def _sequence(counter: PacketCounter | None) -> dict[str, Any] | None:
+    """Return the counter of packets; values that functions calculate are null."""
+    if counter is None:
+        return None
+    data = facts(counter, "field", "first", "last", "returns")
+    return {name: None if callable(value) else value for name, value in data.items()}
 
 
 def facts(value: object, *names: str) -> dict[str, Any]:

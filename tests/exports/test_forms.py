@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,7 +22,7 @@ from lidarspec.exports import EXPORTS, ExportError, UnknownExport, export, selec
 from lidarspec.exports.diagram import BIT_WIDTH_PX, LEFT_MARGIN_PX, ROW_BITS
 from lidarspec.exports.json import node_data
 from lidarspec.frames.schema import make_schema
-from lidarspec.spec import Checksummed, Command, Frame, WordXor, ZeroPadded
+from lidarspec.spec import Checksummed, Command, Frame, PacketCounter, WordXor, ZeroPadded
 from tests.broken import sound
 from tests.cli.running import ran
 from tests.exports.json_decoder import Decoder
@@ -128,6 +129,16 @@ def assert_keys_are_documented(sensors: list[Sensor]) -> None:
     page = PAGE.read_text(encoding="utf-8")
     used = {key for sensor in sensors for key in keys(json.loads(export(sensor, "json")))}
     assert used - set(re.findall(r"`(\w+)`", page)) == set()
+
+
+def test_json_has_the_returns_of_a_sensor_and_of_its_counter() -> None:
+    pairs = SHAPES["shape-pairs"]
+    spec = json.loads(export(pairs, "json"))
+    assert spec["returns"] == ["first", "last"]
+    assert spec["sequence"] == {"field": "number", "first": 1, "last": 40, "returns": None}
+    twos = replace(pairs, sequence=PacketCounter("number", returns=2))
+    assert json.loads(export(twos, "json"))["sequence"]["returns"] == 2
+    assert json.loads(export(SHAPES["shape-synced"], "json"))["returns"] == []
 
 
 @pytest.mark.parametrize("name", SPOKEN)
