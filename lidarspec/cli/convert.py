@@ -32,11 +32,20 @@ from lidarspec.cli.terminal import note
 from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import make_recorder
-from lidarspec.errors import UnknownFrame, UsageError, WireError, WriteError, suggest, suggestion
+from lidarspec.errors import (
+    PluginError,
+    SpecError,
+    UnknownFrame,
+    UsageError,
+    WireError,
+    WriteError,
+    suggest,
+    suggestion,
+)
 from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
 from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
-from lidarspec.packets.imu import join_samples
+from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
@@ -239,9 +248,7 @@ def convert(
             frames = _choose_frames(device, target, frame)
             summary = _write_frames(device, target, frames, selection, count)
         elif is_imu:
-            if selection.time != "sensor":
-                raise UsageError("--imu writes the times of the sensor: omit --time")
-            summary = _write_imu(device, target, count)
+            summary = _write_imu(device, target, selection, count)
         else:
             summary = _write_points(
                 device,
@@ -259,14 +266,35 @@ def convert(
         conclude(device)
 
 
-def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
+def _write_imu(
+    device: Device, target: str, selection: Selection, count: int | None
+) -> dict[str, Any]:
     """Write IMU samples; return the entries of the summary."""
-    samples = join_samples(list(device.imu()))[:count]
+    samples = join_samples(list(_iter_imu(device, selection)))[:count]
     if not len(samples):
         raise _no_data_error(device, target)
     write_imu(target, samples)
     note(f"{target}: {len(samples)} IMU samples of {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
+
+
+def _iter_imu(device: Device, selection: Selection) -> Iterator[ImuSamples]:
+    """Yield the IMU samples of the selected packets, with times by the selected clock.
+
+    Errors of a plugin are counted.
+
+    Raises:
+        UsageError: if no frame of the sensor has IMU samples, or if a required time is unknown.
+    """
+    device.sensor.require_imu()
+    for selected in _select_frames(device, device.sensor.imu_frames, selection, None):
+        for packets in selected.values():
+            try:
+                samples = packets.imu()
+            except SpecError as error:
+                packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
+                continue
+            yield samples if device.mount is None else samples.turn(device.mount.rotation)
 
 
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:

@@ -300,8 +300,7 @@ class Device(ClosingContext):
             UsageError: if no frame of the sensor has IMU samples.
             SourceError: if a file has already been read to its end.
         """
-        if not self.sensor.imu_frames:
-            raise UsageError(f"{self.sensor.id}: no frame type contains IMU samples")
+        self.sensor.require_imu()
         reader = self._get_reader(None)
         ahead = self._take_batch_of_latest()
         yield_timer = _YieldTimer(wait)

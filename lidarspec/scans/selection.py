@@ -247,9 +247,12 @@ class PacketTimes:
         """Return the times of the next packets, (n,) ns.
 
         Raises:
-            UsageError: if their UTC is unknown.
+            UsageError: if their UTC or their arrival times are unknown.
         """
         if self._time == "host":
+            if len(packets) and not packets.host_ns.any():
+                error = UsageError(f"{self._source} has no arrival times")
+                raise suggest(error, "repeat with --time sensor")
             return packets.host_ns
         if self._time == "sensor":
             return packets.time_ns

@@ -164,6 +164,11 @@ class SensorDescription:
                 f" {', '.join(self.incoming) or 'none'}"
             )
 
+    def require_imu(self) -> None:
+        """Raise UsageError for a sensor without IMU samples."""
+        if not self.imu_frames:
+            raise UsageError(f"{self.id}: no frame type contains IMU samples")
+
     @cached_property
     def main_frames(self) -> tuple[str, ...]:
         """The names of the data frames, or of all incoming frames if the sensor has no points."""

@@ -23,6 +23,7 @@ from lidarspec.captures.records import WRITINGS
 from lidarspec.recording.background_writer import RecordFile
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import open_transport
+from lidarspec.transports.protocol import Chunk
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, process, ran, run_json
 from tests.evidence import capture
 from tests.shapes import SHAPES
@@ -462,6 +463,43 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
             "convert", capture(COIN_D4), tmp_path / "b.csv", "-s", "cspc-coin-d4", "--imu", code=2
         ).stderr
     )
+
+
+def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> None:
+    """The clock of the shape counts from power-up: UTC is the arrival without its delay."""
+    plugin = tmp_path / "inertia.py"
+    hook = [
+        "from lidarspec.spec import hookimpl",
+        "from tests.shapes.inertia import SENSOR",
+        "@hookimpl",
+        "def lidarspec_sensors():",
+    ]
+    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    sensor = SHAPES["shape-inertia"]
+    recording = tmp_path / "drive.lsr"
+    began_ns = 1_785_283_200 * 10**9
+    frames = simulate(sensor, 400)
+    times_ns = sensor.decode(frames).time_ns
+    with ls.Recorder(recording, sensor) as recorder:
+        for number, (data, time_ns) in enumerate(zip(frames, times_ns.tolist(), strict=True)):
+            delay_ns = 1_000_000 * (number % 2)
+            recorder.write(Chunk(data, began_ns + time_ns + delay_ns))
+    found = {}
+    for time in ("sensor", "host", "utc"):
+        target = tmp_path / f"{time}.csv"
+        ran("convert", recording, target, "-s", plugin, "--imu", "--time", time)
+        with target.open(encoding="ascii", newline="") as file:
+            found[time] = np.array([int(row["time_ns"]) for row in csv.DictReader(file)])
+    late_ns = np.repeat(np.arange(400) % 2 * 1_000_000, 3)
+    np.testing.assert_array_equal(found["host"], began_ns + found["sensor"] + late_ns)
+    np.testing.assert_allclose(found["utc"] - began_ns - found["sensor"], 0, atol=10_000)
+    bytes_ = tmp_path / "in.bin"
+    bytes_.write_bytes(b"".join(frames))
+    for time in ("host", "utc"):
+        target = tmp_path / "none.csv"
+        failed = ran("convert", bytes_, target, "-s", plugin, "--imu", "--time", time, code=2)
+        assert "no arrival times" in failed.stderr
+        assert "next: repeat with --time sensor" in failed.stderr
 
 
 @pytest.mark.parametrize("suffix", [".lsr", ".pcap", ".pcapng"])
