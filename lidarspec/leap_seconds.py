@@ -19,6 +19,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 #: TAI minus UTC since 2017, and before the first leap second in 1972, s.
 CURRENT_TAI_OFFSET_S = 37
@@ -64,16 +68,23 @@ class LeapSeconds:
             "gps": self.gps_minus_utc(utc_s),
         }
 
-    def utc_from_tai(self, tai_s: float) -> float:
-        """Return the UTC of a time in TAI; both are seconds since 1970.
+    def utc_from_tai(self, tai_s: ArrayLike) -> NDArray[Any]:
+        """Return the UTC of times in TAI; both are seconds since 1970.
 
         A leap second repeats the second before it, as in the clock of an operating system.
+
+        Args:
+            tai_s: the times, of any shape.
+
+        Returns:
+            the same shape; integers remain integers.
         """
-        index = 0
-        for number, start in enumerate(self.starts_s):
-            if tai_s >= start + self.offsets_s[max(number - 1, 0)]:
-                index = number
-        return tai_s - self.offsets_s[index]
+        offsets_s = np.array(self.offsets_s)
+        offsets_before_s = np.concatenate([offsets_s[:1], offsets_s[:-1]])
+        starts_tai_s = np.array(self.starts_s) + offsets_before_s
+        index = np.searchsorted(starts_tai_s, tai_s, side="right") - 1
+        utc_s: NDArray[Any] = np.asarray(tai_s) - offsets_s[np.maximum(index, 0)]
+        return utc_s
 
     def has_expired(self, utc_s: float) -> bool:
         """Return whether the table may lack leap seconds before a time, seconds since 1970."""

@@ -24,6 +24,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -186,6 +187,57 @@ class DeviceClock:
         self._last_stamped = ClockSample(device_ns, offset)
         self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
+
+    def stamp_packets(self, device: Times, host: Times) -> Times:
+        """Return the host's times of packets, each later than all stamps before, (n,) ns.
+
+        Also updates the conversion with the packets. While the clock runs evenly, the line is
+        updated once for each part, otherwise with each packet, as by `stamp`.
+
+        Args:
+            device, host: as for `observe`.
+        """
+        stamps = np.empty(len(device), np.int64)
+        edges = np.flatnonzero(np.diff(device // PART_NS)) + 1
+        bounds = [0, *edges.tolist(), len(device)]
+        for start, stop in pairwise(bounds):
+            part = slice(start, stop)
+            if self._is_regular(device[part], host[part]):
+                stamps[part] = self._stamp_part(device[part], host[part])
+            else:
+                pairs = zip(device[part].tolist(), host[part].tolist(), strict=True)
+                stamps[part] = [self.stamp(*pair) for pair in pairs]
+        return stamps
+
+    def _is_regular(self, device: Times, host: Times) -> bool:
+        """Return whether the packets of a part are in order and near to a reliable line."""
+        if self._last_stamped is None or self._outliers or not self.is_settled or not len(device):
+            return False
+        if (np.diff(device, prepend=self._last_stamped.device) <= 0).any():
+            return False
+        lowest = self.delays_above_line(device, host).min().item()
+        return bool(-EARLY_LIMIT_NS < lowest < LATE_LIMIT_NS)
+
+    def _stamp_part(self, device: Times, host: Times) -> Times:
+        """Return the host's times of the packets of a part, (n,) ns.
+
+        From the packet before, the delay changes evenly to the one of the last packet.
+        """
+        before = self._last_stamped
+        assert before is not None
+        self.observe(device, host)
+        last = device.item(-1)
+        delay_change = self._slewed_delay(last) - before.delay
+        steps = (device - before.device) / (last - before.device)
+        delays = before.delay + np.rint(delay_change * steps).astype(np.int64)
+        delays = np.minimum(delays, host - device)
+        self._last_stamped = ClockSample(last, delays.item(-1))
+        # each stamp is at least 1 ns later than the one before
+        numbers = np.arange(len(device))
+        stamps = np.maximum(device + delays - numbers, self._stamp + 1)
+        stamps = np.maximum.accumulate(stamps) + numbers
+        self._stamp = stamps.item(-1)
+        return stamps
 
     def _slewed_delay(self, device: int) -> int:
         """Return the delay at a time of the sensor, on the way to the line."""

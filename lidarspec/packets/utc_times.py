@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,23 +155,8 @@ class UtcTimes:
         Raises:
             UsageError: if neither the sensor's clock nor the arrival times determine UTC.
         """
-        if not math.isnan(status):
-            self._status = status
-        source = self._find_source(time_ns)
-        if source.kind != "clock" and not host_ns:
-            raise self._explain_unknown(source)
-        # The estimate of the arrival has to know all times, also those that do not need it.
-        arrival_ns = self._estimate.stamp(time_ns, host_ns) if host_ns else 0
-        if source.kind == "clock":
-            utc_ns = self._subtract_scale(time_ns, source.epoch)
-        elif source.kind == "hour":
-            utc_ns = time_ns + round((host_ns - time_ns) / HOUR_NS) * HOUR_NS
-        else:
-            utc_ns = arrival_ns
-        if source != self._source:
-            self.changes.append(UtcChange(utc_ns, source, is_first=self._source is None))
-            self._source = source
-        return utc_ns
+        utc_ns = self._convert(np.array([time_ns]), np.array([host_ns]), np.array([status]))
+        return int(utc_ns.item())
 
     def convert(self, packets: Packets) -> Times:
         """Return the UTC of packets, (n,) ns.
@@ -178,22 +164,57 @@ class UtcTimes:
         Raises:
             UsageError: as for `to_utc`.
         """
-        rows = zip(
-            packets.time_ns.tolist(),
-            packets.host_ns.tolist(),
-            read_clock_status(packets).tolist(),
-            strict=True,
-        )
-        return np.array([self.to_utc(*row) for row in rows], np.int64)
+        return self._convert(packets.time_ns, packets.host_ns, read_clock_status(packets))
 
-    def _find_source(self, time_ns: int) -> UtcSource:
-        """Return the source of UTC at a time by the sensor's clock."""
+    def _convert(self, times: Times, host: Times, status: NDArray[np.float64]) -> Times:
+        """Return the UTC of times by the sensor's clock, (n,) ns since 1970.
+
+        Args:
+            times, host, status: as for `to_utc`, (n,).
+        """
+        status = self._fill_status(status)
+        utc_ns = np.empty(len(times), np.int64)
+        for part in _split_runs(status, times >= FIRST_DATE_NS):
+            source = self._find_source(times.item(part.start), status.item(part.start))
+            if source.kind != "clock" and not host[part].all():
+                raise self._explain_unknown(source)
+            utc_ns[part] = self._convert_run(source, times[part], host[part])
+            if source != self._source:
+                first_ns = utc_ns.item(part.start)
+                self.changes.append(UtcChange(first_ns, source, is_first=self._source is None))
+                self._source = source
+        return utc_ns
+
+    def _fill_status(self, status: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the status with the last known value in place of each nan, (n,)."""
+        filled = np.concatenate([[self._status], status])
+        known = np.where(np.isnan(filled), 0, np.arange(len(filled)))
+        filled = filled[np.maximum.accumulate(known)]
+        self._status = filled.item(-1)
+        return filled[1:]
+
+    def _convert_run(self, source: UtcSource, times: Times, host: Times) -> Times:
+        """Return the UTC of times that have the same source, (n,) ns."""
+        if source.kind == "arrival":
+            return self._estimate.stamp_packets(times, host)
+        # The estimate of the arrival has to know all times, also those that do not need it.
+        known = np.flatnonzero(host)
+        if len(known):
+            self._estimate.observe(times[known[:-1]], host[known[:-1]])
+            self._estimate.stamp(times.item(known[-1]), host.item(known[-1]))
+        if source.kind == "clock":
+            return self._subtract_scale(times, source.epoch)
+        hours = np.rint((host - times) / HOUR_NS).astype(np.int64)
+        return times + hours * HOUR_NS
+
+    def _find_source(self, time_ns: int, status: float) -> UtcSource:
+        """Return the source of UTC at a time by the sensor's clock, with this status."""
         clock = self._clock
         if clock is None:
             raise self._explain_no_clock()
         state: ClockState | None = None
-        if clock.status is not None and not math.isnan(self._status):
-            state = clock.status.state_of(self._status)
+        if clock.status is not None and not math.isnan(status):
+            state = clock.status.state_of(status)
         epoch = clock.epoch_at(time_ns, state)
         if epoch in DATED_EPOCHS and time_ns >= FIRST_DATE_NS:
             kind = "clock"
@@ -205,18 +226,18 @@ class UtcTimes:
             return UtcSource(kind, epoch)
         return UtcSource(kind, epoch, state.locked, state.meaning)
 
-    def _subtract_scale(self, time_ns: int, epoch: str) -> int:
-        """Return the UTC of a time in another time scale, ns."""
+    def _subtract_scale(self, times: Times, epoch: str) -> Times:
+        """Return the UTC of times in another time scale, (n,) ns."""
         if epoch == "utc":
-            return time_ns
+            return times
         table = read_leap_seconds()
-        seconds, fraction_ns = divmod(time_ns, SECOND_NS)
+        seconds, fractions_ns = np.divmod(times, SECOND_NS)
         if epoch == "gps":
-            seconds += TAI_MINUS_GPS_S
-        utc_s = int(table.utc_from_tai(seconds))
-        if table.has_expired(utc_s):
+            seconds = seconds + TAI_MINUS_GPS_S
+        utc_s = table.utc_from_tai(seconds)
+        if table.has_expired(utc_s.max().item()):
             self._expired_path = table.path
-        return utc_s * SECOND_NS + fraction_ns
+        return utc_s * SECOND_NS + fractions_ns
 
     def _explain_no_clock(self) -> UsageError:
         error = UsageError(f"{self._sensor} has no clock, so that UTC is known by arrival only")
@@ -237,3 +258,11 @@ class UtcTimes:
             f" that UTC is unknown; record with arrival times (lidarspec record -o drive.lsr)"
         )
         return suggest(error, "repeat with --time sensor")
+
+
+def _split_runs(status: NDArray[np.float64], has_date: NDArray[np.bool_]) -> list[slice]:
+    """Return slices of packets with the same status, with or without a date."""
+    is_known = ~np.isnan(status)
+    changes = (np.diff(np.where(is_known, status, 0)) != 0) | np.diff(is_known) | np.diff(has_date)
+    edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(status)]
+    return [slice(start, stop) for start, stop in pairwise(edges) if stop > start]

@@ -10,6 +10,8 @@ import pytest
 from lidarspec import UsageError, simulate
 from lidarspec.leap_seconds import LeapSeconds
 from lidarspec.packets import utc_times
+from lidarspec.packets.clock_estimate import DeviceClock
+from lidarspec.packets.packets import Packets
 from lidarspec.packets.utc_times import UtcTimes
 from lidarspec.simulation.clock_faults import parse_clock_faults
 from lidarspec.spec import Clock
@@ -28,9 +30,12 @@ def leap_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(utc_times, "read_leap_seconds", lambda: LEAP_SECONDS)
 
 
+def make_clock(epoch: str) -> Clock:
+    return Clock("time", epoch=epoch, wraps_at=3600 if epoch == "hour" else None)
+
+
 def make(epoch: str) -> UtcTimes:
-    clock = Clock("time", epoch=epoch, wraps_at=3600 if epoch == "hour" else None)
-    return UtcTimes("shape-synced", clock, "drive.lsr")
+    return UtcTimes("shape-synced", make_clock(epoch), "drive.lsr")
 
 
 @pytest.mark.parametrize(("epoch", "ahead_s"), [("utc", 0), ("tai", 37), ("gps", 18)])
@@ -134,6 +139,71 @@ def test_packets_are_converted_with_their_status() -> None:
     np.testing.assert_allclose(utc_ns[:250] - NOW, np.arange(250) * 2_000_000, atol=128)
     assert [change.source.kind for change in times.changes] == ["clock", "arrival"]
     assert times.changes[1].utc_ns == utc_ns[250]
+
+
+@pytest.mark.parametrize("epoch", ["utc", "tai", "gps", "boot", "hour", ""])
+def test_many_packets_get_the_utc_that_each_alone_gets(epoch: str) -> None:
+    """The clock is 50 ppm fast; it loses its date, and gets it again. Some packets are late."""
+    seconds = np.arange(0, 60, 0.01)
+    random = np.random.default_rng(1)
+    drifted_ns = np.rint(seconds * (1 + 50e-6) * 1e9).astype(np.int64)
+    start_ns = NOW if epoch in ("utc", "tai", "gps") else 0
+    readings = np.where((seconds < 25) | (seconds > 40), drifted_ns + start_ns, drifted_ns)
+    late_s = random.uniform(0, 0.005, len(seconds)) + 0.05 * (random.random(len(seconds)) < 0.02)
+    arrivals = NOW + np.rint((seconds + late_s) * 1e9).astype(np.int64)
+    one_by_one = make(epoch)
+    expected = [
+        one_by_one.to_utc(*row) for row in zip(readings.tolist(), arrivals.tolist(), strict=True)
+    ]
+    together = make(epoch)
+    found = []
+    for start in range(0, len(seconds), 700):
+        piece = slice(start, start + 700)
+        packets = make_packets(epoch, readings[piece], arrivals[piece])
+        found.append(together.convert(packets))
+    np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=300_000)
+    assert [change.source for change in together.changes] == [
+        change.source for change in one_by_one.changes
+    ]
+    times_ns = [[change.utc_ns for change in each.changes] for each in (together, one_by_one)]
+    np.testing.assert_allclose(*times_ns, rtol=0, atol=300_000)
+
+
+def make_packets(epoch: str, readings: np.ndarray, arrivals: np.ndarray) -> Packets:
+    sensor = replace(SYNCED, clock=make_clock(epoch))
+    frame = SYNCED.build("data", number=0, sync=0, time=0, azimuth=0, distances=[0] * 4)
+    packets = sensor.decode([frame] * len(readings)).with_times(readings)
+    packets.host_ns = arrivals
+    return packets
+
+
+def test_stamps_of_many_packets_are_evenly_spaced_and_ascend(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+    stamp = DeviceClock.stamp
+
+    def count_calls(self: DeviceClock, device_ns: int, host_ns: int) -> int:
+        calls.append(device_ns)
+        return stamp(self, device_ns, host_ns)
+
+    monkeypatch.setattr(DeviceClock, "stamp", count_calls)
+    device = np.arange(0, 40 * SECOND, SECOND // 200)
+    random = np.random.default_rng(3)
+    host = NOW + device + random.integers(0, 5_000_000, len(device))
+    clock = DeviceClock()
+    stamps = np.concatenate([clock.stamp_packets(*part) for part in split(device, host)])
+    assert len(calls) < len(device) // 3  # those of the first ten seconds
+    settled = device > 15 * SECOND
+    assert np.abs(stamps - NOW - device)[settled].max() < 100_000
+    assert np.abs(np.diff(stamps) - SECOND // 200)[settled[1:]].max() < 20_000
+    assert (np.diff(stamps) > 0).all()
+
+
+def split(*columns: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """Return pieces of 130 rows."""
+    starts = range(0, len(columns[0]), 130)
+    return [tuple(column[start : start + 130] for column in columns) for start in starts]
 
 
 def sweep_now(i: int) -> dict[str, object]:
