@@ -32,6 +32,8 @@ START_S = 0.2
 #: Change of the duty cycle per Hz of deviation, at once and per second.
 PROPORTIONAL = 0.006
 INTEGRAL = 0.02
+#: Lowest speed at which the scans of lidarspec are complete.
+MIN_HERTZ = 0.5
 #: Longest time between two corrections that counts, seconds.
 MAX_STEP_S = 0.2
 
@@ -117,6 +119,8 @@ def main() -> None:
     parser.add_argument("--pin", default="GPIO18", help="output for gpiozero")
     parser.add_argument("--pwm", default="", help="folder of a channel in /sys/class/pwm")
     options = parser.parse_args()
+    if not options.hertz >= MIN_HERTZ:  # the manual gives no limits
+        parser.error(f"--hertz: expected at least {MIN_HERTZ}, got {options.hertz:g}")
     pin = make_pin(options.pin, options.pwm)
     control = SpeedControl(pin, options.hertz)
     control.begin()

@@ -262,8 +262,7 @@ STL27L = make_lidar(
     "STL-27L",
     links={"data": Serial(921_600)},
     range_limits=(0.03, 25.0),
-    # the limits of the internal speed control (manual, section 1); none are given for PWM control
-    turn=(9.9, 10.1),
+    # no `turn`: internal control has 10 Hz (manual, section 1), but PWM control has no limits
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )

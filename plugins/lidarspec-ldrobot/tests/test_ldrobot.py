@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -322,6 +323,21 @@ def test_turns_are_cut_where_the_angle_passes_zero(sensor: ls.Sensor, number: in
     assert len(scans[1]) == pytest.approx(number, abs=1)
     assert scans[1].rate_hz == pytest.approx(10, rel=0.03)
     assert sum(map(len, scans)) == 12 * len(frames)
+
+
+@pytest.mark.parametrize("hertz", [0.6, 2, 4, 6, 10, 13])
+def test_scans_are_complete_at_each_speed_of_external_control(hertz: float) -> None:
+    assert SENSOR.simulation.sweep is not None
+    sweep = partial(SENSOR.simulation.sweep, turns=hertz)
+    points = [dict(distance=2.0, intensity=9)] * 12
+    frames = [
+        SENSOR.build("data", units=True, points=points, **sweep(i))
+        for i in range(round(3.5 * 1800 / hertz))
+    ]
+    scans = list(SENSOR.scans(b"".join(frames)))
+    assert [scan.complete for scan in scans] == [False, True, True, False]
+    assert [len(scan) for scan in scans[1:3]] == [pytest.approx(21_600 / hertz, abs=2)] * 2
+    assert [scan.rate_hz for scan in scans[1:3]] == [pytest.approx(hertz, rel=0.03)] * 2
 
 
 def test_speed_and_links() -> None:

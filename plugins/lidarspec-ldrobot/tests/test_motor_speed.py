@@ -64,7 +64,7 @@ class Motor:
         )
 
 
-@pytest.mark.parametrize("hertz", [6, 10, 13])
+@pytest.mark.parametrize("hertz", [2, 6, 10, 13])
 @pytest.mark.parametrize(("gain", "lag"), [(16, 0.3), (20, 0.5), (28, 0.8)])
 def test_the_speed_settles(example: ModuleType, hertz: float, gain: float, lag: float) -> None:
     pin = FakePin()
@@ -81,6 +81,32 @@ def test_the_speed_settles(example: ModuleType, hertz: float, gain: float, lag: 
     settled = measured[len(measured) // 2 :]
     assert max(abs(speed - hertz) for speed in settled) <= TOLERANCE_HZ
     assert pin.value == pytest.approx(hertz / gain, abs=0.01)
+
+
+@pytest.mark.parametrize("hertz", ["0", "-1", "0.4", "nan"])
+def test_a_speed_without_complete_scans_is_refused(
+    example: ModuleType,
+    hertz: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["motor_speed.py", "/dev/null", "--hertz", hertz])
+    with pytest.raises(SystemExit) as caught:
+        example.main()
+    assert caught.value.code == 2
+    assert "--hertz: expected at least 0.5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("hertz", ["0.5", "4", "13"])
+def test_other_speeds_are_accepted(
+    example: ModuleType, hertz: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+    monkeypatch.setattr(sys, "argv", ["motor_speed.py", "/dev/null", "--hertz", hertz])
+    monkeypatch.setattr(example, "make_pin", lambda pin, pwm: started.append(pin) or sys.exit(0))
+    with pytest.raises(SystemExit):
+        example.main()
+    assert started == ["GPIO18"]
 
 
 def test_the_duty_cycle_stays_in_its_limits(example: ModuleType) -> None:

@@ -41,6 +41,7 @@ from lidarspec_robosense.rotor import (
     DIFOP_UNIT,
     DIFOP_VERSIONS,
     FACTORY_SPEED_HZ,
+    SPEED_LIMITS_HZ,
     TEMPERATURE,
     TIME,
     Rotor,
@@ -255,6 +256,7 @@ HELIOS_32 = dataclasses.replace(
     points=partial(points_32, model=HELIOS_32_ROTOR),
     state=HELIOS_32_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_1615)),
+    turn=SPEED_LIMITS_HZ,  # 300, 600 and 1200 rpm (Helios 32 product manual)
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(

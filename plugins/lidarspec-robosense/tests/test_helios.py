@@ -380,3 +380,16 @@ def test_a_packet_of_another_model_is_a_warning(tmp_path: Path) -> None:
     with ls.open(path, SENSOR) as device:
         assert list(device.scans())
         assert not any("read as" in warning for warning in device.warnings)
+
+
+@pytest.mark.parametrize("hertz", [4.95, 10, 20])  # 300 rpm less a tolerance, 600, 1200
+@pytest.mark.parametrize("model", ["helios32", "helios5515"])
+def test_scans_are_complete_at_each_speed_of_the_32(model: str, hertz: float) -> None:
+    sensor = ls.sensor(f"robosense-{model}")
+    data = []
+    for i in range(round(3.5 / hertz / (12 * FIRING))):
+        time = i * 12 * FIRING
+        azimuths = (time + np.arange(12) * FIRING) * hertz * 36_000 % 36_000
+        data.append(msop(azimuths.astype(int).tolist(), count=i, time=time))
+    scans = list(sensor.scans(data))
+    assert [scan.complete for scan in scans] == [False, True, True, False]
