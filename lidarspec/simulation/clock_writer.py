@@ -53,8 +53,7 @@ MAX_STATUS_FIELDS = 2
 #: than a second.
 TEST_SHIFT_NS = 1_500_000_000
 #: The date that a sensor counts from after power-on without a source of time, if it sends year,
-#: month and day: 2000-01-01, ns since 1970 (user manuals of the Hesai Pandar64 and PandarXT,
-#: appendix B, "virtual UTC").
+#: month and day: 2000-01-01, ns since 1970. Manuals call it a virtual UTC.
 POWER_ON_DATE_NS = 946_684_800 * 10**9
 
 
