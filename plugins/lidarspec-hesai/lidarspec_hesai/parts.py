@@ -78,8 +78,8 @@ def clock(f: Fields) -> tuple[Any, Any]:
 
 
 #: The date is UTC with GPS. With PTP it is the time of the grandmaster. Data packets do not report
-#: the state of the clock: GPS packets (UDP port 10110) and the sensor's web page do. Until it is set,
-#: the clock counts from a virtual UTC such as 2000-01-01 (user manuals of the Pandar64 and the
+#: the state of the clock: GPS packets (UDP port 10110) and the sensor's web page do. Until it is
+#: set, the clock counts from a virtual UTC such as 2000-01-01 (user manuals of the Pandar64 and the
 #: PandarXT, appendix B).
 CLOCK = Clock(clock, epoch="utc")
 
