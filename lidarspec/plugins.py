@@ -198,6 +198,7 @@ class Plugin:
         error: the reason why the plugin or one of its ids is not available; "" if all are.
         rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
             none.
+        failed_sensor: the id that the error concerns; "" if it concerns the whole plugin.
         traceback: the traceback of the error.
         remark: a description of side effects of loading it, such as printed text.
     """
@@ -208,6 +209,7 @@ class Plugin:
     sensors: tuple[str, ...] = ()
     error: str = ""
     rule: str = ""
+    failed_sensor: str = ""
     traceback: str = ""
     remark: str = ""
 
@@ -291,6 +293,7 @@ class Registry:
                 plugin,
                 error=f"{lost[0]}: another sensor has this id already: that of {owners}",
                 rule="LS005",
+                failed_sensor=lost[0],
             )
         return replace(plugin, sensors=tuple(own))
 
@@ -759,8 +762,10 @@ def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) 
             reason = str(error)
         else:
             reason = f"{type(error).__name__}: {error}"
-        rule = error.rule if isinstance(error, SpecError) else ""
-        return replace(plugin, error=reason, rule=rule, traceback=traceback.format_exc())
+        failed = replace(plugin, error=reason, traceback=traceback.format_exc())
+        if isinstance(error, SpecError):
+            return replace(failed, rule=error.rule, failed_sensor=error.sensor)
+        return failed
 
 
 def _letters(name: str) -> str:

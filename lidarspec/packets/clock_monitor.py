@@ -71,7 +71,7 @@ class OffsetSample:
 
 @dataclass(frozen=True)
 class ClockReport:
-    """What is known about a clock.
+    """The findings about a clock, and its measured offset, drift and jitter.
 
     Attributes:
         epoch: what the clock counts, a key of `spec.timing.EPOCHS`; "" if unknown.

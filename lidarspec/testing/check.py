@@ -194,7 +194,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
     refused = [
         plugin
         for plugin in registry().plugins
-        if plugin.rule == "LS005" and plugin.error.partition(":")[0] in names
+        if plugin.rule == "LS005" and plugin.failed_sensor in names
     ]
     return [
         Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point)
