@@ -124,7 +124,7 @@ INFO = Checksummed(
         "model" / Bytes(12) * "ASCII, terminated by 00",
         "zero_angle"
         / Scaled(Int16ul, 1, "deg")
-        * "from the zero direction of the data to the mark on the housing, clockwise",
+        * "from the mark on the housing to the zero of the data, clockwise",
         "direction" / Enum(Int8ul, clockwise=0),
         "correction" / Int8ul * "1: the host must correct the angles",
         "reserved" / Bytes(3),
@@ -300,8 +300,9 @@ def configure(
 ) -> Sensor:
     """Return the sensor with angles from the zero of the data or of the housing.
 
-    The data on the wire count from the zero of the data. Source: manual 2.2.2, bytes 13 and 14;
-    whether the host should add the angle is not documented.
+    The data on the wire count from the zero of the data, which is 12 degrees clockwise from the
+    mark on the housing. Source: manual 2.2.2, bytes 13 and 14, for the angle; its edition v1.1,
+    page 4, for the direction. Whether the host should add the angle is not documented.
     """
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
