@@ -116,8 +116,8 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
 #: Codes of DIFOP and of the packets of an M1 (user guides).
 SYNC_MODES = {"internal": 0, "PPS": 1, "PTP": 2, "gPTP": 3}
 SYNC_STATES = {"none": 0, "locked": 1, "timeout": 2}
-#: The mode and the status make one code: mode * CODES_PER_MODE + status.
-CODES_PER_MODE = 4
+#: The mode and the status, of one byte each, make one code: mode * CODES_PER_MODE + status.
+CODES_PER_MODE = 256
 WAVE_MODES = {"dual": 0, "strongest": 4, "last": 5, "first": 6}
 RETURN_NUMBERS = {"single": 0, "first": 1, "second": 2}
 SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
@@ -136,7 +136,7 @@ def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
     for mode, source in enumerate(others, start=1):
         if not source:
             continue
-        source_epoch = "utc" if source == "PPS" else None
+        source_epoch = "utc" if mode == SYNC_MODES["PPS"] else None
         first = mode * CODES_PER_MODE
         states[first + SYNC_STATES["none"]] = ClockState(
             f"{source}, not locked", False, epoch="boot"

@@ -46,11 +46,11 @@ from lidarspec.spec import (
     stack,
 )
 from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1, count_returns, number_firings
-from lidarspec_robosense.rotor import RETURN_NUMBERS, TIME, make_clock_status
+from lidarspec_robosense.rotor import RETURN_NUMBERS, TIME, WAVE_MODES, make_clock_status
 
 # return modes
-DUAL = 0
-STRONGEST = 4
+DUAL = WAVE_MODES["dual"]
+STRONGEST = WAVE_MODES["strongest"]
 GRAVITY = 9.80665
 MAGIC = Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55")
 UNIT_VECTOR = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")

@@ -355,3 +355,17 @@ def test_mode_and_status_of_synchronization_say_whether_the_clock_is_locked() ->
     locked = {place: clock.epoch_in(state) for place, state in states.items() if state.locked}
     assert locked == {(1, 1): "utc", (2, 1): "tai", (3, 1): "tai"}
     assert all(state.locked is not None for state in states.values())
+
+
+def test_an_undocumented_status_of_synchronization_is_unknown() -> None:
+    helios = ls.sensor("robosense-helios32")
+    assert helios.clock is not None
+    assert helios.clock.status is not None
+    difop = helios.parse(helios.example("difop"), "difop")
+    for mode in range(4):
+        for status in (3, 4, 5, 8, 255):
+            difop.time_sync_mode = mode
+            difop.time_sync_status = status
+            frames = helios.decode([helios.build("difop", difop)], "difop")
+            value = frame_status(helios.clock.status, frames.table).item()
+            assert helios.clock.status.state_of(value).locked is None
