@@ -190,7 +190,8 @@ class Packets:
         a return whose packet is lost. Its shape depends on the packets:
 
         - If consecutive packets contain the returns (`PacketCounter.returns`): (groups of packets,
-          *shape of the points of a packet, returns).
+          *shape of the points of a packet, returns), ordered by `return_index`, or by the counter
+          if the packets of a group have equal ones.
         - If each packet contains them in the same places: (packets, *shape of the firings of a
           packet, returns).
         - Otherwise: (firings, returns).

@@ -142,12 +142,40 @@ def arrange_returns(packets: PacketBatch, index: NDArray[np.int64]) -> NDArray[A
     rule = packets.sensor.sequence
     indices: NDArray[np.intp] | None = None
     if is_regular and rule is not None and rule.returns != 1:
-        indices = _join_packets(read_groups(rule, packets.batch(), index), shape)
+        members = read_groups(rule, packets.batch(), index)
+        if cloud.return_index is not None:
+            numbers = cloud.return_index.reshape(len(packets), -1)
+            members = _place_by_return_index(members, numbers)
+        indices = _join_packets(members, shape)
     elif is_regular and cloud.return_index is not None:
         indices = _split_axis(cloud.return_index.reshape(len(packets), *shape))
     if indices is None:
         indices = group_firings(cloud)
     return _gather(cloud, indices)
+
+
+def _place_by_return_index(
+    members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
+    numbers: NDArray[np.uint8],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return groups of packets whose places are their return index, not their counter.
+
+    A group in which the return index does not distinguish the packets keeps its places.
+
+    Args:
+        members: the group of each packet, its place, and the size of the group, (n,).
+        numbers: the return index of the points of each packet, (n, points).
+    """
+    groups, places, sizes = members
+    if not numbers.size:
+        return members
+    own = numbers[:, 0].astype(np.int64)
+    is_place = (numbers == own[:, None]).all(axis=1) & (own < sizes)
+    keys = groups * int(sizes.max()) + own
+    _, rows, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    is_place &= counts[rows.reshape(-1)] == 1
+    is_kept = np.isin(groups, groups[~is_place])
+    return groups, np.where(is_kept, places, own), sizes
 
 
 def _join_packets(

@@ -23,9 +23,12 @@ NEAR_M = 5.0
 FAR_M = 7.5
 
 
-def make_packet(number: int) -> bytes:
-    """Return the packet with this counter, 1 to 1260; its two returns are 5 and 7.5 m away."""
-    second = (number - 1) % 2
+def make_packet(number: int, second: int | None = None) -> bytes:
+    """Return the packet with this counter, 1 to 1260; its two returns are 5 and 7.5 m away.
+
+    The packet has the second returns if `second` is 1; by default, if its counter is even.
+    """
+    second = (number - 1) % 2 if second is None else second
     firing = (number - 1) // 2 * 25
     blocks = [
         {
@@ -74,6 +77,24 @@ def test_odd_and_even_packets_are_the_returns_of_the_same_firings(packets: list[
     np.testing.assert_allclose(returns["range"], np.broadcast_to([NEAR_M, FAR_M], returns.shape))
     np.testing.assert_array_equal(returns["azimuth"][..., 0], returns["azimuth"][..., 1])
     assert decoded.stats.incomplete_returns == 0
+
+
+def test_the_return_sequence_decides_not_the_counter() -> None:
+    """The guide (2.1.2) judges the type of a packet by return_seq."""
+    exchanged = [make_packet(number, number % 2) for number in range(1, 41)]
+    returns = M1.decode(exchanged).returns()
+    np.testing.assert_allclose(returns["range"], np.broadcast_to([NEAR_M, FAR_M], returns.shape))
+    first = M1.decode(exchanged[:4] + exchanged[5:]).returns()[2]
+    assert (first["missing"].all(axis=(0, 1)) == [False, True]).all()
+    (scan,) = M1.scans(exchanged, select=ls.Selection(returns="first"))
+    assert (scan.points.range == NEAR_M).all()
+
+
+def test_the_counter_decides_if_the_return_sequence_does_not() -> None:
+    same = [make_packet(number, 0) for number in (1, 2)]
+    returns = M1.decode(same).returns()
+    assert returns.shape == (1, 25, 5, 2)
+    assert not returns["missing"].any()
 
 
 def test_a_lost_half_is_counted(packets: list[bytes]) -> None:
