@@ -239,34 +239,47 @@ def simulated_angles(number: int) -> tuple[Any, Any]:
     return np.repeat(elevation[:, None], CHANNELS, axis=1), azimuth
 
 
-def sweep(i: int, temperature: int = 105) -> dict[str, Any]:
-    """Return the values of simulated packet i with single return.
+def sweep(i: int, temperature: int = 105, *, is_dual: bool = False) -> dict[str, Any]:
+    """Return the values of simulated packet i.
 
-    `temperature` is the raw byte, or degC if the firmware is known.
+    With dual return, both packets of a pair measure the same surface.
+
+    Args:
+        temperature: the raw byte, or degC if the firmware is known.
+        is_dual: whether the sensor sends pairs of packets with dual return.
     """
-    number = i % SINGLE_RETURN_PACKETS
-    time = i / (SINGLE_RETURN_PACKETS * FRAME_RATE_HZ)
-    elevation, azimuth = simulated_angles(number)
+    if is_dual:
+        returns = 2
+        mode = WAVE_MODES["dual"]
+        return_seq = RETURN_NUMBERS["first"] + i % 2
+    else:
+        returns = 1
+        mode = WAVE_MODES["strongest"]
+        return_seq = RETURN_NUMBERS["single"]
+    number = i % (SINGLE_RETURN_PACKETS * returns)
+    time = i / (SINGLE_RETURN_PACKETS * returns * FRAME_RATE_HZ)
+    elevation, azimuth = simulated_angles(number // returns)
     return {
         "pkt_psn": number + 1,
         "protocol_version": 0,
-        "wave_mode": 4,
+        "wave_mode": mode,
         "time_sync_mode": 0,
         "seconds": int(time),
         "microseconds": time % 1,
         "lidar_type": 0x10,
         "mems_tmp": temperature,
         "blocks.time_offset": BLOCK_OFFSETS_S,
+        "blocks.return_seq": return_seq,
         "blocks.channels.elevation": elevation,
         "blocks.channels.azimuth": azimuth,
     }
 
 
-def sweep_difop(i: int) -> dict[str, Any]:
-    """Return the device information of a sensor with the factory's settings."""
+def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
+    """Return the device information of a sensor with the factory's settings, or dual return."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     modes = {
-        "return_mode": 4,
+        "return_mode": WAVE_MODES["dual" if is_dual else "strongest"],
         "time_sync_mode": 0,
         "time_sync_status": 0,
         "seconds": i,
@@ -281,21 +294,45 @@ def sweep_difop(i: int) -> dict[str, Any]:
     }
 
 
-def configure(sensor: Sensor, /, *, firmware: Literal["current", "2021"]) -> Sensor:
-    """Return the sensor with a temperature in degC.
+def configure(
+    sensor: Sensor,
+    /,
+    *,
+    firmware: Literal["current", "2021"] | None = None,
+    returns: Literal["single", "dual"] | None = None,
+) -> Sensor:
+    """Return the sensor with a temperature in degC, or with other returns of a simulated sensor.
 
     Args:
-        firmware: "current" if the byte is degC + 80 (M1P user guide, rs_driver), "2021" if it is
-            signed degC (rs_driver of April 2021).
+        firmware: "current" if the byte of the temperature is degC + 80 (M1P user guide, rs_driver),
+            "2021" if it is signed degC (rs_driver of April 2021).
+        returns: the returns that the simulated sensor sends. Real packets contain their mode.
     """
-    struct = Struct(*HEADER_START, TEMPERATURES[firmware], *BLOCKS_AND_TAIL)
-    data = dataclasses.replace(sensor.frames["data"], struct=struct)
-    return dataclasses.replace(
-        sensor,
-        frames={**sensor.frames, "data": data},
-        simulation=Simulation(functools.partial(sweep, temperature=25)),
-        info={**sensor.info, "temperature": "data.mems_tmp"},
-    )
+    if firmware is not None:
+        struct = Struct(*HEADER_START, TEMPERATURES[firmware], *BLOCKS_AND_TAIL)
+        data = dataclasses.replace(sensor.frames["data"], struct=struct)
+        sensor = dataclasses.replace(
+            sensor,
+            frames={**sensor.frames, "data": data},
+            simulation=change_sweep(sensor.simulation, temperature=25),
+            info={**sensor.info, "temperature": "data.mems_tmp"},
+        )
+    if returns is not None:
+        is_dual = returns == "dual"
+        difop = sensor.frames["difop"]
+        reporting = change_sweep(difop.simulation, is_dual=is_dual)
+        sensor = dataclasses.replace(
+            sensor,
+            frames={**sensor.frames, "difop": dataclasses.replace(difop, simulation=reporting)},
+            simulation=change_sweep(sensor.simulation, is_dual=is_dual),
+        )
+    return sensor
+
+
+def change_sweep(simulation: Simulation, **values: Any) -> Simulation:
+    """Return a simulation with other arguments of its sweep."""
+    assert simulation.sweep is not None
+    return dataclasses.replace(simulation, sweep=functools.partial(simulation.sweep, **values))
 
 
 def in_each_layout(field: str, text: Callable[[Any], str] | None = None) -> Reported:

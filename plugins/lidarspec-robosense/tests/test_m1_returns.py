@@ -119,6 +119,28 @@ def test_lost_halves_are_in_the_contents_of_a_file(packets: list[bytes], tmp_pat
         assert json.loads(text.stdout)["contents"][0]["incomplete_returns"] == count
 
 
+def test_a_simulated_sensor_sends_pairs() -> None:
+    dual = M1.configure(firmware="current").configure(returns="dual")
+    decoded = dual.decode(ls.simulate(dual, PACKETS + 20))
+    assert decoded["pkt_psn"].tolist() == [*range(1, PACKETS + 1), *range(1, 21)]
+    assert set(decoded["mems_tmp"].tolist()) == {25}
+    np.testing.assert_allclose(np.diff(decoded.time_ns), 1e8 / PACKETS, atol=1000)
+    assert (decoded.stats.lost, decoded.stats.incomplete_returns) == (0, 0)
+    returns = decoded.returns()
+    assert returns.shape == (PACKETS // 2 + 10, 25, 5, 2)
+    assert not returns["missing"].any()
+    assert (returns["return_index"] == [0, 1]).all()
+    for name in ("azimuth", "elevation", "column", "ring"):
+        np.testing.assert_array_equal(returns[name][..., 0], returns[name][..., 1])
+    (scan,) = dual.scans(ls.simulate(dual, PACKETS), select=ls.Selection(returns="last"))
+    assert scan.points.shape == (630 * 25, 5)
+    report = dual.frames["difop"].simulation.sweep
+    assert report is not None
+    assert report(0)["return_mode"] == 0
+    single = dual.configure(returns="single")
+    assert ls.simulate(single, 40) == ls.simulate(M1.configure(firmware="current"), 40)
+
+
 @pytest.mark.parametrize(("which", "metres"), [("first", NEAR_M), ("last", FAR_M)])
 def test_a_frame_has_one_point_of_each_firing(
     packets: list[bytes], which: str, metres: float
