@@ -55,13 +55,20 @@ class UtcSource:
         """Whether a user should know of this source, even if it never changes."""
         return self.kind == "arrival" or self.locked is False
 
+    @property
+    def reason(self) -> str:
+        """The reason why the clock alone does not give UTC, to be put after "the clock"."""
+        if self.kind == "hour":
+            return "counts from the full hour"
+        if self.epoch in DATED_EPOCHS:
+            return "was not set"
+        if self.epoch:
+            return "counts time since power-up"
+        return "is not declared to count UTC, TAI or GPS time"
+
     def __str__(self) -> str:
-        if self.kind == "arrival" and self.epoch in DATED_EPOCHS:
-            text = "the arrival times, because the sensor's clock was not set"
-        elif self.kind == "arrival" and not self.epoch:
-            text = "the arrival times, because it is not declared what the sensor's clock counts"
-        elif self.kind == "arrival":
-            text = "the arrival times, because the sensor's clock counts time since power-up"
+        if self.kind == "arrival":
+            text = f"the arrival times, because the sensor's clock {self.reason}"
         elif self.kind == "hour":
             text = "the sensor's clock, with the hour of the arrival time"
         elif self.epoch == "utc":
@@ -245,17 +252,9 @@ class UtcTimes:
 
     def _explain_unknown(self, source: UtcSource) -> UsageError:
         """Return the error for times that cannot be converted."""
-        if source.epoch == "hour":
-            reason = "counts from the full hour"
-        elif source.epoch in DATED_EPOCHS:
-            reason = "was not set"
-        elif source.epoch:
-            reason = "counts time since power-up"
-        else:
-            reason = "is not declared to count UTC, TAI or GPS time"
         error = UsageError(
-            f"{self._name} has no arrival times, and the clock of {self._sensor} {reason}, so"
-            f" that UTC is unknown; record with arrival times (lidarspec record -o drive.lsr)"
+            f"{self._name} has no arrival times, and the clock of {self._sensor} {source.reason},"
+            f" so that UTC is unknown; record with arrival times (lidarspec record -o drive.lsr)"
         )
         return suggest(error, "repeat with --time sensor")
 

@@ -93,6 +93,17 @@ def test_without_arrival_times_utc_is_unknown(epoch: str) -> None:
         UtcTimes("shape-synced", None).to_utc(NOW, NOW)
 
 
+@pytest.mark.parametrize("epoch", ["boot", "", "tai"])
+def test_warning_and_error_give_the_same_reason(epoch: str) -> None:
+    with pytest.raises(UsageError) as error:
+        make(epoch).to_utc(5 * SECOND, 0)
+    times = make(epoch)
+    times.to_utc(5 * SECOND, NOW)
+    (change,) = times.changes
+    assert f"the clock of shape-synced {change.source.reason}, so" in str(error.value)
+    assert times.warnings[0].endswith(f"because the sensor's clock {change.source.reason}")
+
+
 def test_each_change_of_the_source_is_reported_once_with_its_time() -> None:
     times = UtcTimes("shape-synced", SYNCED.clock, "drive.lsr")
     statuses = [FREE] * 5 + [LOCKED] * 5 + [HOLDOVER] * 5 + [np.nan] * 5
