@@ -27,6 +27,7 @@ class Item:
         test: the path of a test file from the root, with "::" and a function.
         names: fields, as the manual prints them.
         fields: patterns of field paths, "frame.path".
+        covers: text that the test contains, if it contains none of the names and fields.
     """
 
     section: str
@@ -36,6 +37,7 @@ class Item:
     test: str
     names: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
+    covers: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,14 @@ class Coverage:
         manual: the name of the manual.
         tables: name of each table of the manual -> its fields, as printed.
         items: the items, in the order of the manual.
+        gaps: parts of the manual that no item covers, with the reason.
     """
 
     sensor: str
     manual: str
     tables: dict[str, list[str]] = field(default_factory=dict)
     items: tuple[Item, ...] = ()
+    gaps: tuple[str, ...] = ()
 
 
 def read_coverages() -> list[Coverage]:
@@ -65,7 +69,8 @@ def read_coverage(path: Path) -> Coverage:
     content = tomllib.loads(path.read_text(encoding="utf-8"))
     folder = path.parent.relative_to(ROOT).as_posix()
     items = tuple(_make_item(entry, folder) for entry in content["items"])
-    return Coverage(content["sensor"], content["manual"], content["tables"], items)
+    gaps = tuple(content.get("gaps", ()))
+    return Coverage(content["sensor"], content["manual"], content["tables"], items, gaps)
 
 
 def _make_item(entry: dict[str, Any], folder: str) -> Item:
@@ -87,8 +92,8 @@ def make_coverage_page(coverage: Coverage, title: str) -> str:
         f"Source: {coverage.manual}. The fields and packets are on [the page of the"
         f" sensor]({coverage.sensor}.md).",
         "",
-        "| section | manual | fields | in lidarspec | proof | test |",
-        "|---|---|---|---|---|---|",
+        "| section | manual | fields | in lidarspec | paths | proof | test |",
+        "|---|---|---|---|---|---|---|",
     ]
     for item in coverage.items:
         cells = [
@@ -96,8 +101,11 @@ def make_coverage_page(coverage: Coverage, title: str) -> str:
             item.item,
             ", ".join(item.names),
             item.place,
+            ", ".join(f"`{path}`" for path in item.fields),
             item.proof,
             f"`{item.test.rpartition('/')[2]}`",
         ]
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+    if coverage.gaps:
+        lines += ["", "Not covered:", "", *(f"* {gap}" for gap in coverage.gaps)]
     return "\n".join(lines) + "\n"

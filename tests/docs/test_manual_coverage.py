@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import functools
+import re
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -24,19 +26,47 @@ def test_the_three_first_sensors_have_a_page() -> None:
     assert sensors == {"cspc-m1c1-mini", "ldrobot-stl27l", "robosense-m1"}
 
 
+@functools.cache
+def read_tests(file: str) -> dict[str, str]:
+    """Return the text of each test function in a file, with its decorators."""
+    path = ROOT / file
+    if not path.is_file():
+        return {}
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    tests = {}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            tests[node.name] = "\n".join(lines[first - 1 : node.end_lineno])
+    return tests
+
+
+def read_test(item: Any) -> str:
+    """Return the text of the test that an item names; "" if it does not exist."""
+    file, _, function = item.test.partition("::")
+    return read_tests(file).get(function, "")
+
+
 def list_missing_tests(coverage: Any) -> list[str]:
     """Return the tests that items name and that do not exist."""
-    missing = []
+    return [item.test for item in coverage.items if not read_test(item)]
+
+
+def list_unrelated_tests(coverage: Any) -> list[str]:
+    """Return the items whose test contains none of their words.
+
+    The words are `covers`, or else the names in the manual and the last part of each field's path.
+    """
+    unrelated = []
     for item in coverage.items:
-        file, _, function = item.test.partition("::")
-        path = ROOT / file
-        names = set[str]()
-        if path.is_file():
-            nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            names = {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
-        if function not in names or not function.startswith("test_"):
-            missing.append(item.test)
-    return missing
+        last_parts = {path.rpartition(".")[2].strip("*_") for path in item.fields}
+        words = {item.covers} if item.covers else {*item.names, *last_parts}
+        text = read_test(item)
+        found = (re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words if word)
+        if not any(found):
+            unrelated.append(f"{item.section}: {item.item} ({item.test})")
+    return unrelated
 
 
 def list_missing_names(coverage: Any) -> set[str]:
@@ -70,6 +100,11 @@ def test_each_item_names_a_test_that_exists(coverage: Any) -> None:
 
 
 @EACH_MANUAL
+def test_each_item_names_a_test_that_contains_it(coverage: Any) -> None:
+    assert list_unrelated_tests(coverage) == []
+
+
+@EACH_MANUAL
 def test_each_field_of_the_manuals_tables_is_an_item(coverage: Any) -> None:
     assert list_missing_names(coverage) == set()
 
@@ -98,6 +133,8 @@ def test_a_page_has_a_row_for_each_item(coverage: Any) -> None:
     for row, item in zip(rows[1:], coverage.items, strict=True):
         assert row.startswith(f"| {item.section} |")
         assert item.test.rpartition("/")[2] in row
+        assert all(f"`{path}`" in row for path in item.fields)
+    assert all(f"* {gap}" in page.splitlines() for gap in coverage.gaps)
 
 
 def test_gaps_are_found() -> None:
@@ -106,3 +143,24 @@ def test_gaps_are_found() -> None:
     assert list_missing_tests(coverage) == [item.test]
     assert list_missing_names(coverage) == {"speed"}
     assert "data.speed" in list_missing_fields(coverage)
+
+
+@pytest.mark.parametrize(
+    ("words", "is_related"),
+    [
+        ({"fields": ("data.speed", "data.crc")}, True),
+        ({"names": ("speed",)}, True),
+        ({"covers": "list_missing_names"}, True),
+        ({"fields": ("data.start_angle",)}, False),
+        ({"fields": ("data.spee",)}, False),
+        ({"fields": ("data.speed",), "covers": "10 Hz"}, False),
+        ({}, False),
+    ],
+)
+def test_a_test_without_the_words_of_its_item_is_found(
+    words: dict[str, Any], is_related: bool
+) -> None:
+    test = "tests/docs/test_manual_coverage.py::test_gaps_are_found"  # it contains "speed"
+    item = SCRIPT.Item("1", "it", "here", "so", test, **words)
+    coverage = SCRIPT.Coverage("ldrobot-stl27l", "manual", {}, (item,))
+    assert (list_unrelated_tests(coverage) == []) == is_related

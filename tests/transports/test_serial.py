@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import termios
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,6 +56,27 @@ def test_the_sensor_says_the_baud_rate_and_the_source_overrides_it(tmp_path: Pat
             one = open_port(source, sensor)
             assert one.baud == baud
             one.close()
+
+
+def test_a_port_is_opened_with_8n1_without_flow_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requested: list[list[Any]] = []  # a pseudo terminal has 8 data bits whatever is requested
+    monkeypatch.setattr(termios, "tcsetattr", lambda port, when, state: requested.append(state))
+    with port(tmp_path) as line:
+        descriptor = os.open(line.name, os.O_RDWR | os.O_NOCTTY)
+        state = termios.tcgetattr(descriptor)
+        os.close(descriptor)
+        state[0] |= termios.IXON | termios.IXOFF
+        state[2] |= termios.PARENB | termios.CSTOPB | termios.CRTSCTS
+        state[2] = state[2] & ~termios.CSIZE | termios.CS7
+        monkeypatch.setattr(termios, "tcgetattr", lambda port: [*state])
+        open_port(f"serial://{line.name}", ls.sensor("ldrobot-stl27l")).close()
+    iflag, _, cflag, _, ispeed, ospeed, _ = requested[-1]
+    assert (ispeed, ospeed) == (termios.B921600, termios.B921600)
+    assert cflag & termios.CSIZE == termios.CS8
+    assert not cflag & (termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
+    assert not iflag & (termios.IXON | termios.IXOFF)
 
 
 def test_control_lines_are_ignored_by_ports_without_them(tmp_path: Path) -> None:

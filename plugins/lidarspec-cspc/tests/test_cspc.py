@@ -103,7 +103,8 @@ def test_the_fields_of_the_answers_and_of_the_device_information() -> None:
     ack = SENSOR.parse(vector_bytes(FILE, "cspc_ack_start"))
     assert (ack.mode, ack.firmware, ack.reserved, ack.checksum) == (0x50, 3, bytes(6), 0xAB)
     info = SENSOR.parse(INFO)
-    assert info.model == b"M1C1_Mini\0\0\0"
+    assert info.model == b"M1C1_Mini\0\0\0"  # nine characters, and 00 ends them
+    assert info.reserved == bytes(3)
     assert (info.sum, info.zero_angle, info.direction, info.correction, info.revision) == (
         0x0403,
         12,
@@ -112,6 +113,27 @@ def test_the_fields_of_the_answers_and_of_the_device_information() -> None:
         4,
     )
     assert SENSOR.decode(INFO, "info")["zero_angle"].tolist() == [12]
+
+
+def test_the_length_of_the_device_information_counts_the_data_only() -> None:
+    assert SENSOR.parse(INFO).length == len(INFO[7:]) == 20
+    assert INFO[2:4] == b"\x14\x00"  # the low byte is first
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        # the manual's example of a length: a5 + 5a + 05 + 02 + 1 + 2 + 3 + 4 + 5 = 115
+        "a55a 0500 1501 02 0102030405",
+        "a55a 0100 0401 01 03",  # a5 + 5a + 01 + 01 + 03 = 104
+        "a55a 0100 8301 81 02",
+    ],
+)
+def test_other_types_and_lengths_of_information_are_skipped(frame: str) -> None:
+    data = bytes.fromhex(frame)
+    assert sum(data[:4] + data[6:]) == int.from_bytes(data[4:6], "little")
+    packets = decode(SENSOR, data + QUADRANTS)
+    assert (len(packets), packets.stats.bytes_skipped) == (1, len(data))
 
 
 def test_the_printed_sum_of_the_device_information_is_wrong() -> None:

@@ -54,6 +54,44 @@ def test_the_exposure_is_a_column_of_the_points() -> None:
     assert cloud.to_structured()["exposure"].tolist() == [HIGH, LOW, LOW]
 
 
+@pytest.mark.parametrize(
+    ("sample", "distance", "intensity", "exposure"),
+    [
+        ("ff ff ff", 16383, 255, 3),
+        ("01 00 80", 8192, 0, HIGH),  # 80 * 64
+        ("02 04 00", 1, 0, LOW),  # 04 >> 2
+        ("fd 03 00", 0, 255, HIGH),  # 3 * 64 + (fd >> 2)
+        ("92 a1 0f", 1000, 100, LOW),
+    ],
+)
+def test_the_bits_of_a_sample(sample: str, distance: int, intensity: int, exposure: int) -> None:
+    """Distance (14 bits, mm) and intensity (8 bits) by the formulas of 2.2.3."""
+    low, second, high = bytes.fromhex(sample)
+    assert distance == high * 64 + (second >> 2)
+    assert intensity == (second & 0x03) * 64 + (low >> 2)
+    samples = [{"distance": distance, "intensity": intensity, "exposure": exposure}]
+    angle = {"angle": 0}
+    packet = SENSOR.build("data", mt={"m": 0, "start": 0}, fsa=angle, lsa=angle, samples=samples)
+    assert packet[10:] == bytes.fromhex(sample)
+    assert SENSOR.decode(packet)["samples.distance"].tolist() == [[distance / 1000]]
+
+
+def test_the_checksum_by_the_rule_of_the_manual() -> None:
+    """CS is the XOR of all words but itself; the first byte of a sample is a word with 00."""
+    packet = build_packet([HIGH, LOW, HIGH])
+    words = [packet[place : place + 2] for place in (0, 2, 4, 6)]
+    for place in range(10, len(packet), 3):
+        words += [packet[place : place + 1] + b"\0", packet[place + 1 : place + 3]]
+    checksum = 0
+    for word in reversed(words):  # the order does not matter
+        checksum ^= int.from_bytes(word, "little")
+    assert SENSOR.parse(packet).cs == checksum
+    changed = packet[:12] + bytes([packet[12] ^ 1]) + packet[13:]
+    with pytest.raises(ls.WireError) as caught:
+        SENSOR.parse(changed)
+    assert caught.value.path == "cs"
+
+
 def test_the_exposure_is_written_to_csv(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(build_packet([HIGH, LOW]))
     command = f"{sys.executable} -m lidarspec convert a.bin a.csv -s {SENSOR.id}"
@@ -116,6 +154,17 @@ def measure(data: bytes) -> tuple[list[float], list[int]]:
     speeds = packets["frequency"][packets["mt.start"] == 1].tolist()
     exposures = [int(scan.points.extra["exposure"].max()) for scan in scans]
     return speeds, exposures
+
+
+def test_a_simulated_sensor_is_silent_until_start_and_after_stop() -> None:
+    running = Running()
+    assert running.read(2.0) == b""
+    running.send("start")
+    assert SENSOR.scans(running.read(3.0))
+    running.send("stop")
+    running.read(0.1)  # its acknowledgement
+    assert running.read(2.0) == b""
+    assert (SENSOR.on_open, SENSOR.on_close) == (("start",), ("stop",))
 
 
 def test_a_simulated_sensor_starts_with_high_exposure_which_follows_the_speed() -> None:

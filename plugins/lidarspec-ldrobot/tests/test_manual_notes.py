@@ -1,4 +1,4 @@
-"""Test of the wiring of an STL-27L on its page (manual, section 2)."""
+"""Tests of wiring and speed control of an STL-27L on its page (manual, sections 1 and 2)."""
 
 from __future__ import annotations
 
@@ -27,3 +27,18 @@ def test_the_page_has_the_signals_of_the_connector(row: list[str]) -> None:
     cells = [cell.strip() for cell in lines[0].strip("|").split("|")]
     assert [cells[0], cells[1].partition(":")[0], *cells[2:]] == row
     assert "ZH1.5T-4P" in text
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "**Internal control** holds 10 +- 0.1 Hz, at most 3 s after power-up: connect PWM to GND.",
+        "An open pin is not allowed.",
+        "20 to 50 kHz (30 kHz recommended)",
+        "a duty cycle above 45 % and below 55 % for at least 100 ms",
+        "the duty cycle starts, stops and sets the speed, until the power is switched off",
+        "The speed at a given duty cycle differs between units",
+    ],
+)
+def test_the_page_has_the_rules_of_the_speed_control(sentence: str) -> None:
+    assert sentence in " ".join(NOTES.read_text(encoding="utf-8").split())

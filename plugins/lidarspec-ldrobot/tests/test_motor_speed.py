@@ -83,6 +83,12 @@ def test_the_speed_settles(example: ModuleType, hertz: float, gain: float, lag: 
     assert pin.value == pytest.approx(hertz / gain, abs=0.01)
 
 
+def test_external_control_begins_within_the_limits(example: ModuleType) -> None:
+    assert 20_000 <= example.FREQUENCY_HZ <= 50_000
+    assert 0.45 < example.START_DUTY < 0.55  # 45 and 55 % are excluded
+    assert example.START_S > 0.1  # 100 ms
+
+
 @pytest.mark.parametrize("hertz", ["0", "-1", "0.4", "nan"])
 def test_a_speed_without_complete_scans_is_refused(
     example: ModuleType,

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import lidarspec as ls
+import lidarspec_robosense
 from lidarspec.detect.identification import read_info
 from lidarspec.framing.results import Found
 
 M1 = ls.sensor("robosense-m1")
+NOTES = Path(lidarspec_robosense.__file__).parent / "notes" / "robosense-m1.md"
 MODES = {
     "return_mode": 0,
     "time_sync_mode": 2,
     "time_sync_status": 1,
     "pl_firmware": bytes([0, 1, 2, 3, 4]),
+    "ps_firmware": bytes([5, 6, 7, 8, 9]),
 }
 POWER = {
     "serial_number": bytes([1, 2, 3, 4, 5, 6]),
@@ -39,6 +44,7 @@ def test_difop_of_rs_driver_reports_modes_and_power(frame: str) -> None:
     facts = report(frame, **POWER)
     assert facts["serial"] == "010203040506"
     assert facts["firmware"] == "0001020304"
+    assert facts["ps_firmware"] == "0506070809"
     assert facts["return_mode"] == "dual"
     assert facts["sync_mode"] == "PTP"
     assert facts["sync_status"] == "locked"
@@ -67,3 +73,34 @@ def test_the_firmware_decides_the_temperature(firmware: str, byte: int, celsius:
     assert sensor.decode([packet])["mems_tmp"].tolist() == [celsius]
     assert read_info(sensor, [Found("data", 0, packet)])["temperature"] == f"{celsius} degC"
     assert "temperature" not in read_info(M1, [Found("data", 0, packet)])
+
+
+def test_the_load_of_the_network() -> None:
+    """Table 2 and page 6 of the M1 user guide; the rate is that of 630 packets a frame."""
+    packets = ls.simulate(M1, 1500)
+    data = [packet for packet in packets if len(packet) == 1210]
+    times_ns = M1.decode(data).time_ns
+    rate_hz = 1e9 * (len(data) - 1) / np.ptp(times_ns)
+    assert rate_hz == pytest.approx(6300, rel=1e-3)
+    assert rate_hz * 1210 * 8 == pytest.approx(61e6, rel=1e-3)  # bits a second
+    printed = 58.2e6
+    assert printed == pytest.approx(6000 * 1210 * 8, rel=3e-3)
+    assert len(M1.example("difop")) == 256
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "| address of the sensor | 192.168.1.200 |",
+        "| address of the host | 192.168.1.102 |",
+        "| points (MSOP) | UDP port 6699 |",
+        "| device information (DIFOP) | UDP port 7788 |",
+        "mask 255.255.255.0",
+        "about 61 Mbit/s with single returns and twice as much with dual returns",
+        "6 300 and 12 600 packets a second",
+        "the guide prints at least 58.2 and 116.4 Mbit/s",
+        "Clocks are synchronised by GPS (PPS), PTP or gPTP.",
+    ],
+)
+def test_the_page_has_the_network(sentence: str) -> None:
+    assert sentence in " ".join(NOTES.read_text(encoding="utf-8").split())

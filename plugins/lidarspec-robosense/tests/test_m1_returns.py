@@ -90,6 +90,18 @@ def test_the_return_sequence_decides_not_the_counter() -> None:
     assert (scan.points.range == NEAR_M).all()
 
 
+@pytest.mark.parametrize(("mode", "name"), [(4, "strongest"), (5, "last"), (6, "first")])
+def test_each_mode_of_single_return_has_one_packet_for_its_firings(mode: int, name: str) -> None:
+    packets = []
+    for number in (1, 2):
+        parsed = M1.parse(make_packet(number))
+        blocks = [{**block, "return_seq": 0} for block in parsed.blocks]
+        packets.append(M1.build("data", {**parsed, "wave_mode": mode, "blocks": blocks}))
+    assert M1.parse(packets[0]).wave_mode.name == name
+    assert M1.decode(packets).returns().shape == (2, 25, 5, 1)
+    assert len(set(M1.decode(packets).points().column)) == 50
+
+
 def test_the_counter_decides_if_the_return_sequence_does_not() -> None:
     same = [make_packet(number, 0) for number in (1, 2)]
     returns = M1.decode(same).returns()

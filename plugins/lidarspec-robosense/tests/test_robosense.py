@@ -223,6 +223,40 @@ def test_the_device_information() -> None:
     assert SENSOR.links["data"] == Udp(parsed.msop_port, parsed.difop_port)
 
 
+@pytest.mark.parametrize("layout", ["difop", "difop_fov", "difop_guide", "difop_other"])
+def test_the_first_28_bytes_are_equal_in_all_layouts(layout: str) -> None:
+    head = bytes.fromhex(
+        "a5ff005a11115555 00 0a c0a801c8 c0a80166 001ccd0a0b0c 1a2b 1e6c"
+    )  # 10 Hz, 192.168.1.200, 192.168.1.102, MAC, 6699, 7788
+    data = head + SENSOR.example(layout)[28:]
+    parsed = SENSOR.parse(data, layout)
+    assert parsed.frame_rate == 10
+    assert parsed.lidar_ip == bytes([192, 168, 1, 200])
+    assert parsed.host_ip == bytes([192, 168, 1, 102])
+    assert parsed.mac == bytes.fromhex("001ccd0a0b0c")
+    assert (parsed.msop_port, parsed.difop_port) == (6699, 7788)
+    assert SENSOR.build(layout, parsed) == data
+
+
+def test_the_field_of_view_is_in_its_layout_only() -> None:
+    data = bytearray(vector_bytes(FILE, "rsm1_difop_rs_driver_fov"))
+    data[28:36] = bytes.fromhex("1770 2ee0 04e2 09c4")  # 60, 120, 12.5 and 25 degrees
+    found = decode(SENSOR, [bytes(data)], "difop_fov")
+    fields = ("horizontal_start", "horizontal_end", "vertical_start", "vertical_end")
+    assert [found[name].tolist() for name in fields] == [[60], [120], [12.5], [25]]
+
+
+@pytest.mark.parametrize(("layout", "start"), [("difop", 117), ("difop_fov", 125)])
+def test_calibration_by_its_offset(layout: str, start: int) -> None:
+    data = bytearray(SENSOR.example(layout))
+    for number in range(20):
+        entry = bytes([number % 2]) + (1000 + number).to_bytes(2, "big")
+        data[start + 3 * number : start + 3 * number + 3] = entry
+    calibration = SENSOR.parse(bytes(data), layout).calibration
+    signs_and_values = [(entry.sign, entry.value) for entry in calibration]
+    assert signs_and_values == [(number % 2, 1000 + number) for number in range(20)]
+
+
 def test_device_information_layouts_are_distinguished() -> None:
     """Layouts are distinguished by the values at the offsets of modes and time.
 
