@@ -11,6 +11,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import functools
+import operator
 import itertools
 from collections.abc import Mapping
 from typing import Any
@@ -572,9 +573,10 @@ def _find_count(
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part, given its values.
 
-    This is the first kind that has all given fields and no contradicting constant, or else the
-    first of all kinds.
+    This is a kind that has all given fields and no contradicting constant; of several, the one with
+    the fewest fields that are not given. If there is none, it is the first of all kinds.
     """
+    possible = list[tuple[int, Kind]]()
     for kind in node.kinds:
         fields = make_schema(kind.root)
         constants = [(info, part.get(path)) for path, info in fields.fields.items()]
@@ -584,8 +586,11 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
             for info, value in constants
             if info.const is not None
         ):
-            return kind
-    return node.kinds[0]
+            names = {path.partition(".")[0] for path in fields.fields}
+            possible.append((len(names - part.keys()), kind))
+    if not possible:
+        return node.kinds[0]
+    return min(possible, key=operator.itemgetter(0))[1]
 
 
 @functools.lru_cache(maxsize=1024)

@@ -218,7 +218,7 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
     """Return the rows of packets that have a clock reading, and the readings in ns.
 
     The rows are None if all packets have a reading. If the parts of a frame have the clock, this is
-    the reading of the first part.
+    the reading of the first part. A frame whose header leaves out a field of the clock has none.
     """
     assert sensor.clock is not None
     fields = clock_fields(sensor.clock)
@@ -231,7 +231,15 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
     if callable(source):
         terms = header_function(source, batch.table.schema, _to_ns)(batch)
         return None, sum(terms, np.zeros(len(batch), np.int64))
-    return None, _sum_fields(fields, batch.table, sensor.id)
+    readings = _sum_fields(fields, batch.table, sensor.id)
+    presences = [batch.table.present(path) for path in fields]
+    optional = [presence for presence in presences if presence is not None]
+    if not optional:
+        return None, readings
+    rows = np.flatnonzero(np.all(optional, axis=0))
+    if len(rows) == len(batch):
+        return None, readings
+    return rows, readings[rows]
 
 
 def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:

@@ -115,7 +115,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
     if not clock_fields(shared) or (declared.imu is None and sensor.has_points):
         return None
     schema = get_codec(declared).schema
-    if all(path in schema.fields for path in clock_fields(shared)):
+    if all(path in schema.scan_names for path in clock_fields(shared)):
         return shared
     return None
 

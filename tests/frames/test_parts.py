@@ -12,7 +12,7 @@ from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, thi
 import lidarspec as ls
 from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree
-from lidarspec.spec import Checksummed, Frame, Parts, Simulation, SizeOf, Sum, Xor
+from lidarspec.spec import Checksummed, Clock, Frame, Parts, Scaled, Simulation, SizeOf, Sum, Xor
 from tests.agreement import assert_backends_agree
 from tests.by_construct import reader
 from tests.engine import against_construct
@@ -134,6 +134,45 @@ def test_the_clock_of_a_part_is_its_own() -> None:
             40_000,
             60_000,
         ]
+
+
+@pytest.mark.parametrize("backend", ["auto", "construct"])
+def test_the_clock_in_a_part_of_a_frame_without_points(backend: str) -> None:
+    time = Struct("kind" / Const(1, Int8ub), "seconds" / Scaled(Int16ub, 0.001, "s"))
+    heat = Struct("kind" / Const(2, Int8ub), "temperature" / Scaled(Int16ub, 0.1, "degC"))
+    report = Struct(
+        "head" / Const(b"\xc5\x02\x03"),
+        "count" / Int8ub,
+        "tags" / Parts({"time": time, "heat": heat}, this.count),
+    )
+    logger = dataclasses.replace(
+        against_construct.sensor(report, max_length=99),
+        frames={"data": Frame(report, max_length=99)},
+        clock=Clock("tags.time.seconds"),
+        points=None,
+        scan=None,
+    )
+    frames = [
+        logger.build("data", tags=[dict(kind=1, seconds=ms), dict(kind=2, temperature=5)])
+        for ms in (1500, 2500)
+    ]
+    packets = reader(logger, backend).decode(frames, "data")
+    assert packets.time_ns.tolist() == [1_500_000_000, 2_500_000_000]
+
+
+def test_a_part_is_built_as_the_kind_with_no_further_fields() -> None:
+    pair = Struct("kind" / Const(2, Int8ub), "a" / Int8ub, "next" / Const(3, Int8ub), "b" / Int8ub)
+    single = Struct("kind" / Const(2, Int8ub), "a" / Int8ub)
+    report = Struct(
+        "count" / Int8ub,
+        "tags" / Parts({"pair": pair, "single": single}, this.count),
+        "end" / Const(b"\x99\x98"),
+    )
+    sensor = against_construct.sensor(report, max_length=99)
+    frame = bytes.fromhex("03 02 07 02 08 03 01 02 09 99 98")
+    parsed = sensor.parse(frame)
+    assert [tag.a for tag in parsed.tags] == [7, 8, 9]
+    assert sensor.build("data", parsed) == frame
 
 
 FOUR = Struct("kind" / Const(4, Int8ub), "value" / Int16ub)

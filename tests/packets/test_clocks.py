@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from construct import Array, Int8ub, Int16ul, Int64ul, Struct
+from construct import Array, If, Int8ub, Int16ub, Int16ul, Int64ul, Struct, this
 
 from lidarspec import SpecError
 from lidarspec.packets.clocks import Unwrapper
@@ -28,6 +28,17 @@ def test_unseen_clock_turns_are_counted_by_arrival_times() -> None:
     first = clock.push(times(10, 11), NOW + times(0, 1))
     later = clock.push(times(12, 13), NOW + times(92, 93))
     assert ((np.concatenate([first, later]) - first[0]) / SECOND).tolist() == [0, 1, 92, 93]
+
+
+def test_a_packet_without_the_optional_clock_has_the_time_of_the_one_before() -> None:
+    struct = Struct(
+        "has_time" / Int8ub, "time" / If(this.has_time == 1, Scaled(Int16ub, 0.001, "s"))
+    )
+    ours = dataclasses.replace(sensor(struct), clock=Clock("time"))
+    frames = [b"\1\x05\xdc", b"\0", b"\0", b"\1\x09\xc4"]
+    for backend in BACKENDS:
+        packets = reader(ours, backend).decode(frames)
+        assert (packets.time_ns / SECOND).tolist() == [1.5, 1.5, 1.5, 2.5]
 
 
 def test_a_pause_of_more_than_half_a_turn_goes_forward_where_the_host_says_so() -> None:
