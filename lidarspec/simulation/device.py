@@ -298,6 +298,7 @@ class _PlannedData(NamedTuple):
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
+        index: the index of a periodic frame since its first one, which its sweep gets.
     """
 
     at: float
@@ -305,6 +306,7 @@ class _PlannedData(NamedTuple):
     link: str
     frame: str
     data: bytes
+    index: int = 0
 
 
 class _FrameStream:
@@ -619,13 +621,9 @@ class SimulatedDevice:
         else:
             rate = 0.0
         if rate:
-            number = round(due.at * rate / SECOND) + 1
-            self._put(
-                due.at + SECOND / rate,
-                due.link,
-                due.frame,
-                self._replies.make_periodic_frame(due.frame, number),
-            )
+            index = due.index + 1
+            data = self._replies.make_periodic_frame(due.frame, index)
+            self._put(due.at + SECOND / rate, due.link, due.frame, data, index)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
         """Plan the reply to a command, unless the command is ignored while data is sent.
@@ -712,9 +710,9 @@ class SimulatedDevice:
             )
         return stream_simulation
 
-    def _put(self, at: float, link: str, frame: str, data: bytes) -> None:
+    def _put(self, at: float, link: str, frame: str, data: bytes, index: int = 0) -> None:
         self._planned += 1
-        heapq.heappush(self._plan, _PlannedData(at, self._planned, link, frame, data))
+        heapq.heappush(self._plan, _PlannedData(at, self._planned, link, frame, data, index))
 
     def _switch_plug(self, now: int) -> None:
         """Disconnect or reconnect the device when it is due."""

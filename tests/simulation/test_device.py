@@ -20,7 +20,7 @@ from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, FaultyLink, parse_faults
 from lidarspec.simulation.simulator import RestingImu
-from lidarspec.spec import Command, Frame, Scaled, Simulation
+from lidarspec.spec import Command, Frame, Scaled, Serial, Simulation
 from lidarspec.spec.fields import duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -239,6 +239,30 @@ def test_periodic_frames_are_made_in_batches(monkeypatch: pytest.MonkeyPatch) ->
     assert len(times) > 50
     assert times == sorted(set(times))
     assert filled * 20 < len(times)
+
+
+def test_the_frames_of_a_logger_are_numbered_from_its_start_command_on() -> None:
+    report = Struct("head" / Const(b"\xc5\x02\x03"), "number" / Int8ul)
+    order = Struct("head" / Const(b"\xc5\x09\x09"), "code" / Int8ul)
+    logger = Sensor(
+        "test-logger",
+        vendor="Test",
+        model="Logger",
+        frames={
+            "data": Frame(report, simulation=Simulation(lambda i: {"number": i}, rate=100.0)),
+            "order": Frame(order, direction="out"),
+        },
+        commands={"go": Command("order", {"code": 1}, starts=True)},
+        on_open=("go",),
+        links={"data": Serial(115200)},
+        status="manual",
+        source="invented for the tests",
+    )
+    device = on(logger)
+    assert passing(device, 0, 200 * MS) == b""
+    assert send_command(device, "go", 200 * MS) == logger.build("data", number=0)
+    later = passing(device, 210 * MS, 260 * MS)
+    assert later == b"".join(logger.build("data", number=number) for number in range(1, 6))
 
 
 def test_a_device_that_was_not_polled_does_not_flood() -> None:
