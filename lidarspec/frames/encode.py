@@ -11,8 +11,8 @@ from __future__ import annotations
 import bisect
 import contextlib
 import functools
-import operator
 import itertools
+import operator
 from collections.abc import Mapping
 from typing import Any
 

@@ -68,7 +68,7 @@ def find_target(text: str | Path) -> CheckTarget:
 
     Raises:
         SourceError: for a file that does not exist, or the folder of a distribution that is not
-            installed.
+            installed from it.
         UnknownSensor: for any other name.
     """
     name = str(text)
@@ -80,7 +80,13 @@ def find_target(text: str | Path) -> CheckTarget:
     entries = _find_entry_points(name)
     if entries:
         return _find_distribution_target(entries)
-    sensor = registry().sensor(name)
+    try:
+        sensor = registry().sensor(name)
+    except UnknownSensor as error:
+        if not error.failure:
+            raise
+        # The distribution failed to load: its findings name the line and what to change.
+        return _find_distribution_target(_find_entry_points(error.distribution))
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [
         file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])
@@ -133,6 +139,17 @@ def _find_folder_target(folder: Path) -> CheckTarget:
     entries = _find_entry_points(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
+    elsewhere = [
+        module
+        for entry in entries
+        for module in module_files(entry.value)
+        if folder.resolve() not in module.resolve().parents
+    ]
+    if elsewhere:
+        raise SourceError(
+            f"the installed {name} is not the one in {folder}: its module is {elsewhere[0]};"
+            f" pip install -e {folder}"
+        )
     return _find_distribution_target(entries)
 
 

@@ -344,6 +344,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
         if (
             info.name in MEASURE_NAMES
             and info.kind in ("int", "float")
+            and info.bits > 1  # a single bit is a flag, such as "the temperature is too high"
             and not info.unit
             and not info.labels
             and path not in pure

@@ -129,6 +129,17 @@ def test_a_folder_of_a_distribution_that_is_not_installed_is_named(tmp_path: Pat
     )
 
 
+def test_a_folder_with_another_copy_of_an_installed_distribution_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\nname = "lidarspec-ldrobot"\n', encoding="utf-8"
+    )
+    message = ran("check", tmp_path, code=3).stderr
+    assert (
+        f"the installed lidarspec-ldrobot is not the one in {tmp_path}: its module is " in message
+    )
+    assert f"pip install -e {tmp_path}" in message
+
+
 def test_every_rule_is_on_its_page() -> None:
     page = (ROOT / "docs" / "reference" / "check.md").read_text(encoding="utf-8")
     rows = [f"* **{rule.code}** {rule.title}: {rule.fix}" for rule in RULES.values()]

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Struct, this
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Float32l,
+    Int8ul,
+    Int16sl,
+    Int16ul,
+    Struct,
+    this,
+)
 
 from lidarspec import Sensor
+from lidarspec.entry_points import SENSORS, EntryPoint
+from lidarspec.plugins import Registry
 from lidarspec.spec import (
     Checksummed,
     Command,
@@ -19,6 +34,7 @@ from lidarspec.spec import (
     Sum,
     Xor,
 )
+from lidarspec.testing import check
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import list_unacknowledged
@@ -90,6 +106,15 @@ def test_components_of_a_direction_are_no_angle() -> None:
     assert codes(Float32l) == {"LS201"}
 
 
+def test_a_flag_with_the_name_of_a_measured_value_needs_no_unit() -> None:
+    def codes(bits: int) -> set[str]:
+        flags = BitStruct("temperature" / BitsInteger(bits), "unused" / BitsInteger(8 - bits))
+        return declared_codes(sound.sensor(sound.frame(sound.struct(flags=flags))))
+
+    assert codes(1) == set()
+    assert codes(2) == {"LS201"}
+
+
 def test_a_checksum_that_is_not_documented_has_a_remark() -> None:
     def frame(check: Any) -> Sensor:
         return sound.sensor(sound.frame(sound.struct(sum=check)))
@@ -119,3 +144,17 @@ def test_vectors_in_two_quadrants_prove_the_sense_of_the_points() -> None:
     subject.placed.add("data")
     assert held.findings(subject) == []
     assert "data: sense" in subject.picture
+
+
+def test_a_sensor_whose_plugin_does_not_load_is_checked_as_its_distribution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "acme_lidar.py").write_text("X1 = 1 / 0\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    entry = EntryPoint("acme-x1", "acme_lidar:X1", "lidarspec-acme", "1.0")
+    broken = Registry(offered=[entry])
+    monkeypatch.setattr(check, "registry", lambda: broken)
+    monkeypatch.setattr(check, "entry_points", lambda group: [entry] if group == SENSORS else [])
+    (finding,) = check.find_target("acme-x1").findings
+    assert (finding.code, finding.line) == ("LS001", 1)
+    assert "ZeroDivisionError" in finding.what
