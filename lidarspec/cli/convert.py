@@ -35,6 +35,7 @@ from lidarspec.device.source_recording import make_recorder
 from lidarspec.errors import (
     PluginError,
     SpecError,
+    UnknownField,
     UnknownFrame,
     UsageError,
     WireError,
@@ -45,6 +46,7 @@ from lidarspec.errors import (
 from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
 from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
+from lidarspec.frames.schema import make_schema
 from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
@@ -116,7 +118,8 @@ class _Counts:
     "-f",
     "--frame",
     metavar="NAME",
-    help="Write the fields of this frame type, one row per frame, instead of the points.",
+    help="Write the fields of this frame type, one row per frame, instead of the points."
+    " FRAME.PARTS.KIND writes the parts of one kind, one row per part.",
 )
 @click.option(
     "--force", is_flag=True, help="Overwrite OUT; with --to, also convert finished files again."
@@ -300,17 +303,23 @@ def _iter_imu(device: Device, selection: Selection) -> Iterator[ImuSamples]:
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
     """Return the frame types to write.
 
-    This is the requested frame type, or all types that a sensor without points sends.
+    This is the requested frame type, or all types that a sensor without points sends. A path of
+    parts may follow the frame type.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
+        UnknownField: for parts that the frame does not have.
         UsageError: if no type is requested, but the format can contain only one.
     """
     sensor = device.sensor
     frames = sensor.incoming
     if frame is not None:
-        if frame not in frames:
-            raise UnknownFrame(frame, frames, place=sensor.id)
+        name, _, parts = frame.partition(".")
+        if name not in frames:
+            raise UnknownFrame(name, frames, place=sensor.id)
+        known = _list_parts(sensor, name)
+        if parts and frame not in known:
+            raise UnknownField(frame, known, place=sensor.id)
         return [frame]
     if len(frames) > 1 and not holds_several_types(target):
         error = UsageError(
@@ -329,19 +338,49 @@ def _write_frames(
     count: int | None,
 ) -> dict[str, Any]:
     """Write the fields of frames; return the entries of the summary."""
-    batches = _select_frames(device, frames, selection, count)
+    types = list(frames)
+    parts = [part for frame in frames for part in _list_parts(device.sensor, frame)]
+    if holds_several_types(target):
+        types += parts
+    elif parts:
+        note(
+            f"{target} has no columns for the parts of {frames[0]}: repeat with"
+            f" -f {' or -f '.join(parts)}, or write an .mcap file"
+        )
+    batches = _select_frames(device, types, selection, count)
     first = next(batches, None)
     if first is None:
         raise _no_data_error(device, target)
     written = write_frames(target, itertools.chain([first], batches))
-    note(f"{target}: {written} frames of {device.sensor.id}; {device.stats}")
+    noun = "rows" if any("." in name for name in types) else "frames"
+    note(f"{target}: {written} {noun} of {device.sensor.id}; {device.stats}")
     return {"frames": written}
 
 
+def _list_parts(sensor: Sensor, frame: str) -> list[str]:
+    """Return the types of the parts in frames of a type, such as "report.tags.temperature".
+
+    Returns an empty list for a type that is itself a type of parts.
+    """
+    if frame not in sensor.frames:
+        return []
+    separate_parts = make_schema(sensor.frames[frame].tree).separate_parts
+    return [
+        ".".join(filter(None, (frame, axis, kind.name)))
+        for axis, node in separate_parts.items()
+        for kind in node.kinds
+    ]
+
+
 def _select_frames(
-    device: Device, frames: Sequence[str], selection: Selection, count: int | None
+    device: Device, types: Sequence[str], selection: Selection, count: int | None
 ) -> Iterator[dict[str, Packets]]:
-    """Yield batches with the selected frames, without empty batches."""
+    """Yield batches with the selected frames and their parts, without empty batches.
+
+    Args:
+        types: the frame types, and types of parts.
+    """
+    frames = list(dict.fromkeys(name.partition(".")[0] for name in types))
     slices = {frame: TimeSlice(selection.times) for frame in frames}
     clocks = {frame: PacketTimes(selection.time, device.source) for frame in frames}
     left = math.inf if count is None else count
@@ -353,13 +392,27 @@ def _select_frames(
             which = which[: int(min(left, len(which)))]
             left -= len(which)
             if len(which):
-                selected[frame] = packets.with_times(times).take(which)
+                chosen = packets.with_times(times).take(which)
+                selected |= _take_types(chosen, types)
         if selected:
             yield selected
         if left <= 0 or all(wanted.ended for wanted in slices.values()):
             break
     for warning in dict.fromkeys(text for clock in clocks.values() for text in clock.warnings):
         note(warning)
+
+
+def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
+    """Return the packets of a frame type, and their parts, that are among some types."""
+    found = dict[str, Packets]()
+    for name in types:
+        frame, _, path = name.partition(".")
+        if frame != packets.frame:
+            continue
+        chosen = packets.parts(path) if path else packets
+        if len(chosen):
+            found[name] = chosen
+    return found
 
 
 def _write_packets(

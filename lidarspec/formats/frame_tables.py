@@ -5,6 +5,8 @@ unit of the field; integers without a unit are unchanged. Bytes are hexadecimal 
 if the frame is text. Each element of an array of numbers is a column, for example `gains[2]`. Its
 value is nan if a frame does not have the element.
 
+Parts of a frame have rows of their own. Their type is, for example, "report.tags.temperature".
+
 A table contains one frame type. An MCAP file has a topic for each type, with JSON messages for
 Foxglove and PlotJuggler. The log time of a message is the arrival time of the frame if it is known.
 """
@@ -43,7 +45,8 @@ def frame_columns(packets: Packets) -> Columns:
         if info.const is not None:
             continue
         if info.kind == "bytes":
-            is_text = getattr(packets.sensor.frames[packets.frame].wire, "is_text", False)
+            frame = packets.frame.partition(".")[0]  # the rest is the path of parts
+            is_text = getattr(packets.sensor.frames[frame].wire, "is_text", False)
             columns[path] = _format_bytes(packets.table.raw(path), is_text=is_text)
         else:
             columns |= _split_elements(path, _read_numbers(packets, path, info))
