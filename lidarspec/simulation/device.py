@@ -298,7 +298,7 @@ class _PlannedData(NamedTuple):
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
-        index: the index of a periodic frame since its first one, which its sweep gets.
+        repetition: how often a periodic frame was sent before; the sweep gets this number.
     """
 
     at: float
@@ -306,7 +306,7 @@ class _PlannedData(NamedTuple):
     link: str
     frame: str
     data: bytes
-    index: int = 0
+    repetition: int = 0
 
 
 class _FrameStream:
@@ -621,9 +621,9 @@ class SimulatedDevice:
         else:
             rate = 0.0
         if rate:
-            index = due.index + 1
-            data = self._replies.make_periodic_frame(due.frame, index)
-            self._put(due.at + SECOND / rate, due.link, due.frame, data, index)
+            repetition = due.repetition + 1
+            data = self._replies.make_periodic_frame(due.frame, repetition)
+            self._put(due.at + SECOND / rate, due.link, due.frame, data, repetition)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
         """Plan the reply to a command, unless the command is ignored while data is sent.
@@ -710,9 +710,10 @@ class SimulatedDevice:
             )
         return stream_simulation
 
-    def _put(self, at: float, link: str, frame: str, data: bytes, index: int = 0) -> None:
+    def _put(self, at: float, link: str, frame: str, data: bytes, repetition: int = 0) -> None:
         self._planned += 1
-        heapq.heappush(self._plan, _PlannedData(at, self._planned, link, frame, data, index))
+        planned = _PlannedData(at, self._planned, link, frame, data, repetition)
+        heapq.heappush(self._plan, planned)
 
     def _switch_plug(self, now: int) -> None:
         """Disconnect or reconnect the device when it is due."""

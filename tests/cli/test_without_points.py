@@ -167,6 +167,40 @@ def test_fields_become_parquet(recording: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(table[name].to_numpy(), packets[name])
 
 
+TAGS = RECEIVER.with_name("tags.py")
+
+
+@pytest.fixture(scope="module")
+def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a file of two frames with parts of several kinds."""
+    path = tmp_path_factory.mktemp("tags") / "tags.bin"
+    heat = [dict(type=2, temperature=200 + number) for number in range(3)]
+    frames = [heat[:2], [dict(type=9, content=b"ab"), heat[2]]]
+    sensor = SHAPES["shape-tags"]
+    path.write_bytes(
+        b"".join(
+            sensor.build("data", number=number, tags=parts, padding=bytes(-(7 + size) % 8))
+            for number, (parts, size) in enumerate(zip(frames, (8, 8), strict=True))
+        )
+    )
+    return path
+
+
+def test_parts_of_one_kind_become_csv(tagged: Path, tmp_path: Path) -> None:
+    target = tmp_path / "heat.csv"
+    ran("convert", tagged, target, "-s", TAGS, "-f", "data.tags.temperature")
+    header, *rows = target.read_text().splitlines()
+    assert header.split(",")[-1] == "temperature"
+    assert [row.split(",")[-1] for row in rows] == ["20", "20.1", "20.2"]
+    result = ran("convert", tagged, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
+    assert "no columns for the parts of data" in result.stderr
+    assert "-f data.tags.temperature" in result.stderr
+    unknown = ran(
+        "convert", tagged, tmp_path / "no.csv", "-s", TAGS, "-f", "data.tags.heat", code=2
+    )
+    assert "unknown field 'data.tags.heat'" in unknown.stderr
+
+
 @pytest.mark.slow
 @needs("mcap")
 def test_fields_of_all_types_become_mcap(recording: Path, tmp_path: Path) -> None:

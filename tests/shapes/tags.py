@@ -22,6 +22,7 @@ from lidarspec.spec import (
     Serial,
     Simulation,
     Sum,
+    hookimpl,
     previous,
 )
 
@@ -95,3 +96,9 @@ SENSOR = Sensor(
     status="manual",
     source="invented for the tests: tags with a type and a length",
 )
+
+
+@hookimpl
+def lidarspec_sensors() -> list[Sensor]:
+    """Return it, so that the command line takes this file as a sensor."""
+    return [SENSOR]
