@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from construct import Const, Int8ul, Struct
 
 import lidarspec as ls
 from lidarspec import SourceError, UsageError
@@ -24,7 +25,7 @@ from lidarspec.errors import SpecError, UnknownFormat
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
-from lidarspec.spec import Command, Simulation, Udp
+from lidarspec.spec import Command, Frame, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import FairLock, Served
@@ -301,6 +302,15 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
     mistaken = sound.sensor(
         commands={"wake": Command("order", {"code": 1}), "start": start}, on_open=("start",)
     )
+    polled = dataclasses.replace(
+        sound.sensor(),
+        frames={
+            "ask": Frame(Struct("head" / Const(b"\xc5\x09\x09")), direction="out"),
+            "value": Frame(Struct("head" / Const(b"\xc5\x02\x03"), "value" / Int8ul)),
+        },
+        commands={"ask": Command("ask", reply="value")},
+        **dict.fromkeys(("points", "scan", "clock", "sequence"), None),
+    )
     for device, seconds, error, said in (
         (
             SimulatedDevice(slow),
@@ -314,6 +324,7 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             UsageError,
             "all sent frames",
         ),
+        (SimulatedDevice(polled), 0.1, UsageError, "sends only replies to commands"),
         (SimulatedDevice(stopped), 0.1, SpecError, "no command starts its data after stop"),
         (
             SimulatedDevice(mistaken),
