@@ -185,7 +185,8 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
         except SpecError as error:
             if name in subject.sensor.simulation.answers:
                 raise
-            what = f"cannot simulate its reply without answers= of the Simulation: {error.reason}"
+            cause = f"{error.path}: {error.reason}".removeprefix(": ")
+            what = f"cannot simulate its reply without answers= of the Simulation: {cause}"
             raise ViolationError("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
         _learn(subject, name, reply)
