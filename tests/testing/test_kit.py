@@ -569,7 +569,7 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
         "LS604 commands.ask: cannot simulate its reply without answers= of the Simulation:"
-        " cannot be simulated"
+        " page: cannot be simulated"
     )
 
 
