@@ -543,8 +543,8 @@ def convert(
             if manifest.is_new and not force and manifest.has(piece.target)
         ]:
             error = UsageError(
-                f"{taken[0]} exists already, and no {MANIFEST} tells which source it was made"
-                " from; it is not overwritten"
+                f"{taken[0]} exists already and was not overwritten: the folder has no {MANIFEST}"
+                " that names its source"
             )
             raise suggest(error, "repeat with --force, or with another folder")
         if not force:
@@ -589,8 +589,8 @@ def _iter_results(
             result = future.result()
         except BrokenProcessPool:
             error = SourceError(
-                "a worker process was killed, possibly because memory ran out; its current"
-                " piece was not written"
+                "a worker process was killed, possibly because memory ran out; the piece that it"
+                " was converting was not written"
             )
             raise suggest(error, "repeat the command: it resumes where this one ended") from None
         except Exception as failure:  # an error of a survey, or a Dask worker that died repeatedly

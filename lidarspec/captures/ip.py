@@ -319,7 +319,7 @@ def _skip_loopback_header(frame: bytes) -> int:
     # The family has the byte order of the capturing machine. Families are small numbers, so the
     # smaller value is the one in the right byte order.
     if min(little, big) not in _IP_FAMILIES:
-        raise NoDatagramError("other", "loopback without IP")
+        raise NoDatagramError("other", "loopback frames without IP")
     return _LOOPBACK_HEADER_BYTES
 
 
@@ -333,7 +333,7 @@ def _skip_ethertype(frame: bytes, ethertype: int, start: int) -> int:
     if ethertype in _UNSUPPORTED_ETHERTYPES:
         raise NoDatagramError("link", _UNSUPPORTED_ETHERTYPES[ethertype])
     if ethertype < _MIN_ETHERTYPE:
-        raise NoDatagramError("other", "802.3 without EtherType")
+        raise NoDatagramError("other", "802.3 frames without EtherType")
     name = _ETHERTYPE_NAMES.get(ethertype, f"EtherType 0x{ethertype:04x}")
     raise NoDatagramError("other", name)
 

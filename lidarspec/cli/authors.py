@@ -55,12 +55,12 @@ MAX_CAPTURE_BYTES = 1 << 22
     help="Name of the distribution, such as lidarspec-acme. The sensor is added to an existing"
     " distribution of this name.",
 )
-@click.option("--vendor", metavar="NAME", help="Name of the vendor; default: from the id.")
-@click.option("--model", metavar="NAME", help="Name of the model; default: from the id.")
+@click.option("--vendor", metavar="NAME", help="Name of the vendor; default: taken from the id.")
+@click.option("--model", metavar="NAME", help="Name of the model; default: taken from the id.")
 @click.option(
     "--link",
     type=click.Choice(["serial", "udp"]),
-    help="Link of the sensor's data; default: serial.",
+    help="Link over which the sensor sends data; default: serial.",
 )
 @click.option(
     "--from-capture",
@@ -79,12 +79,12 @@ def new(
 ) -> None:
     """Create a distribution for your own sensor, with a working example.
 
-    The distribution contains an invented sensor with frames, checksum, points, commands and
-    simulation, its tests, and an entry point, so that lidarspec finds it after installation.
-    --distribution adds a module and its tests to an existing distribution.
+    The distribution contains an invented sensor, which has frames, a checksum, points, commands and
+    a simulation. It also contains tests, and an entry point by which lidarspec finds the sensor
+    after installation. --distribution adds a module and its tests to an existing distribution.
 
-    With --from-capture, the frames are drafted from the bytes of a capture. The draft has the sync
-    bytes, the length, the checksum, counters and angles that were found, each with its evidence.
+    With --from-capture, the frames are drafted from the bytes of a capture. The draft contains the
+    sync bytes, length, checksum, counters and angles that were found, each with its evidence.
     All other bytes are marked as unknown.
     """
     names = DistributionNames(sensor_id, distribution or "", vendor or "", model or "")
@@ -136,8 +136,8 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
         raise WireError(no_bytes(capture, opened.warnings))
     frame_draft = make_draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(
-        f"{capture}: {len(frame_draft.frames)} frames,"
-        f" {frame_draft.share:.1%} of {frame_draft.bytes_in} bytes"
+        f"{capture}: found {len(frame_draft.frames)} frames, which contain"
+        f" {frame_draft.share:.1%} of the {frame_draft.bytes_in} bytes"
     )
     receiver = chunks[0].receiver
     chosen: Link = (

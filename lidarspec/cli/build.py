@@ -52,7 +52,7 @@ def build(
     sensor = named_sensor(sensor_id)
     if "=" in frame:
         error = UsageError(
-            f"frame name missing before {frame!r}; frames of {sensor.id}:"
+            f"the name of the frame is missing before {frame!r}; {sensor.id} has the frames"
             f" {', '.join(sensor.frames)}"
         )
         raise suggest(
@@ -112,9 +112,9 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    No other command is sent, so a sensor that was started keeps running when the verb ends. A value
-    without a unit is in the unit that `show` prints; rate=600rpm has a unit. If a sensor sends
-    nothing until it is started, name it with -s.
+    No other command is sent, so a sensor that was started keeps running when the verb ends. Without
+    a unit, as in rate=10, a value has the unit that `show` prints; rate=600rpm is converted to it.
+    If a sensor sends nothing until it is started, name it with -s.
     """
     if (command is None) == (digits is None):
         raise UsageError("send requires the name of a command, or bytes such as --hex 'a5 50'")
@@ -211,7 +211,7 @@ def _write_bytes(
     rest = [piece for piece in pieces if piece.frame not in sensor.data_frames]
     if len(rest) < len(pieces):
         # Data frames arrived as well, so incomplete pieces at both ends are parts of data frames.
-        note(f"{len(pieces) - len(rest)} data frames were received as well")
+        note(f"{len(pieces) - len(rest)} data frames were received besides the reply")
         rest = [piece for piece in rest if piece.is_valid or piece not in (pieces[0], pieces[-1])]
     parts = [
         (piece, part)

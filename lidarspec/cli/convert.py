@@ -167,18 +167,18 @@ def convert(
 ) -> None:
     """Write the points of a recording or capture to a file of another format.
 
-    The suffix of OUT selects the format. .csv and .npz contain the columns x y z range azimuth
-    elevation intensity time ring return_index column that the sensor has, its further columns, and
-    the number of the scan. Units are metres, radians, and seconds since the scan's stamp. .npy,
-    .ply, .pcd and the compressed .lzf.pcd contain x y z intensity ring time, the further columns
-    and, for several scans, the number of the scan. .bin contains x y z intensity, as in KITTI.
-    .xyz contains x y z.
+    The suffix of OUT selects the format. .csv and .npz contain those of the columns x, y, z, range,
+    azimuth, elevation, intensity, time, ring, return_index and column that the sensor has, its
+    further columns, and the number of the scan. Units are metres, radians, and seconds since the
+    scan's stamp. .npy, .ply, .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring,
+    time and the further columns; if several scans share a file, also the number of the scan. .bin
+    contains x, y, z and intensity, as in KITTI. .xyz contains x, y and z.
 
-    A number in the name, scans/%05d.pcd, writes one file for each scan. With %F, %H, %M or %S in
-    the name, all scans of one date, hour, minute or second share a file.
+    If OUT contains a number format, as in scans/%05d.pcd, each scan is written to a file of its
+    own. With %F, %H, %M or %S in OUT, all scans of one date, hour, minute or second share a file.
 
     With -f NAME, and for sensors without points, .csv, .parquet, .arrow, .feather and .mcap
-    contain the fields of frames, in units.
+    contain the fields of frames, in physical units.
 
     .lsr, .pcap and .pcapng contain the packets as they were received.
 
@@ -277,7 +277,7 @@ def _write_imu(
     if not len(samples):
         raise _no_data_error(device, target)
     write_imu(target, samples)
-    note(f"{target}: {len(samples)} IMU samples of {device.sensor.id}; {device.stats}")
+    note(f"{target}: {len(samples)} IMU samples from {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
 
 
@@ -353,7 +353,7 @@ def _write_frames(
         raise _no_data_error(device, target)
     written = write_frames(target, itertools.chain([first], batches))
     noun = "rows" if any("." in name for name in types) else "frames"
-    note(f"{target}: {written} {noun} of {device.sensor.id}; {device.stats}")
+    note(f"{target}: {written} {noun} from {device.sensor.id}; {device.stats}")
     return {"frames": written}
 
 
@@ -542,7 +542,7 @@ def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -
     names = [name for name in totals if name != "pieces" or totals[name] > totals["files"]]
     parts = [", ".join(f"{totals[name]} {name}" for name in names) or "nothing"]
     if done_before:
-        parts.append(f"{done_before} pieces had been converted before")
+        parts.append(f"{done_before} pieces were already converted by an earlier run")
     if failed_count:
         parts.append(f"{failed_count} failed")
     return "; ".join(parts)

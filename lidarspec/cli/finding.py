@@ -214,7 +214,10 @@ def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
         length = f"{structure.period} bytes"
     else:
         length = f"{structure.length} bytes"
-    note(f"{len(structure.frames)} frames of {length} that begin with {structure.sync.hex(' ')}")
+    note(
+        f"found {len(structure.frames)} frames of {length}, beginning with"
+        f" {structure.sync.hex(' ')}"
+    )
     return list(structure.frames)
 
 
@@ -281,10 +284,10 @@ def detect(
     """Identify the sensor that sends data, its port and its baud rate.
 
     SOURCE is a port, a file or a capture. Without SOURCE, all serial ports are tried at the baud
-    rates of the installed sensors, and all their UDP ports. Sensors are ranked by the share of the
-    bytes that are in frames with a valid checksum and plausible values. Sensors with the same
-    frames are distinguished by clock, baud rate, or a model name in the frames, if possible. -v
-    also lists the sensors that were ruled out.
+    rates of the installed sensors, and the UDP ports of these sensors are tried as well. Sensors
+    are ranked by the share of the bytes that are in frames with a valid checksum and plausible
+    values. If sensors have the same frames, they are distinguished by clock, baud rate or a model
+    name in the frames, if possible. -v also lists the sensors that were ruled out.
     """
     if source == "-":
         raise suggest(
@@ -443,8 +446,8 @@ def _iter_conclusions(
             yield f"next: lidarspec {_find_verb(verdict)} {_format_source(verdict)} {options}"
         elif verdict.candidates:
             yield (
-                f"{_describe_place(verdict.sample)}: {', '.join(list_candidates(verdict))} send the"
-                " same frames, so the model is not certain: choose one"
+                f"{_describe_place(verdict.sample)}: choose the model, because these models send"
+                f" the same frames: {', '.join(list_candidates(verdict))}"
             )
             if files := [
                 name
@@ -484,8 +487,8 @@ def _iter_conclusions(
         if unknown:
             structure_note = ""
         else:
-            structure_note = ", and without a repeated structure"
-        yield f"{size} bytes{kind} without a frame of an installed sensor{structure_note}"
+            structure_note = ", and have no repeated structure"
+        yield f"{size} bytes{kind} contain no frame of an installed sensor{structure_note}"
         yield f"next: {_find_next_command(source, unknown)}"
         return
     has_warnings = any(verdict.sample.warnings for verdict in verdicts)
@@ -501,8 +504,8 @@ def _iter_conclusions(
     )
     if is_serial and not start and list_start_required():
         yield (
-            f"{', '.join(sensor.id for sensor in list_start_required())} send nothing until they"
-            " are started"
+            "these sensors send nothing until they are started:"
+            f" {', '.join(sensor.id for sensor in list_start_required())}"
         )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
     else:

@@ -65,7 +65,7 @@ def parse(
         else:
             emit_parts(_iter_tables(sensor, frames, output), output)
         if wanted.unframed:
-            note(f"{wanted.unframed} bytes outside frames; use lidarspec explain to show them")
+            note(f"{wanted.unframed} bytes are outside frames; lidarspec explain shows them")
 
 
 def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
@@ -320,11 +320,13 @@ class FrameSelection:
             Exit: if `bad` is set and the input is damaged.
         """
         if self._ended and not self._shown and self._end <= self._from:
-            raise UsageError(f"{sample.source} has only {self._end} bytes, so no byte {self._from}")
+            raise UsageError(
+                f"{sample.source} has only {self._end} bytes; byte {self._from} does not exist"
+            )
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 if self.others:
-                    others = f", but {self.others} frames of other types"
+                    others = f"; it contains {self.others} frames of other types"
                 else:
                     others = ""
                 raise WireError(
@@ -346,7 +348,7 @@ class FrameSelection:
         yield f"{self.damaged} damaged"
         yield f"{self.unframed} byte{'s' * (self.unframed != 1)} outside frames"
         if self.others:
-            yield f"{self.others} of other types omitted"
+            yield f"{self.others} frames of other types omitted"
 
 
 def _parse_stretch(text: str | None) -> tuple[float, float]:

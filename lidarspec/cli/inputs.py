@@ -305,9 +305,9 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
     best = find_nearest_fault(sample.data)
     if best is None:
         if sensors():
-            text = f"no frame of the {len(sensors())} installed sensors found"
+            text = f"found no frame of the {len(sensors())} installed sensors"
         else:
-            text = "no frame of an installed sensor found"
+            text = "found no frame of an installed sensor"
         if sample.is_text:
             text = f"{sample.source} is text: {text}"
         error = suggest_installation(WireError(text, data=sample.data[:MAX_QUOTED_CHARS]), sample)
@@ -349,7 +349,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
         if sample is not None and (fault := _wrong_checksums_error(sample)) is not None:
             return fault
         if sample is not None and sample.is_text:
-            error = WireError(f"{source} is text, without a data frame: {stats}", sensor=sensor.id)
+            error = WireError(f"{source} is text and has no data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
             reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
@@ -429,7 +429,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())
         return (
-            f"does not contain the sensor's settings; its data frames require {assignments}",
+            f"does not contain the sensor's settings; to read its data frames, set {assignments}",
             format_sensor_options(sensor.configure(**own)),
         )
     others = [score.sensor for score in scores if score.sensor.id != sensor.id]

@@ -66,9 +66,9 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
     unit = click.option(
         "--calibration",
         metavar="FILE",
-        help="Calibration file of this unit; short for -O calibration=FILE.",
+        help="Calibration file of the device; short for -O calibration=FILE.",
     )(function)
-    help_text = "Option of the sensor, such as calibration=FILE or answer=FRAME; repeatable."
+    help_text = "Set an option of the sensor, such as calibration=FILE; can be repeated."
     return click.option(
         "-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=help_text
     )(unit)
@@ -132,7 +132,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 def colour_option(function: Function) -> Function:
     """Add ``--colour``, also spelled ``--color``, for pictures."""
-    help_text = "Value that sets the colour: range, intensity, or a further column of the points."
+    help_text = "Colour the points by range, intensity, or a further column of the points."
     return click.option(
         "--colour",
         "--color",

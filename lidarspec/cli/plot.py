@@ -146,10 +146,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
         raise no_scan_error(device, source)
     if whole_count < number:
         plural = "" if whole_count == 1 else "s"
-        note(
-            f"{source} has {whole_count} complete scan{plural}: drawing the last part that can be"
-            " drawn"
-        )
+        note(f"{source} has only {whole_count} complete scan{plural}, so the last scan is drawn")
     return chosen
 
 

@@ -101,7 +101,7 @@ def read(
 
     Points are printed when their scan is complete, with the columns of a PointCloud and the number
     of the scan. Units are metres, radians, and seconds since the scan's stamp. Packets are printed
-    with their offset in the input, their time, and the values of their fields in units. Arrays are
+    with their offset in the input, their time, and the physical values of their fields. Arrays are
     printed only with --json. Packets can be selected only by --slice and --time.
     """
     with open_device(source, sensor_id) as device:
@@ -374,9 +374,10 @@ def stats(
     """Print speed, rates, errors, loss, jitter and queue of a sensor.
 
     A line is printed for each interval, and a summary at the end. Errors are frames with a wrong
-    checksum, length or value. Loss is the share of missing packets, by the packet counter or the
-    clock of the sensor. A file is read as fast as possible, in batches. Its intervals are measured
-    by packet time, and can be longer than requested. Several sources are read one after another.
+    checksum, length or value. Loss is the share of missing packets, computed from the packet
+    counter or the clock of the sensor. A file is read as fast as possible, in batches. Its
+    intervals are measured by packet time, and can be longer than requested. Several sources are
+    read one after another.
     """
     lasting = min(duration or math.inf, interval * count if count else math.inf)
     has_findings = False

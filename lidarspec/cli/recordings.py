@@ -56,7 +56,7 @@ from lidarspec.transports.replays import LATE_NS, Replay
     type=DURATION,
     help="Stop after this time, such as 10s; default: at Ctrl-C.",
 )
-@count_option("data packets or, if no sensor is named, datagrams; a few more may be recorded")
+@count_option("data packets, or datagrams if no sensor is named; a few more may be recorded")
 @click.option("--no-start", is_flag=True, help="Send no commands to the sensor.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option(
@@ -383,13 +383,13 @@ def _print_summary(
         note(f"{file} has no arrival times, so its bytes were sent as fast as possible")
     if played.late:
         note(
-            f"{played.late} chunks were sent more than {LATE_NS // 1_000_000} ms late, up to"
-            f" {played.latest / 1e6:.0f} ms"
+            f"{played.late} chunks were sent more than {LATE_NS // 1_000_000} ms late; the longest"
+            f" delay was {played.latest / 1e6:.0f} ms"
         )
     if len(played.senders) > 1 and not is_file:
         note(
-            f"the datagrams of {len(played.senders)} senders were all sent from one address; choose"
-            f" one sender with '{file}?src=ADDRESS'"
+            f"the recording has the datagrams of {len(played.senders)} senders, but all were sent"
+            f" from one address; select one sender with '{file}?src=ADDRESS'"
         )
     if is_file:
         note(f"next: lidarspec {_view_words(sensor, target)}")

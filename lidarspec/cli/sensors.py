@@ -126,7 +126,7 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="Show how points are computed, and which parts use the slow reference evaluator.",
+    help="Show how points are computed, and for what the slow reference evaluator is used.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
@@ -245,9 +245,8 @@ def _list_plan(sensor: Sensor, frame: str) -> list[str]:
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """List the installed plugins, with the error of each plugin that fails.
 
-    All plugins are loaded in a separate process. If this process hangs or exits, each plugin is
-    loaded in its own process, to find the plugin that caused it. The exit code is 1 if a plugin
-    fails.
+    All plugins are loaded in one separate process. If it hangs or exits, each plugin is loaded in a
+    process of its own, to find the plugin at fault. The exit code is 1 if a plugin fails.
     """
     from lidarspec.plugins import try_plugins
 
@@ -281,10 +280,10 @@ def trust(folder: str) -> None:
     """Trust a folder, so that its lidarspec.toml may name Python files.
 
     The lidarspec.toml of a trusted folder may also name files outside the folder. Trust only your
-    own folders, with files that you know. The decision is stored for this folder.
-    LIDARSPEC_TRUST=FOLDER trusts a folder for a single run.
+    own folders, with files that you know. The decision is stored in your settings, and applies to
+    all later runs. LIDARSPEC_TRUST=FOLDER trusts a folder for a single run.
     """
-    say(f"{trusted(folder)}: its {FILE} is now trusted; stored in {user_folder() / TRUSTED}")
+    say(f"{trusted(folder)}: its {FILE} is now trusted, as {user_folder() / TRUSTED} records")
 
 
 def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:

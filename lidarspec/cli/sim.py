@@ -59,7 +59,7 @@ PLACES = (
 @click.argument("sensor_id", metavar="SENSOR")
 @configuring
 @click.option("--to", metavar="PLACE", help=PLACES)
-@click.option("--link", metavar="PATH", help="Path of a symbolic link to the pty.")
+@click.option("--link", metavar="PATH", help="Create a symbolic link to the pty at this path.")
 @click.option(
     "-t",
     "--duration",
@@ -108,26 +108,26 @@ PLACES = (
     show_default=True,
     help="Delay datagrams so that up to N later datagrams overtake them.",
 )
-@click.option("--unplug", type=DURATION, help="Disconnect the sensor repeatedly after this time.")
+@click.option("--unplug", type=DURATION, help="Time between simulated disconnections.")
 @click.option(
     "--shake",
     type=click.FloatRange(min=0),
     default=0.0,
     metavar="NOISE",
-    help="Standard deviation of IMU noise, m/s2 and rad/s.",
+    help="Standard deviation of the IMU noise, in m/s2 and rad/s.",
 )
 @click.option(
     "--absent",
     type=DURATION,
     default="2s",
     show_default=True,
-    help="With --unplug: time until reconnection.",
+    help="With --unplug: time for which the sensor stays disconnected.",
 )
 @click.option(
     "--clock",
     metavar="FAULT,...",
-    help="Faults of the clock: utc, tai, gps, drift=50ppm, step=0.2s@10s, pps@10s, leap@10s,"
-    " unlock=5s@10s, restart@10s.",
+    help="Simulate faults of the clock, separated by commas: utc, tai, gps, drift=50ppm,"
+    " step=0.2s@10s, pps@10s, leap@10s, unlock=5s@10s, restart@10s.",
 )
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
@@ -194,7 +194,7 @@ def sim(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; {size(opened.unsent_bytes)} were not read by any program"
+            lost = f"; no program has read {size(opened.unsent_bytes)} of the data"
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")
@@ -305,15 +305,15 @@ def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[
     name = result.sensor.id
     frames = sum(stats.frames.values())
     if result.sensor.datagrams:
-        harm = "of the datagrams lost"
+        harm = "of the datagrams were lost"
     else:
-        harm = "of the bytes damaged"
+        harm = "of the bytes were damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
-        where = f"{result.address} (no pseudo-terminals on this system)"
+        where = f"{result.address} (this system has no pseudo-terminals)"
     else:
         where = result.address
-    passed = f"{errors:.1%} {harm}, {result.intact} arrived undamaged"
+    passed = f"{errors:.1%} {harm}, {result.intact} packets arrived undamaged"
     lines = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
         *(str(reply) for reply in result.replies if reply.confirmed),

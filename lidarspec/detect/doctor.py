@@ -270,7 +270,7 @@ def _check_interfaces(
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
-        text = f"only packets to {host} are received; the sensor may send to another address"
+        text = f"the source receives only packets to {host}; the sensor may send to another address"
         yield Diagnosis(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
         text = (
@@ -280,8 +280,8 @@ def _check_interfaces(
         yield Diagnosis(False, text, f"sudo tcpdump -ni {name} udp")
         if ports.filters_senders(name):
             text = (
-                f"{name} drops packets of senders in other networks, such as a sensor with its"
-                " factory address (rp_filter)"
+                f"{name} drops packets of senders in other networks (rp_filter); a sensor with its"
+                " factory address can be such a sender"
             )
             yield Diagnosis(
                 False,
@@ -384,7 +384,8 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
             command = f"lidarspec {verb_to_show(verdict.candidates[0].sensor)} {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
-        return Diagnosis(False, f"received frames of {other} ({why}){rate}, not of {name}", command)
+        text = f"received frames of {other}{rate}, not of {name}; evidence: {why}"
+        return Diagnosis(False, text, command)
     score = next(score for score in verdict.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if sample.baud is not None and link and sample.baud not in link.bauds:
@@ -412,8 +413,8 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
     )
     return Diagnosis(
         True,
-        f"{name} sends{rate}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"
-        f" frames{printable(device)}",
+        f"{name} sends{rate}: {score.data_frames} data frames, {score.share:.0%} of the bytes are"
+        f" in frames{printable(device)}",
     )
 
 
@@ -428,7 +429,7 @@ def _diagnose_silence(source: str, sensor: Sensor | None) -> Diagnosis:
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = (
-            "no data received: start the sensor, or check its power, and that its TX line is"
+            "no data received: start the sensor, check its power, and check that its TX line is"
             " connected to the RX line of this computer"
         )
         return Diagnosis(False, text, f"lidarspec detect {quoted} --start", is_silence=True)

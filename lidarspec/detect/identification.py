@@ -491,8 +491,8 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     frames = [item.data for item in matches[0].found if item.frame == name]
     ids = " or ".join(score.sensor.id for score in matches)
     text = (
-        f"{len(frames)} {name} frames match {ids} in constants and lengths, but all their"
-        " checksums are wrong"
+        f"the constants and lengths of {len(frames)} {name} frames are those of {ids}, but all"
+        " their checksums are wrong"
     )
     match = next(iter(search(frames, quick=True)), None)
     if match is None:
@@ -501,10 +501,10 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     where = (
         f"{match.algorithm.describe()} in {match.place} is correct in {match.right} of"
-        f" {match.total}"
+        f" {match.total} frames"
     )
     return (
-        f"{text}: {where}, over {covered} of the {length - match.place.size} other bytes"
+        f"{text}; {where}, if it covers {covered} of the {length - match.place.size} other bytes"
         f" ({match.span.describe(match.place, length)})"
     )
 
@@ -608,7 +608,7 @@ def identify_sample(sample: SampleBytes) -> Verdict:
         if score.sensor.id in result.candidates
     ]
     if len(possible) > 1 and sample.baud is not None:
-        why = f"it runs at {sample.baud} baud"
+        why = f"it sends at {sample.baud} baud"
         links = [(score, data_link(score.sensor, Serial)) for score in possible]
         possible = [
             replace(score, why=why) for score, link in links if link and sample.baud in link.bauds
@@ -793,7 +793,7 @@ def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception
     if largest.size:
         kind = " in this text" if largest.is_text else ""
         error = WireError(
-            f"{source}: no frame of an installed sensor{kind}",
+            f"{source}: found no frame of an installed sensor{kind}",
             data=largest.chunks[0][:MAX_SHOWN_BYTES],
         )
         return suggest_installation(error, largest)

@@ -102,7 +102,8 @@ def read_samples(
         if not rates:
             example = with_option(text, "baud", ANY_BAUD)
             raise SourceError(
-                f"{text}: no installed sensor declares a baud rate; add one: {example}"
+                f"{text}: no installed sensor declares a baud rate; add the rate to the source:"
+                f" {example}"
             )
         first_rates = list(dict.fromkeys([rates[0], min(rates), max(rates)]))
         other_rates = [baud for baud in rates if baud not in first_rates]

@@ -292,8 +292,8 @@ class CaptureThread:
         if ahead is None:
             return
         self.warnings = [
-            f"the clock of this computer was set by {ahead / 1e9:+.3f} s; arrival times"
-            " continue without a step"
+            f"the clock of this computer was stepped by {ahead / 1e9:+.3f} s; arrival times"
+            " continue without this step"
         ]
         if self._log is not None:
             self._log.event("clock", chunk.at, ahead_ns=ahead)

@@ -166,7 +166,7 @@ def _read(
         raise failure
     if sum(one.whole for one in scans) >= turns:
         return replies, tuple(scans), device.stats
-    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, expected {turns}"
+    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, but {turns} were expected"
     raise SourceError(f"the simulated {device.sensor.id} sent {number}: {device.stats}")
 
 

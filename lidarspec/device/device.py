@@ -135,8 +135,8 @@ class Device(ClosingContext):
                 warnings.append(f"{self.source}: {text}")
         if stats.incomplete_returns:
             warnings.append(
-                f"{self.source}: some firings lack a return, because packets were lost"
-                " (stats counts incomplete_returns)"
+                f"{self.source}: some firings lack a return, because packets were lost;"
+                " incomplete_returns in stats counts these firings"
             )
         if stats.nominal:
             warnings.append(_describe_nominal(self.sensor))
@@ -354,7 +354,8 @@ class Device(ClosingContext):
         while not (self._unseen_scans and self._input.has_decoded_until(mark)):
             if self._input.ended:
                 raise SourceError(
-                    f"{self.source}: no further scan, because the input is {self._input.state}"
+                    f"{self.source}: no further scan arrives, because the input is"
+                    f" {self._input.state}"
                 )
             batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
             if batch is not None:
@@ -681,7 +682,7 @@ def open(
 
 def _describe_nominal(sensor: Sensor) -> str:
     """Return a warning about a nominal calibration, with the option that replaces it."""
-    text = f"{sensor.id}: points use the nominal calibration of the model, not of this unit"
+    text = f"{sensor.id}: points use the nominal calibration of the model, not that of the device"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
         return (

@@ -105,9 +105,9 @@ class LinkState:
         elif name == "silent":
             text = f"no data received{self._describe_others()} for {self.silent_for:.1f} s"
         elif name == "no frames":
-            text = f"no frame of {self._sensor.id} in {self._frameless_bytes} bytes"
+            text = f"received {self._frameless_bytes} bytes without a frame of {self._sensor.id}"
             if self._transport.baud:
-                text = f"{text}: {self._transport.baud} baud is probably wrong"
+                text = f"{text}; {self._transport.baud} baud is probably wrong"
         else:
             return []
         return [f"{self._source}: {text}; next: {self.suggest_command()}"]
@@ -117,7 +117,7 @@ class LinkState:
         other = self._other_sender
         if other is not None and self.name == "silent":
             chosen = with_option(self._source, "src", endpoint(other))
-            return f"repeat with {quote(chosen)} to read that sender"
+            return f"repeat with {quote(chosen)} to read the other sender"
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
             return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
         return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"

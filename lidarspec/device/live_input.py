@@ -156,7 +156,7 @@ class LiveInput(DeviceInput):
         if self._recorder is not None and self._recorder.error is not None:
             warnings.append(f"the recording has stopped: {self._recorder.error}")
         silent = [
-            f"{self._source}: {error}; sending it again"
+            f"{self._source}: {error}; sending the command again"
             for error in list(self._session.unanswered.values())
         ]
         if self._closed:
@@ -192,12 +192,12 @@ class LiveInput(DeviceInput):
                     and not self.sensor.commands[name].starts
                 ):
                     self._reported_warnings.append(
-                        f"{error}; the sensor is read without the values that it should have"
-                        " reported"
+                        f"{error}; the sensor is read without the values that the reply would have"
+                        " contained"
                     )
                 elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
                     self._reported_warnings.append(
-                        f"{error}; the sensor sends data, so reading continues"
+                        f"{error}; reading continues, because the sensor sends data"
                     )
                 else:
                     raise suggest(error, self._link_state.suggest_command()) from None
@@ -575,8 +575,8 @@ class LiveInput(DeviceInput):
                     if self.learned.get(name, value) != value
                 ]
                 self._reported_warnings += [
-                    f"{self._source}: the sensor that reconnected reports another {name}: open"
-                    " the device again"
+                    f"{self._source}: after reconnecting, the sensor reports another value of"
+                    f" {name}: open the device again"
                     for name in changed
                 ]
 

@@ -107,8 +107,8 @@ class NamedDevice:
             reason = f"sensor {self.sensor!r} is a Python file, which would be executed"
         elif is_remote(self.source):
             reason = (
-                f"source {self.source!r} is a URL, which could lead to any host, or to a"
-                f" file outside {folder}"
+                f"source {self.source!r} is a URL, which could name any host, or a file outside"
+                f" {folder}"
             )
         elif os.path.isfile(file):
             try:
@@ -119,7 +119,8 @@ class NamedDevice:
             return None
         return self._suggest_trust(
             UsageError(
-                f"{self.file}: [device.{self.name}]: {reason}: this requires a trusted folder"
+                f"{self.file}: [device.{self.name}]: {reason}; this is allowed only in a trusted"
+                " folder"
             )
         )
 
@@ -234,8 +235,8 @@ def _make_device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice
     place = f"[device.{name}]"
     if not _NAME.fullmatch(name):
         raise UsageError(
-            f"{path}: {place}: invalid name: expected a letter, then letters, digits, '-' and"
-            " '_', and not a port such as COM4"
+            f"{path}: {place}: invalid name: expected a letter followed by letters, digits, '-' or"
+            " '_'; the name of a port, such as COM4, is not allowed"
         )
     _check_keys(path, place, table, _KEYS)
     if "source" not in table:

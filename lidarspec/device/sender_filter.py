@@ -84,7 +84,7 @@ class SenderCheck:
         chosen = with_option(self._source, "src", one)
         error = UsageError(
             f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one"
-            f" with {chosen}"
+            f" sender, for example with {chosen}"
         )
         return suggest(error, f"repeat with {quote(chosen)}")
 
@@ -137,8 +137,8 @@ class SenderFilter(SenderCheck):
         if self.other_sender is None or self._owner is None:
             return []
         text = (
-            f"{self._source}: reading {endpoint(self._owner)}; ignoring"
-            f" {endpoint(self.other_sender)}, which also sends data"
+            f"{self._source}: reading data from {endpoint(self._owner)}, and ignoring data from"
+            f" {endpoint(self.other_sender)}"
         )
         other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
         return [f"{text}; next: repeat with {other} to read the other sender"]

@@ -677,7 +677,8 @@ def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     for name, value in options.items():
         if not isinstance(value, bytes | int | float):
             raise CommandError(
-                f"{place}: {name} must be a number, bytes or a string, got {type(value).__name__}"
+                f"{place}: `learns` must return a number, bytes or a string for {name}, got"
+                f" {type(value).__name__}"
             )
     return {
         name: Learned(value) if isinstance(value, bytes) else value
@@ -706,7 +707,8 @@ def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     for name, value in values.items():
         if not isinstance(value, str | int | float):
             raise CommandError(
-                f"{place}: {name} must be a number or a string, got {type(value).__name__}"
+                f"{place}: `provides` must return a number or a string for {name}, got"
+                f" {type(value).__name__}"
             )
     return values
 

@@ -42,14 +42,15 @@ _NUMBERS = re.compile(r"[\d.]+")
 def make_recorder(
     opened: Transport, source: str, target: str, sensor: Sensor | str | None, *, overwrite: bool
 ) -> BackgroundWriter:
-    """Create a recording of an open source, and return its recorder.
+    """Create a recording for a source, and return the recorder that writes it.
 
-    If the source is a recording, its sensor, source and baud rate are copied to the new header.
+    If the source is itself a recording, the sensor, source and baud rate in its header are copied
+    to the header of the new recording.
 
     Args:
-        opened: the open source.
-        source: its SOURCE, for the header.
-        target: the new file.
+        opened: the source, already opened.
+        source: the source as the user named it, which is stored in the header.
+        target: the path of the new file.
         sensor: the sensor, or its id; None if unknown.
         overwrite: whether the file may exist.
 

@@ -47,8 +47,8 @@ MIN_VALID_SHARE = 0.95
 #: Number of combinations of offset and covered bytes that are tried for a checksum in nibbles.
 NIBBLE_TRIALS = 8
 ANYWHERE_NOTE = (
-    "an XOR of a whole frame fits at several offsets; this is the offset with the most varying"
-    " bytes"
+    "an XOR of a whole frame fits at several offsets; of these, the offset was chosen whose byte"
+    " varies most"
 )
 #: Values of `WordXor.head` to try. The next constant is the values of `WordXor.groups`.
 WORD_XOR_HEADS = (0, 2, 4, 6, 8, 10, 12)
@@ -332,8 +332,8 @@ def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
             evidence_bits = weigh_evidence(8, halves, 0, NIBBLE_TRIALS)
             if are_enough(right, len(samples)) and evidence_bits > 0:
                 note = (
-                    "it is stored in the low nibbles of two bytes, low half first:"
-                    " name both in Checksummed(field=(...))"
+                    "the checksum is stored in the low nibbles of two bytes, low half first:"
+                    " name both bytes in Checksummed(field=(...))"
                 )
                 yield ChecksumMatch(
                     Xor(),

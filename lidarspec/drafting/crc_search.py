@@ -449,8 +449,8 @@ def _iter_crcs(
             1,
             (
                 (
-                    "frames of equal length do not determine init and xorout; other pairs"
-                    " give the same results"
+                    "all frames have the same length, so other pairs of init and xorout fit them"
+                    " equally well"
                 ),
             ),
         )
@@ -463,7 +463,9 @@ def _iter_crcs(
 def _solve_registers(
     remainders: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield a CRC; linear equations determine its start value and final XOR.
+    """Solve linear equations for the start value and final XOR, and yield the CRC.
+
+    Yields nothing if the equations have no solution.
 
     Args:
         remainders: frame length -> remainder of a frame of this length.
@@ -495,7 +497,7 @@ def _solve_registers(
         )
         notes: tuple[str, ...] = ()
         if free:
-            notes = (f"{2 ** len(free)} pairs of init and xorout fit these frames",)
+            notes = (f"{2 ** len(free)} pairs of init and xorout fit these frames equally well",)
         yield reading.crc(poly, init, xorout), 2, notes
 
 

@@ -68,8 +68,8 @@ class DistributionNames:
             object.__setattr__(self, name, getattr(self, name) or default)
         if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
             raise UsageError(
-                f"{self.distribution!r} is not a valid name of a distribution: expected lower case"
-                " with hyphens, such as lidarspec-acme"
+                f"{self.distribution!r} is not a valid name of a distribution: expected words in"
+                " lower case, joined by hyphens, such as lidarspec-acme"
             )
         if invalid := re.search(r'["\\\n]', self.vendor + self.model):
             raise UsageError(f"vendor and model must not contain {invalid[0]!r}")
@@ -119,11 +119,11 @@ def make_draft_files(
         origin: a description of the capture.
         port: the UDP port to which the datagrams were sent; None if unknown.
     """
-    serial = "Serial(115_200)},  # baud rate: a capture does not contain it"
+    serial = "Serial(115_200)},  # replace this baud rate: a capture does not contain it"
     if port:
-        udp = f"Udp({port})}},  # destination of the captured datagrams"
+        udp = f"Udp({port})}},  # the port to which the captured datagrams were sent"
     else:
-        udp = "Udp(2368)},  # port: this capture does not contain it"
+        udp = "Udp(2368)},  # replace this port: the capture does not contain it"
     values = {
         **names.values(),
         **make_template_values(draft, origin=origin, link=serial if link == "serial" else udp),
@@ -207,8 +207,8 @@ def add_to_distribution(
             vectors = "[]"
     if f'name = "{names.distribution}"\n' not in project or _ENTRY_POINTS not in project:
         raise UsageError(
-            f"{folder / 'pyproject.toml'} does not belong to {names.distribution},"
-            " or has no entry points lidarspec.sensors"
+            f"{folder / 'pyproject.toml'} is not the project of {names.distribution},"
+            " or has no table of the entry points lidarspec.sensors"
         )
     module = names.id.partition("-")[2].replace("-", "_")
     if not module.isidentifier():

@@ -147,7 +147,7 @@ def make_draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     structure = find_structure(chunks, datagrams=datagrams)
     if structure is None:
         raise WireError(
-            "no repeated frame structure found in these bytes", data=b"".join(chunks[:1])[:16]
+            "these bytes have no repeated frame structure", data=b"".join(chunks[:1])[:16]
         )
     parts = chunks if datagrams else [b"".join(chunks)]
     size = sum(map(len, chunks))

@@ -177,7 +177,7 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
         if len(sizes) == 1:
-            seen = f"complete frames of {sizes[0]} bytes, and a part of another"
+            seen = f"complete frames of {sizes[0]} bytes, and one incomplete frame"
         else:
             seen = f"frames of {sizes[0]} to {sizes[-1]} bytes"
         fields.append(
@@ -220,7 +220,7 @@ def _iter_sync_fields(draft: Draft) -> Iterator[DraftField]:
             continue
         code = f"Const({_format_bytes(draft.sync[first:last])})"
         if first == 0:
-            evidence = (f"{len(draft.frames)} frames begin with it",)
+            evidence = (f"{len(draft.frames)} frames begin with these bytes",)
             yield DraftField(first, last - first, "header", code, evidence)
         else:
             yield DraftField(first, last - first, f"header_{first}", code)
@@ -286,8 +286,8 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
         start_field = _find_start_field(draft, rising)
         if start_field is not None:
             evidence.append(
-                f"is between {start_field.name} of this frame and of the next frame:"
-                " the angle of the last sample?"
+                f"the value is between {start_field.name} of this frame and {start_field.name} of"
+                " the next frame: the angle of the last sample?"
             )
     return DraftField(rising.offset, rising.size, rising.name, code, tuple(evidence))
 
@@ -359,7 +359,9 @@ def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
         step = int(np.gcd.reduce([length - min(lengths) for length in lengths]))
         evidence: tuple[str, ...] = ()
         if step > 1:
-            evidence = (f"their lengths differ by multiples of {step}: samples of {step} bytes?",)
+            evidence = (
+                f"the lengths of frames differ by multiples of {step}: samples of {step} bytes?",
+            )
         yield DraftField(
             draft.head_size, 0, f"unknown_{draft.head_size}", f"Bytes({size})", evidence
         )
@@ -385,8 +387,8 @@ def _make_checksum_field(draft: Draft, checksum: ChecksumMatch, start: int) -> D
     length = min(len(frame) for _, frame in draft.frames)
     for other in draft.others[:MAX_ALTERNATIVES]:
         evidence.append(
-            f"or {other.source.splitlines()[0]} at byte {other.place.start(length)}"
-            f" over {other.span.describe(other.place, length)}"
+            f"also possible: {other.source.splitlines()[0]} at byte {other.place.start(length)},"
+            f" computed over {other.span.describe(other.place, length)}"
         )
     size = checksum.place.size
     code = _format_integer(size, checksum.order)
@@ -457,14 +459,17 @@ def _iter_sensor_arguments(angles: Sequence[str], counters: Sequence[RisingField
     if angles:
         yield f'scan=OnWrap("{angles[0]}"),{_format_alternatives("  #", angles[1:])}'
     else:
-        yield "scan=Every(0.1),  # seconds: no angle found that marks a revolution"
+        yield "scan=Every(0.1),  # seconds, because no angle was found that marks a revolution"
     if counters:
         counter = counters[0]
         limits = ""
         if counter.wraps:
             limits = f", first={counter.first}, last={counter.circle - 1}"
         alternatives = _format_alternatives(";", [other.name for other in counters[1:]])
-        yield f'sequence=PacketCounter("{counter.name}"{limits}),  # a jump is a loss{alternatives}'
+        yield (
+            f'sequence=PacketCounter("{counter.name}"{limits}),'
+            f"  # a jump means lost packets{alternatives}"
+        )
 
 
 def _format_alternatives(begin: str, names: Sequence[str]) -> str:

@@ -141,7 +141,8 @@ class RisingField:
             step = f"{usual}"
         else:
             step = f"{low} to {high}"
-        text = f"rises by {step} from {container} to {container}, in {self.right} of {self.total}"
+        of_steps = f"in {self.right} of {self.total} steps"
+        text = f"rises by {step} from {container} to {container}, {of_steps}"
         if self.kind == "angle":
             return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
         if not self.wraps:

@@ -55,7 +55,7 @@ class ChecksumPlace:
                 return f"the last {self.size} bytes"
             return "the last byte"
         if self.offset < 0:
-            where = f"{-self.offset} before the end"
+            where = f"at {-self.offset} bytes before the end"
         else:
             where = f"at byte {self.offset}"
         return f"{self.size} byte{'s' * (self.size > 1)} {where}"
@@ -88,7 +88,7 @@ class CoveredSpan:
         ) == length - place.size:
             return "all other bytes"
         if self.part == "before":
-            return f"bytes {self.head} up to the checksum"
+            return f"the bytes from {self.head} up to the checksum"
         if self.part == "behind":
             return f"all bytes from {self.head} after the checksum" + (
                 f" except the last {self.tail}" if self.tail else ""
@@ -140,8 +140,8 @@ class ChecksumMatch:
         """All remarks for the user."""
         if self.has_constant:
             constant = (
-                "it contains a constant, which may be a start value or depend on bytes that are"
-                " not covered"
+                "the checksum includes a constant; this may be a start value, or depend on bytes"
+                " that are not covered"
             )
             return (constant, *self.notes)
         return self.notes

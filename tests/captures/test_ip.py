@@ -113,13 +113,13 @@ def test_frames_cut_at_every_byte_are_snapped_or_malformed(link: int, frame: byt
 
 OTHERS = {
     "ARP": (1, made.ethernet(bytes(28), ethertype=0x0806)),
-    "802.3 without EtherType": (
+    "802.3 frames without EtherType": (
         1,
         made.ethernet(b"\xaa\xaa\x03" + PACKET, ethertype=len(PACKET) + 3),
     ),
     "ARP in VLAN": (1, made.ethernet(struct.pack(">HH", 5, 0x0806) + bytes(28), ethertype=0x8100)),
     "EtherType 0x1234": (1, made.ethernet(bytes(28), ethertype=0x1234)),
-    "loopback without IP": (0, struct.pack("<I", 7) + PACKET),
+    "loopback frames without IP": (0, struct.pack("<I", 7) + PACKET),
     "TCP": (101, made.ipv4(bytes(20), protocol=TCP)),
     "TCP in fragments": (101, made.ipv4(bytes(24), protocol=TCP, place=0x2000)),
     "TCP over IPv6": (101, made.ipv6(bytes(20), following=TCP)),

@@ -173,7 +173,7 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
         in ran("convert", log, out, code=2).stderr
     )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
-    assert "its data frames require answer=node" in told
+    assert "to read its data frames, set answer=node" in told
     following = next(line for line in told.splitlines() if "next: " in line).split(
         "next: lidarspec "
     )[1]
@@ -441,7 +441,7 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
     sensor = SHAPES["shape-inertia"]
     bytes_.write_bytes(b"".join(simulate(sensor, 40)))
     told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
-    assert "120 IMU samples of shape-inertia" in told
+    assert "120 IMU samples from shape-inertia" in told
     rows = read(tmp_path / "imu.csv")
     assert next(iter(rows)) == "time_ns"
     np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)

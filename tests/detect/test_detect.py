@@ -269,7 +269,7 @@ def test_the_baud_rate_decides_between_equal_candidates() -> None:
     assert {score.sensor.id for score in found.candidates} == {
         f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")
     }
-    assert found.candidates[0].why == "it runs at 1000000 baud"
+    assert found.candidates[0].why == "it sends at 1000000 baud"
     named = sensor.build(
         "info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16)
     )
@@ -325,7 +325,9 @@ def test_frames_with_only_wrong_checksums_are_reported(tmp_path: Path) -> None:
     alike = " or ".join(
         f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p", "stl27l")
     )
-    assert found.fault.startswith(f"60 data frames match {alike} in constants and lengths")
+    assert found.fault.startswith(
+        f"the constants and lengths of 60 data frames are those of {alike}, "
+    )
     assert (
         "CRC-8 poly 0x4d in the last byte is correct in 60 of 60, over 45 of the 46 other bytes"
         in found.fault

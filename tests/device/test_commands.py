@@ -212,7 +212,10 @@ def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
 def test_a_streaming_device_can_be_opened(line: Port) -> None:
     device = Obedient(line, deaf=True, streaming=True)
     with working(device.work), ls.open(f"serial://{line.name}", IMPATIENT) as opened:
-        assert any("sends data, so reading continues" in warning for warning in opened.warnings)
+        assert any(
+            "reading continues, because the sensor sends data" in warning
+            for warning in opened.warnings
+        )
         opened.latest(TIMEOUT_S)
 
 

@@ -228,14 +228,16 @@ def test_a_sensor_that_returns_with_another_table_is_a_warning() -> None:
         assert angles(device) == ANGLES
         port.unplug()
         port.plug()
-        told = "the sensor that reconnected reports another table: open the device again"
+        told = (
+            "after reconnecting, the sensor reports another value of table: open the device again"
+        )
         read_until(device, lambda: any(told in warning for warning in device.warnings))
 
 
 def silent(device: ls.Device) -> bool:
     """Return whether an unanswered heartbeat is reported."""
     return any(
-        "beat: no ack frame received" in said and "sending it again" in said
+        "beat: no ack frame received" in said and "sending the command again" in said
         for said in device.warnings
     )
 

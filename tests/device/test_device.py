@@ -306,7 +306,7 @@ def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
         (said,) = (warning for warning in device.warnings if "also sends data" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
         assert (
-            f"udp://:{number}: reading {senders[0]}; ignoring {senders[1]}, which also sends data"
+            f"udp://:{number}: reading data from {senders[0]}, and ignoring data from {senders[1]}"
             in said
         )
         assert f"'udp://:{number}?src={senders[1]}'" in said
@@ -617,7 +617,9 @@ def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
         whole = [scan for scan in device.scans() if scan.complete]
     with ls.open(path, TURNING) as device:
         assert [device.latest().stamp_ns for _ in whole] == [scan.stamp_ns for scan in whole]
-        with pytest.raises(SourceError, match="no further scan, because the input is ended"):
+        with pytest.raises(
+            SourceError, match="no further scan arrives, because the input is ended"
+        ):
             device.latest()
 
 

@@ -140,7 +140,7 @@ def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
     assert isinstance(match.algorithm, Crc)
     assert match.algorithm.poly == crc.poly
     assert match.is_ambiguous
-    assert "do not determine init and xorout" in match.remarks[0]
+    assert "other pairs of init and xorout fit" in match.remarks[0]
     assert all(match.algorithm(frame[:-2]) == crc(frame[:-2]) for frame in frames)
 
 

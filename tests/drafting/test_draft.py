@@ -189,12 +189,12 @@ def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
         encoding="utf-8"
     )
     assert (
-        "# rises by 200 from frame to frame, in 399 of 399, wraps at 36000: hundredths of a"
+        "# rises by 200 from frame to frame, in 399 of 399 steps, wraps at 36000: hundredths of a"
         " degree?\n" in text
     )
     assert (
-        "# is between angle_4 of this frame and of the next frame: the angle of the last sample?\n"
-        in text
+        "# the value is between angle_4 of this frame and angle_4 of the next frame: the angle of"
+        " the last sample?\n" in text
     )
     assert "# correct in 256 of 256 frames, 1 in " in text
     assert "algorithm=Crc(width=8, poly=0x4D),\n" in text

@@ -470,7 +470,7 @@ def test_entry_points_that_are_not_text_are_named_and_keep_nothing_else_away(
         for plugin in Registry(entry_points("lidarspec")).plugins
         if "bad" in plugin.distribution
     ]
-    assert "its entry_points.txt is not UTF-8" in named.error
+    assert "its file entry_points.txt is not UTF-8" in named.error
 
 
 def test_a_plugin_that_takes_long_is_named_while_it_does(
