@@ -506,8 +506,8 @@ class _RecordBlock:
     def _match(self, kind: int, since: int = 0) -> bool:
         """Assign a kind to the records that match it; return whether all now have a kind.
 
-        Records before `since` are ignored, because they were already read. One of them may have
-        been malformed then, but match now.
+        Records before `since` are ignored, because each of them was already read as a single
+        record. A record that was rejected as malformed must not match the new kind later.
         """
         template = self._known[kind]
         number = len(self._kinds)

@@ -119,7 +119,10 @@ def divisors(polynomial: int, degree: int) -> list[int]:
 
 
 def _try_all(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a small degree, by dividing by all polynomials at once."""
+    """Return the divisors of a small degree that a polynomial has.
+
+    The polynomial is divided by all candidates of this degree at the same time.
+    """
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
     top = np.uint32(degree)

@@ -255,9 +255,9 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 def _find_count(draft: Draft, data: bytes) -> Draft:
     """Return the draft with a length field, if an incomplete last frame shows one.
 
-    If all whole frames have the same length, a constant byte may be the number of elements. This is
-    found if an incomplete frame at the end of the data has another value there. Otherwise, the
-    draft is returned unchanged.
+    If all whole frames have the same length, a constant byte in them may be the number of elements.
+    An incomplete frame at the end of the data shows this if the byte has another value in it.
+    Otherwise, the draft is returned unchanged.
 
     Args:
         draft: the draft.

@@ -63,8 +63,8 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
     indices = sum(map(is_index, names))
     if indices != arrays:
         raise UsageError(
-            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, so {path!r} needs"
-            f" {arrays} ind{'ex' if arrays == 1 else 'ices'}, not {indices}"
+            f"{place}: {plain} is inside {arrays} array{'s' * (arrays != 1)}, so {path!r} requires"
+            f" {arrays} ind{'ex' if arrays == 1 else 'ices'}, but has {indices}"
         )
     return names, _parse_raw(info, value.strip(), path, place)
 
@@ -116,7 +116,7 @@ def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Frac
         per_unit = Fraction(1)
     if per_unit is None:
         raise UsageError(
-            f"{place}: expected {unit or 'no unit'}, cannot convert from {unit_text!r}"
+            f"{place}: the unit {unit_text!r} cannot be converted; expected {unit or 'no unit'}"
         )
     try:
         if digits[:2].lower() in ("0x", "0b", "0o"):
@@ -165,8 +165,8 @@ def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str)
         if isinstance(target, list) and target:
             return 0
         raise UsageError(
-            f"{place}: the number of elements of {path}[*] is unknown: give the count field, or"
-            f" {path}[0]=..."
+            f"{place}: the number of elements of {path} is unknown: set its count field, or name"
+            f" the elements one by one, as in {path}[0]=..."
         ) from None
 
 

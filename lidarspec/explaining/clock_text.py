@@ -38,7 +38,7 @@ def describe_time_source(report: ClockReport) -> str:
 
 def _describe_epoch(report: ClockReport) -> str:
     if not report.epoch:
-        return "the manual does not say what it counts"
+        return "the manual does not say from when the clock counts"
     return EPOCHS[report.epoch]
 
 
@@ -48,7 +48,7 @@ def describe_offset(report: ClockReport) -> str:
     The difference of the time scales is subtracted.
     """
     if math.isnan(report.error_s):
-        return f"{report.offset_s:+.3f} s to the host, from an arbitrary start"
+        return f"{report.offset_s:+.3f} s to the host; the clock starts at an arbitrary time"
     text = f"{report.error_s * 1e3:+.2f} ms"
     if abs(report.error_s) >= 1:
         text = f"{report.error_s:+.3f} s"

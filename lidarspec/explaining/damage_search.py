@@ -195,7 +195,7 @@ def describe_damage(
     """
     matching = find_changes(frame, data)
     if len(matching) > MAX_DESCRIBED_CHANGES:
-        yield f"a single {matching[0].kind} explains the damage, at one of {len(matching)} offsets"
+        yield f"one {matching[0].kind} explains the damage; {len(matching)} offsets are possible"
         return
     before = values(data) if matching else {}
     for change in matching:

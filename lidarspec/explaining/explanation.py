@@ -197,7 +197,7 @@ def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, s
     Each field is a tuple (path, value as text, documentation).
     """
     if not reply.confirmed or reply.frame is None:
-        return "sent; no reply is documented, so the result is unknown", []
+        return "command sent; the result is unknown, because no reply is documented", []
     values = explain(reply.data, sensor, reply.frame).fields.values()
     rows = [
         (value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs)
@@ -245,7 +245,7 @@ def _add_points(
         return rows, (*notes, f"the frame could not be decoded to points: {error}")
     if evaluated.cloud.nominal:
         notes.append(
-            "default values are used, because a frame of another type with the values is missing"
+            "the points use default values, because the frame with the actual values is missing"
         )
     points = [ExplainedPoint.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain

@@ -408,13 +408,16 @@ def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
             )
     if further := contents.flows[MAX_LISTED_FLOWS:]:
         lines.append(
-            ("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets")
+            (
+                "from",
+                f"{len(further)} other senders: {sum(flow.packets for flow in further)} packets",
+            )
         )
     if not contents.whole:
         lines.append(
             (
                 "part",
-                "only the beginning of this long file is counted"
+                "the counts are those of the beginning of this long file"
                 + "; the time of its end is unknown" * (contents.last_ns is None),
             )
         )
@@ -425,7 +428,7 @@ def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
 
 def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
     if not content.sensors:
-        yield "sensor", f"no installed sensor matches ({content.source})"
+        yield "sensor", f"no installed sensor matches the data of {content.source}"
         return
     if content.share is None:
         sure = "named in the file"
@@ -450,7 +453,7 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
     if content.incomplete_returns:
         yield (
             "returns",
-            f"incomplete in {content.incomplete_returns} groups of packets, because packets were"
+            f"{content.incomplete_returns} groups of packets lack a return, because packets were"
             " lost",
         )
     if content.clock:

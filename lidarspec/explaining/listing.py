@@ -216,7 +216,7 @@ def _iter_difference_lines(difference: FieldDifference) -> Iterator[Line]:
     else:
         change = ""
     if new.start != old.start:
-        moved = f" (in the second frame at {new.start:04x})"
+        moved = f" (at {new.start:04x} in the second frame)"
     else:
         moved = ""
     values = f"{_format_value(old)} -> {_format_value(new)}{change}{moved}"

@@ -136,7 +136,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
     with_form = _find_wire_forms(sensor) if on_wire else {}
     if len(with_form) == len(sensor.frames):
         raise ExportError(
-            f"{sensor.id}: this export does not support frame types with a wire form:"
+            f"{sensor.id}: this export does not support frames of text or of escaped bytes:"
             f" {_join_forms(with_form)}"
         )
     return tuple(
@@ -151,7 +151,7 @@ def describe_left_out(sensor: Sensor) -> str:
     with_form = _find_wire_forms(sensor)
     if not with_form:
         return ""
-    return f"left out, because the frames have a wire form: {_join_forms(with_form)}"
+    return f"frames of text or of escaped bytes are omitted: {_join_forms(with_form)}"
 
 
 def _find_wire_forms(sensor: Sensor) -> dict[str, str]:
@@ -212,8 +212,8 @@ def _refuse_inexpressible(node: tree.Node) -> None:
             raise ExportError(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
             raise ExportError(
-                f"{element}: the layout depends on an array element, which the exported"
-                " code cannot look up"
+                f"{element}: the layout depends on this array element, and exported code cannot"
+                " look up an element"
             )
     if isinstance(node, tree.Opaque):
         reason = node.reason

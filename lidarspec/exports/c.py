@@ -116,7 +116,7 @@ def checksum(algorithm: Checksum, name: str) -> str:
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
-            raise ExportError("a folded sum padded with zeros is not supported")
+            raise ExportError("C does not support a folded sum that is padded with zeros")
         pad = (
             f"    for (; i % {algorithm.to}; ++i) {{\n"
             f"        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
@@ -332,7 +332,9 @@ def _format_checksum(
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
-            raise ExportError(f"{path}: a checksum in several places is not supported")
+            raise ExportError(
+                f"{path}: C does not support a checksum that is stored in several places"
+            )
     return _CHECKSUM.format(
         name=name.removesuffix("_ok"),
         parameters=parameters(entry.depth),

@@ -248,7 +248,7 @@ class CLayout:
             ExportError: if its value may exceed 64-bit integers.
         """
         if tree.width(value) > tree.MAX_FORMULA_BITS:
-            raise ExportError("a formula may exceed a 64-bit integer")
+            raise ExportError("the value of a formula may exceed 64 bits")
         return tree.write(
             value,
             lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
@@ -299,9 +299,8 @@ class CLayout:
                 return SizeFormula(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
             case tree.PartSequence():
                 raise ExportError(
-                    f"{entry.path}: the offset of a part depends on the sizes of the parts before"
-                    " it,"
-                    " which is not supported"
+                    f"{entry.path}: C does not support parts with an offset that depends on the"
+                    " sizes of earlier parts"
                 )
             case tree.Empty() | tree.Derived():
                 return SizeFormula()
@@ -372,8 +371,8 @@ class CLayout:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
-                f"{node.axis}: the offset of an element depends on the sizes of the elements before"
-                " it, which is not supported"
+                f"{node.axis}: C does not support elements with an offset that depends on the sizes"
+                " of earlier elements"
             )
         return size
 

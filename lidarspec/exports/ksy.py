@@ -6,10 +6,10 @@ wire order (`seq`), calculated `instances`, `enums` and inner `types`. Types are
 from the current type (`format_reference`).
 
 A bit block becomes bit-sized integers if its parts are consecutive in one of Kaitai's two bit
-orders. Otherwise it becomes bytes, and an instance calculates each part. A field with a scale gets
-an instance with the physical value, a code an instance with its name. Kaitai cannot express
-checksums, plausibility tests and points. The documentation of a checksum's field names the
-algorithm.
+orders. Otherwise it becomes bytes, and an instance calculates each part. For a field with a scale,
+an instance has the physical value. For a field with named values, an instance has the name of the
+value. Kaitai cannot express checksums, plausibility tests and points. The documentation of a
+checksum's field names the algorithm.
 """
 
 from __future__ import annotations
@@ -316,7 +316,8 @@ def ksy(sensor: Sensor) -> str:
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
         raise ExportError(
-            f"{sensor.id}: two frame types have the same name in lower case, as Kaitai requires it"
+            f"{sensor.id}: two frame types have the same name in the lower case that Kaitai"
+            " requires"
         )
     name = identifier(make_prefix(sensor))
     remarks = [
@@ -437,7 +438,9 @@ class _KaitaiWriter:
     ) -> None:
         """Add the attribute of a sequence of parts, which must all have the same type."""
         if len(node.kinds) > 1:
-            raise ExportError(f"{node.axis}: Kaitai cannot distinguish parts by their constants")
+            raise ExportError(
+                f"{node.axis}: Kaitai cannot distinguish kinds of parts by their constants"
+            )
         (kind,), name = node.kinds, identifier(node.name)
         if node.within is not None:
             inner = _KaitaiType(
@@ -531,7 +534,8 @@ class _KaitaiWriter:
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOAT_SIZES:
             raise ExportError(
-                f"{node.info.path}: a float of {node.size} bytes; Kaitai supports 4 and 8 bytes"
+                f"{node.info.path}: Kaitai supports floats of 4 and 8 bytes, but this float has"
+                f" {node.size} bytes"
             )
         if node.size > 1:
             order = {"little": "le", "big": "be"}[node.order]
@@ -548,9 +552,9 @@ class _KaitaiWriter:
         if seal is None:
             sealed = ""
         else:
-            sealed = f"{seal.algorithm.describe()} over {_span(seal)}; not checked here"
+            sealed = f"{seal.algorithm.describe()} over {_span(seal)}, which is not checked here"
         if info.held:
-            unchecked = "a length; not checked here"
+            unchecked = "a length, which is not checked here"
         else:
             unchecked = ""
         text = "; ".join(filter(None, (unit_text(info), describe_field(info), unchecked, sealed)))

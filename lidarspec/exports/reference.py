@@ -98,10 +98,12 @@ def _describe_link(link: Link) -> str:
         details = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [
             f"from port {link.local}"
         ] * bool(link.local)
-        return ", ".join(["UDP", *ports, *details, *["a byte stream in datagrams"] * link.stream])
+        return ", ".join(
+            ["UDP", *ports, *details, *["datagrams that carry a byte stream"] * link.stream]
+        )
     kind = type(link).__name__
     if isinstance(link, Tcp) and link.reported:
-        return f"TCP, the port that the sensor reports as {link.reported}"
+        return f"TCP, port {link.reported}, which the sensor reports"
     if isinstance(link, Tcp | Http):
         return f"{kind.upper()}, port {link.port}"
     return kind
@@ -187,7 +189,7 @@ def _iter_frame_section(name: str, frame: Frame) -> Iterator[str]:
     size = frame_size(frame)
     remarks = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
     remarks += [f"expected after a `{frame.after}` frame"] * (frame.after is not None)
-    remarks += [f"accepted in runs of {frame.confirm} or more"] * (frame.confirm > 1)
+    remarks += [f"accepted only if {frame.confirm} or more follow each other"] * (frame.confirm > 1)
     remarks += ["checked for plausible values"] * (frame.plausible is not None)
     yield "; ".join(remarks) + "."
     rows = [
@@ -232,7 +234,7 @@ def _iter_geometry(sensor: Sensor) -> Iterator[str]:
         elif frame_size(frame).isdigit():
             many = f"{len(cloud)} points"
         else:
-            many = "a number of points given by its header"
+            many = "as many points as its header states"
         yield ""
         yield f"A `{name}` frame has {many}" + (
             f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else "."
@@ -243,8 +245,8 @@ def _iter_geometry(sensor: Sensor) -> Iterator[str]:
                 ""
                 if not cloud.nominal
                 else (
-                    "\nThe directions below are nominal. A calibration file contains the"
-                    " directions of the device."
+                    "\nThese directions are nominal. A calibration file contains the actual"
+                    " directions of a device."
                 )
             )
             yield from _iter_table(["channel", "elevation"], rows)

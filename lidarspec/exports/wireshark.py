@@ -161,8 +161,8 @@ class _TableWriter:
     def node(self, node: tree.Node, path: str = "") -> Table:
         """Return the table of a node.
 
-        Its entry `skip` is the size of the node in bytes. It is None if the node cannot be skipped,
-        because its bytes must match a constant or a later formula uses them.
+        The entry `skip` of the table is the size of the node in bytes. It is None if the node
+        cannot be skipped, because its bytes must match a constant or a later formula uses them.
         """
         match node:
             case tree.Number():
@@ -347,7 +347,10 @@ class _TableWriter:
         kinds = []
         for kind in node.kinds:
             if kind.until is not None:
-                raise ExportError(f"{node.axis}: the end is found by the values of elements")
+                raise ExportError(
+                    f"{node.axis}: Wireshark does not support an array of parts that ends at a"
+                    " certain value"
+                )
             magic = [
                 [offset, mask, value]
                 for offset, (mask, value) in sorted(
@@ -490,7 +493,9 @@ def _algorithm(algorithm: Checksum) -> Table:
             return {"algorithm": "fold15"}
         case ZeroPadded():
             if isinstance(algorithm.algorithm, ZeroPadded):
-                raise ExportError("a checksum padded twice is not supported")
+                raise ExportError(
+                    "Wireshark does not support a checksum over data that is padded twice"
+                )
             return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
     raise ExportError(
         f"the checksum {type(algorithm).__name__} is Python code and cannot be exported to"
@@ -610,7 +615,7 @@ def dissector(sensor: Sensor) -> str:
     link = sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
         raise ExportError(
-            f"{sensor.id}: the dissector does not support messages in several datagrams"
+            f"{sensor.id}: Wireshark does not support messages that consist of several datagrams"
         )
     # The dissector shows the first type that matches. Incoming types come first, so bytes that
     # match both directions are shown as incoming. Types with more constants come before others,

@@ -39,16 +39,17 @@ BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
 #: The messages for operations that columns do not support.
 NO_TRUTH = (
-    "a column has one value per packet: use & | ~ instead of `and`, `or`, `not` and a < f.x <"
-    " b, and np.where instead of `if`"
+    "a column has one value per packet, so it is neither true nor false: use & | ~ instead of"
+    " `and`, `or`, `not`, write a < f.x < b as (a < f.x) & (f.x < b), and use np.where instead of"
+    " `if`"
 )
 NO_BITS = (
-    "& | ~ require conditions, and fields are float64: put each comparison in parentheses,"
-    " (f.a < 1) & (f.b < 2); declare bits in a BitStruct"
+    "& | ~ require conditions, but a field is float64: put each comparison in parentheses, as in"
+    " (f.a < 1) & (f.b < 2); to read single bits, declare them in a BitStruct"
 )
 NO_TEXT = (
-    "a column has numbers and cannot be combined with {!r}; a field of bytes has one number"
-    " per byte, such as 65 for b'A'"
+    "a column consists of numbers and cannot be combined with {!r}; in a field of bytes, each byte"
+    " is a number, such as 65 for b'A'"
 )
 
 Carry = dict[int, NDArray[np.float64]]
@@ -152,7 +153,8 @@ class Column(NDArrayOperatorsMixin):
         """Return one element of an array field for each packet; nan if a packet has fewer."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
-                "only a field has elements, with one index for each array: f.columns[0].timestamp"
+                "only a field can be indexed, with one index for each array, as in"
+                " f.columns[0].timestamp"
             )
         return _read_column(self.batch, self.frame, f"{self.source}[{index}]")
 
@@ -206,7 +208,10 @@ class Column(NDArrayOperatorsMixin):
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
-            raise SpecError(f"a column in {len(own)} nested arrays cannot be moved to {axes}")
+            raise SpecError(
+                f"a column inside {len(own)} nested arrays cannot be moved to {axes}: name as many"
+                " arrays"
+            )
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
         array = self.array
@@ -236,7 +241,7 @@ class Column(NDArrayOperatorsMixin):
         ):  # of one element in all packets
             names = list(schema.fields[self.source].axes)
         if not names:
-            raise SpecError("index requires a field inside an array")
+            raise SpecError("`index` exists only for a field inside an array")
         return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
@@ -482,8 +487,8 @@ def align(
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """Cut each axis of arrays to its shortest length, so that they broadcast.
 
-    This is needed without packets: an array of variable length is then empty, but a plugin's table
-    for this array is not. Axes of length 1 are not changed.
+    This is needed if there are no packets. An array of variable length is empty in that case, but a
+    plugin's table for the array is not. Axes of length 1 are not changed.
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
@@ -512,8 +517,8 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
         and not name.startswith("?")
     ):
         raise SpecError(
-            f"axes {first.strip('?')!r} and {name.strip('?')!r} belong to different arrays:"
-            " move one value to the axis of the other with .on(...)"
+            f"values along the arrays {first.strip('?')!r} and {name.strip('?')!r} cannot be"
+            " combined: move one value to the array of the other with .on(...)"
         )
     return min(first, name, key=lambda axis: (axis.startswith("?"), axis.endswith("?")))
 
@@ -567,10 +572,10 @@ def _find_axis(
     table: Table,
     without: Sequence[int] = (),
 ) -> int:
-    """Return the position among the axes for the first axis of a plain array.
+    """Return the index in `axes` of the axis that the first axis of a plain array belongs to.
 
-    The position is found by the lengths of the plain array. The axes of the other operands are
-    tried first, then the arrays of the frame.
+    The axis is found by its length. The axes of the other operands are compared first, and the
+    arrays of the frame after them.
 
     Args:
         without: the positions that are excluded.
@@ -611,7 +616,7 @@ def _find_axis(
             names = [" x ".join(names) for names in found.values()]
             reason = (
                 f"has the length of several arrays of the frame, {' and '.join(names)}: choose"
-                f" one with along({found[max(found)][-1]!r}, ...)"
+                f" the array, for example with along({found[max(found)][-1]!r}, ...)"
             )
             break
     else:
@@ -647,10 +652,11 @@ def align_points(
         if stray is not None:
             where = f"along {stray!r}"
         else:
-            where = "along a further axis"
+            where = "along another array"
         raise SpecError(
-            f"the points vary {where}, but none of their fields does"
-            f" ({_describe_lengths(named, axes)}); use along(...) for numbers along an array",
+            f"the points vary {where}, but no field in them does"
+            f" ({_describe_lengths(named, axes)}); use along(...) to set the array along which"
+            " plain numbers vary",
             rule="LS214",
         )
     return arrays, axes, ready, shape
@@ -700,7 +706,8 @@ def broadcast_shape(
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except ValueError:
         raise SpecError(
-            f"the arrays have different lengths: {_describe_lengths(arrays, axes)}", rule="LS214"
+            f"the arrays of the points have different lengths: {_describe_lengths(arrays, axes)}",
+            rule="LS214",
         ) from None
 
 
@@ -940,7 +947,7 @@ def _read_column(batch: Batch, frame: str, path: str) -> Column:
     base, indices = without_indices(path)
     if base not in defaults:
         raise SpecError(
-            f"no {frame} frame has arrived yet, and no default is declared",
+            f"the value is unknown: no {frame} frame has arrived yet, and no default is declared",
             path=f"state.{frame}.{path}",
         )
     batch.nominal = True

@@ -191,7 +191,9 @@ class TracedColumn(NDArrayOperatorsMixin):
         if kwargs.get("out") is not None:
             raise SpecError("a column cannot be changed in place: write a new expression")
         if method != "__call__":
-            raise UntraceableError(f"np.{ufunc.__name__}.{method} combines several elements")
+            raise UntraceableError(
+                f"np.{ufunc.__name__}.{method} combines several elements of an array"
+            )
         return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
@@ -238,7 +240,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
-            raise UntraceableError("the array is shorter than the target of .on()")
+            raise UntraceableError("the array is shorter than the array to which .on() moves it")
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
@@ -356,11 +358,11 @@ class TracedFields:
 def _check_raw(schema: Schema, path: str) -> None:
     """Raise UntraceableError unless a field is sent as a number."""
     if path in schema.derived:
-        raise UntraceableError(f"{path} is computed from other fields, and not sent")
+        raise UntraceableError(f"{path} is not sent; it is computed from other fields")
     if schema.find_sequence(path) is not None:
-        raise UntraceableError(f"{path} is in an array of elements of different size")
+        raise UntraceableError(f"{path} is in an array whose elements have different sizes")
     if schema.fields[path].adapter is not None:
-        raise UntraceableError(f"a Python function makes the values of {path}")
+        raise UntraceableError(f"a Python function computes the values of {path}")
 
 
 def _fold_table_rows(
@@ -504,7 +506,9 @@ class Expression:
                 is not a field of the frame.
         """
         if node.fields is None:
-            raise UntraceableError("the expression depends on more than fields of the frame")
+            raise UntraceableError(
+                "the expression depends on values that are not fields of the frame"
+            )
         infos = tuple(schema.fields[source.path] for source in node.fields)
         if len({info.axes for info in infos}) != 1:
             raise UntraceableError("the expression combines fields of different arrays")
@@ -599,7 +603,7 @@ class _ResultPart:
 
     def __init__(self, expression: Expression, made: Made) -> None:
         if any(info.axes or info.optional for info in expression.fields):
-            raise UntraceableError("a field is in an array, or is optional")
+            raise UntraceableError("a field that is used is optional or inside an array")
         self._expression = expression
         self._made = made
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}

@@ -220,7 +220,7 @@ def check_holds(path: str | Path, feature: str) -> None:
             suffix for suffix, format in formats().items() if feature in format.holds
         )
         raise UsageError(
-            f"{path}: {format_of(path).suffix} does not support --{feature}; formats that do:"
+            f"{path}: {format_of(path).suffix} does not support --{feature}; these formats do:"
             f" {having}"
         )
 
@@ -238,7 +238,7 @@ def _iter_organized(path: Path, scans: Iterable[Scan], *, is_single: bool) -> It
             )
         if number and is_single:
             error = UsageError(
-                f"with --organized, {path} can hold one scan only, but several are selected"
+                f"with --organized, {path} can contain only one scan, but several are selected"
             )
             raise suggest(
                 error,
@@ -256,8 +256,8 @@ def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Itera
     ):
         if name in started:
             raise UsageError(
-                f"{name} would be written twice, as its time repeats; use %F, %H, %M and %S in the"
-                " name"
+                f"{name} would be written twice, because the scans of two times have this name; use"
+                " %F, %H, %M and %S in the name"
             )
         started.add(name)
         with system_errors(path):

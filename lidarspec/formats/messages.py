@@ -162,8 +162,8 @@ class RosMessages:
     def _make_time(self, at: int) -> Any:
         if not 0 <= at < _SECOND << 31:
             raise UsageError(
-                f"the stamp of a scan or packet is {at} ns, outside the years 1970 to 2038 that ROS"
-                " supports"
+                f"the stamp of a scan or packet is {at} ns, but ROS supports only the years 1970 to"
+                " 2038"
             )
         return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
 

@@ -75,14 +75,14 @@ def build(
     data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(
-            f"{place}: {declared.wire} cannot encode these values: a number has too many"
-            " digits, or a text contains a separator"
+            f"{place}: {declared.wire} cannot encode these values, because a number has too many"
+            " digits or a text contains a separator"
         )
     return data
 
 
 def _merge_values(value: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the fields of `value` with those of `values` in their place."""
+    """Return the fields of `value`; fields in `values` override them."""
     nested = {name: new for name, new in values.items() if not name.isidentifier()}
     merged: dict[str, Any] = {**value, **values}
     if not nested:
@@ -94,7 +94,7 @@ def _merge_values(value: Mapping[str, Any], values: Mapping[str, Any]) -> Mappin
 
 
 def _with_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Return values with the codes of Enums in construct's form, a text with a number.
+    """Return values with each code of an Enum as construct has it: a string with a number.
 
     `Const` and `Switch` of a struct that construct builds compare the names of codes.
     """
@@ -167,7 +167,7 @@ class _ValueChecker:
             return bytes(numbers)
         except (TypeError, ValueError):
             raise UsageError(
-                f"{self._place}: {shown} must be bytes, or numbers from 0 to 255, not"
+                f"{self._place}: {shown} must be bytes or a list of numbers from 0 to 255, not"
                 f" {numbers!r:.60}"
             ) from None
 

@@ -134,11 +134,11 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     takes |= {"int"} if isinstance(declared.kind, Address) else set()
     if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
         if slot.is_array:
-            what = f"an array; one element is {declared.path}[0]"
+            what = f"an array; to set one element, name {declared.path}[0]"
         else:
             what = f"a field of kind {slot.info.kind!r}"
         raise SpecError(
-            f"{type(declared.kind).__name__} does not fit {declared.path!r}, which is {what}",
+            f"{type(declared.kind).__name__} cannot set {declared.path!r}, which is {what}",
             path=place,
             sensor=sensor.id,
         )
@@ -155,8 +155,8 @@ def _template_slot(
     is_text = isinstance(declared.kind, Range | Text) and not isinstance(declared.kind, Choice)
     if argument not in template.names or not is_text:
         raise SpecError(
-            f"the argument {argument!r} must be in the text {template.text!r}, and have a range or"
-            " Text(size)",
+            f"the argument {argument!r} must be named in the text {template.text!r}, and must be"
+            " declared with a range or Text(size)",
             path=place,
             sensor=sensor.id,
         )
@@ -191,8 +191,8 @@ def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> A
     left = counts[len(indices) :]
     if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
         reason = (
-            f"{path!r} has {len(indices)} indices, but the field is inside"
-            f" {len(counts) - (info.kind == 'bytes')} arrays"
+            f"{path!r} has {len(indices)} indices, but the number of arrays around the field is"
+            f" {len(counts) - (info.kind == 'bytes')}"
         )
         raise SpecError(reason, path=place, sensor=sensor.id)
     for index, count in zip(indices, counts, strict=False):

@@ -34,14 +34,14 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             raise NotCompilableError(node.info.path, node.reason)
         case tree.Sealed():
             if in_array:
-                raise NotCompilableError(path, "a checksum inside an array")
+                raise NotCompilableError(path, "it is a checksum inside an array")
             _ = node.algorithm
         case tree.PartSequence() if in_array:
-            raise NotCompilableError(path, "parts inside an array")
+            raise NotCompilableError(path, "it is a sequence of parts inside an array")
         case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
-                    raise NotCompilableError(part.info.path, "an array of arrays of bits")
+                    raise NotCompilableError(part.info.path, "it is an array of arrays of bits")
         case tree.When() | tree.Select():
             _check_alternatives(node)
     for formula in tree.formulas(node):
@@ -79,7 +79,7 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
             is_direct = part is alternative
             if part.axis in names or (is_direct and not is_only_one):
                 raise NotCompilableError(
-                    part.axis, "an array of parts, where another case has something else"
+                    part.axis, "it is an array of parts, and another case has a different field"
                 )
 
 
@@ -117,10 +117,10 @@ def _check_columns(root: tree.Node) -> None:
     """Raise `NotCompilableError` if no column can represent the values of a field."""
     for info in make_schema(root).fields.values():
         if info.dtype is None:
-            wide = f"its {info.bits} bits do not fit in a column"
+            wide = f"it has {info.bits} bits, and a column has at most 64"
             raise NotCompilableError(
                 info.path,
-                wide if info.bits > 64 else "its values are not plain numbers of one type",
+                wide if info.bits > 64 else "its values are not numbers of one type",
             )
 
 
@@ -129,9 +129,9 @@ def check_control(info: tree.FieldInfo) -> None:
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,
-            "elements of one array have different layouts: Parts(struct, count) supports this",
+            "elements of one array have different layouts: declare it as Parts(struct, count)",
         )
     if info.axes or info.kind != "int":
         raise NotCompilableError(
-            info.path, "the layout depends on a field that is not a single integer"
+            info.path, "the layout depends on this field, which is not a single integer"
         )

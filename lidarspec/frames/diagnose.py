@@ -70,12 +70,10 @@ class Fault:
         if self.kind == CUT_OFF:
             return self._describe_shortage()
         if self.kind == TRAILING:
-            return (
-                f"{self.got - self.expected} bytes after the end of the frame at byte"
-                f" {self.expected}"
-            )
+            more = self.got - self.expected
+            return f"the frame ends at byte {self.expected}, but {more} more bytes follow"
         if self.kind == CONDITION:
-            return f"{self.path}: the check failed"
+            return f"{self.path}: the condition is false"
         if self.kind == LENGTH and self.got is None:
             return f"{self.path}: expected a frame {self.expected}"
         if self.kind == COUNT:
@@ -87,14 +85,14 @@ class Fault:
             total = ""
         else:
             total = f" of {self.expected}"
-        where = f"frame ends at byte {self.end}{total}"
+        where = f"the frame ends at byte {self.end}{total}"
         if self.is_bounded:
-            where = f"parts end at byte {self.end}"
+            where = f"the parts end at byte {self.end}"
         if not self.needed:
             return f"{where}: {self.path or 'the first field'} is cut off"
         plural = "s" if self.needed != 1 else ""
         left = self.end - self.offset
-        return f"{where}: {self.path} needs {self.needed} byte{plural}, {left} left"
+        return f"{where}: {self.path} requires {self.needed} byte{plural}, but has {left}"
 
 
 def find_fault(examined: ExaminedFrame) -> Fault | None:
@@ -180,7 +178,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    return Fault(LENGTH, part.prefix, part.start, "that is filled by its parts", None, end)
+    return Fault(LENGTH, part.prefix, part.start, "whose parts fill the bytes for parts", None, end)
 
 
 def _iter_length_faults(
@@ -287,7 +285,7 @@ def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPa
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):
-        return Fault(LENGTH, path, end, "made of known parts", None, end)
+        return Fault(LENGTH, path, end, "that consists of declared kinds of parts", None, end)
     length = next((each for each in examined.fields() if each.path == path), None)
     if length is not None and length.info.held:
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)

@@ -422,8 +422,7 @@ class _Encoder:
             if walked.status[0] != FOUND or walked.sizes[0] != region.size:
                 raise UsageError(
                     f"{self._place}: {self._make_shown_path(axis)}:"
-                    " the sizes of the parts do not match"
-                    " the header"
+                    " the sizes of the parts differ from the sizes in the header"
                 )
         for condition in layout.conditions:
             if not layout.meet_condition(condition, row)[0]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 #: The reason why an array in elements has no length for each frame.
-VARYING_LENGTH = "its length varies within one frame, which cannot be one column"
+VARYING_LENGTH = "its length varies within one frame, so it cannot be a column"
 
 
 class Table(Protocol):
@@ -519,7 +519,7 @@ class ParsedTable:
             if info.dtype is None:
                 return _make_object_column(values)
             raise SpecError(
-                "its branches have values of different shapes, which cannot be one column",
+                "its branches have values of different shapes, so it cannot be a column",
                 path=path,
             ) from None
         return column
@@ -708,7 +708,7 @@ def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
     elif column.ndim == 1 or isinstance(value, bool):
         column[index] = 0 if value is None else value
     elif value is not None:
-        raise ValueError("expected an array, as in the other frames")
+        raise ValueError("expected an array, because other frames have an array here")
 
 
 def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:

@@ -207,7 +207,7 @@ class HeaderWalk:
         else:
             leaf = None
         if leaf is None:
-            raise IndexError(f"{base} has no such element")
+            raise IndexError(f"{path} does not exist")
         if path in self.values:
             return self.values[path]
         return self.request(leaf, self)
@@ -622,9 +622,10 @@ class _ValueClasses:
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
-        """Return the classes of the values of a field in the formulas of a frame.
+        """Return the classes of the values of a field.
 
-        If the classes cannot be derived from the formulas, each value is a class of its own.
+        They are derived from the formulas of the frame. If that is impossible, each value is a
+        class of its own.
         """
         (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [

@@ -93,7 +93,7 @@ class PartKind:
 
     @cached_property
     def start(self) -> tuple[Word, ...]:
-        """The constants in `prefix` as words."""
+        """The constants in `prefix`, merged into words that are compared at once."""
         return merge_constants(sort_constants(self.prefix))
 
     @cached_property

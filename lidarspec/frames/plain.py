@@ -41,8 +41,8 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     """Return the bytes of a frame.
 
-    The values of length fields are known only after the frame was built, so it is built again with
-    them.
+    The values of length fields are known only after the frame was built. The frame is therefore
+    built a second time with these values.
 
     Raises:
         UsageError: for values that construct does not accept.
@@ -151,7 +151,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
         )
     except construct.StreamError as fault:
         path = field_path(fault.path)
-        reason = f"frame ends at byte {len(data)}: {path or 'the first field'} is cut off"
+        reason = f"the frame ends at byte {len(data)}: {path or 'the first field'} is cut off"
         return WireError(
             reason, sensor=sensor.id, frame=name, offset=stream.tell(), path=path, data=data
         )
@@ -171,7 +171,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
         raise struct_error(fault, path=name, sensor=sensor.id) from fault
     size = stream.tell()
     return WireError(
-        f"{len(data) - size} bytes after the end of the frame at byte {size}",
+        f"the frame ends at byte {size}, but {len(data) - size} more bytes follow",
         sensor=sensor.id,
         frame=name,
         kind=TRAILING,

@@ -139,7 +139,8 @@ class FormCoder(Coder):
         tree = frame_layouts(frame)
         if isinstance(tree, NotCompilableError):
             raise SpecError(
-                f"a wire form requires fields with fixed offsets: {tree.reason}", path=tree.path
+                f"a wire form requires fields with computable offsets: {tree.reason}",
+                path=tree.path,
             )
         self.form = form
         self.tree: HeaderTree = tree
@@ -231,10 +232,12 @@ class FormCoder(Coder):
         begins = self.begins
         if not data or not data.startswith(begins):
             got = data[: len(begins)]
-            reason = f"begins with {got.hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
+            reason = (
+                f"the frame begins with {got.hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
+            )
             return Problem(0, reason, expected=begins, got=got)
         if 0 < size < len(data):
-            reason = f"{len(data) - size} bytes after the end of the frame at byte {size}"
+            reason = f"the frame ends at byte {size}, but {len(data) - size} more bytes follow"
             return Problem(size, reason, expected=size, got=len(data))
         if size <= 0:
             reason = f"no end of frame in {len(data)} bytes"
@@ -253,7 +256,7 @@ class FormCoder(Coder):
         else:
             offset = decoded.problem.offset
         if not leaves:
-            reason = f"the header does not match the frame length of {size} bytes"
+            reason = f"the header does not allow the frame to have {size} bytes"
             return Problem(offset, reason, got=size)
         got = data[offset : offset + MAX_SHOWN_BYTES]
         reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"

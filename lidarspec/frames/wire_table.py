@@ -193,7 +193,7 @@ def _iter_rows(
                 "; ".join(filter(None, (condition, describe_end(node)))),
             )
             for kind in node.kinds:
-                said = f"in part {kind.name}" if kind.name else ""
+                said = f"in parts of kind {kind.name}" if kind.name else ""
                 yield from _iter_rows(
                     kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
                 )
@@ -298,7 +298,7 @@ def describe_end(node: tree.PartSequence) -> str:
         return f"parts that fill {format_formula(node.within)} bytes"
     until = node.kinds[0].until
     if until is not None:
-        return f"parts up to the first with {format_formula(until)}"
+        return f"parts up to the first part with {format_formula(until)}"
     assert node.size is not None
     following = ", ".join(
         dict.fromkeys(
@@ -307,7 +307,7 @@ def describe_end(node: tree.PartSequence) -> str:
     )
     return (
         f"the first part has {format_formula(node.size)} bytes; {following} of each part is the"
-        " size of the next part, 0 after the last part"
+        " size of the next part; it is 0 in the last part"
     )
 
 
@@ -403,6 +403,6 @@ def _describe_seal(node: tree.Sealed) -> str:
     if node.declared:
         name = node.declared.describe()
     else:
-        name = "a checksum that a hook provides"
+        name = "a checksum from the hook lidarspec_checksum"
     first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
     return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

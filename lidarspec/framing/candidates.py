@@ -219,8 +219,9 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 class ConstantFilter:
     """Finds the offsets at which the constants of types match, for several types at once.
 
-    A set of types is an integer with one bit for each type. For each offset in a frame, a table
-    has, for each value of the byte, the set of types that allow this value.
+    A set of types is an integer with one bit for each type. There is a table for each offset in a
+    frame with a constant. For each value of the byte at this offset, the table contains the set of
+    types that allow the value.
 
     Args:
         constants: the constants of each type, for at most `MAX_TYPES` types.
@@ -424,7 +425,7 @@ class Candidates:
             self.checked[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return how many candidates of a type, from the first on, can be checked now."""
+        """Return the number of candidates, counted from the first, that can be checked now."""
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]

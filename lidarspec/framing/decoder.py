@@ -90,7 +90,9 @@ class Decoder:
         sums: Sums | None = None,
     ) -> None:
         if not sensor.incoming:
-            raise UsageError(f"{sensor.id} has no frames yet: configure it with a file first")
+            raise UsageError(
+                f"{sensor.id} has no frames until it is configured: first configure it with a file"
+            )
         self.sensor = sensor
         self.stream = stream
         self.backend = backend

@@ -147,7 +147,7 @@ def make_random_header(
     for _ in range(HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _draw_header(engine.frame, source, drawn, keys)
-    raise SpecError("no header leads to a frame within max_length")
+    raise SpecError("no example found: no random header leads to a frame within max_length")
 
 
 def _draw_header(
@@ -160,7 +160,7 @@ def _draw_header(
         except UnknownSelectorError as unknown:
             if isinstance(unknown.leaf, PartsSize):
                 raise SpecError(
-                    "an example of a frame with parts requires more than a header",
+                    "a header is not enough for an example: the layout depends on the parts",
                     path=unknown.leaf.info.path,
                 ) from None
             own = drawn.get(unknown.leaf.info.path)
@@ -256,7 +256,12 @@ def make_of_values(
         stops = np.array([len(data)])
         if engine.survey(rows, np.zeros(1, np.intp), stops).status[0] == VALID:
             return data
-    raise SpecError("no random frame is valid", path=frame, sensor=sensor.id, rule=NO_EXAMPLE)
+    raise SpecError(
+        "no example found: all random frames are invalid",
+        path=frame,
+        sensor=sensor.id,
+        rule=NO_EXAMPLE,
+    )
 
 
 def _remove_lengths(values: Any, root: Node) -> Any:
@@ -352,7 +357,7 @@ def _make_along_sweep(
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError(
-            "no random frame passes `plausible`, and no `sweep` is declared",
+            "no example found: `plausible` rejects all random frames, and no `sweep` is declared",
             path=frame,
             sensor=sensor.id,
             rule=NO_EXAMPLE,
@@ -374,7 +379,7 @@ def _make_along_sweep(
         if row is not None:
             return layout, row
     raise SpecError(
-        "neither random frames nor frames of `sweep` pass `plausible`",
+        "no example found: `plausible` rejects all random frames and all frames of `sweep`",
         path=frame,
         sensor=sensor.id,
         rule=NO_EXAMPLE,

@@ -164,7 +164,7 @@ class Counters:
             ", ".join(
                 [*(f"{number} {name} frames" for name, number in self.frames.items()), *parts]
             )
-            or "nothing yet"
+            or "nothing received yet"
         )
 
 

@@ -75,7 +75,7 @@ class LayoutFamilies:
     def split(
         self, groups: list[LayoutGroup], make_checker: MakeChecker
     ) -> tuple[list[JointChecker], list[LayoutGroup]]:
-        """Split groups into those to check together, and those to check layout by layout."""
+        """Return checkers for the groups to check together, and the groups to check one by one."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()

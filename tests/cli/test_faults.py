@@ -100,7 +100,7 @@ def test_doctor_says_the_same_as_a_finding(folder: Path, place: Place, told: str
 def test_hexadecimal_digits_with_colons_are_no_address() -> None:
     assert "ldrobot-stl27l data, 47 bytes" in ran("parse", EXAMPLE.hex(":"), *STL).stdout
     assert (
-        "lsn needs 1 byte, 0 left"
+        "lsn requires 1 byte, but has 0"
         in ran("parse", "aa:55:00", "-s", "cspc-m1c1-mini", code=4).stderr
     )
 

@@ -92,7 +92,7 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
 def test_a_stream_is_parsed_and_gaps_are_counted() -> None:
     data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE
     result = ran("parse", data.hex(), *SENSOR)
-    assert "4 bytes outside frames" in result.stderr
+    assert "4 bytes are outside frames" in result.stderr
     assert [frame["offset"] for frame in run_json("parse", data.hex(), *SENSOR)["frames"]] == [
         2,
         51,
@@ -144,8 +144,8 @@ def test_explain_can_show_damaged_frames_only(tmp_path: Path) -> None:
     result = ran("explain", tmp_path / "drive.bin", "--bad", *SENSOR, code=1)
     assert [line for line in result.stdout.splitlines() if not line.startswith("00")] == [
         (
-            "ldrobot-stl27l data at byte 940, 46 bytes: frame ends at byte 46 of 47: crc needs 1"
-            " byte, 0 left"
+            "ldrobot-stl27l data at byte 940, 46 bytes: the frame ends at byte 46 of 47: crc"
+            " requires 1 byte, but has 0"
         ),
         *(
             line
@@ -177,7 +177,7 @@ def test_explain_can_show_some_bytes_only(tmp_path: Path) -> None:
     ] == [0, 47, 94]
     assert len(run_json("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
     assert (
-        "14100 bytes, so no byte 14100"
+        "14100 bytes; byte 14100 does not exist"
         in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
     )
     for words in (
@@ -199,7 +199,8 @@ def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
     assert result.stdout.count("cspc-coin-d4 info") == 6
     assert "cspc-coin-d4 data" not in result.stdout
     assert (
-        result.stderr == "6 frames, 0 damaged, 0 bytes outside frames, 6 of other types omitted\n"
+        result.stderr
+        == "6 frames, 0 damaged, 0 bytes outside frames, 6 frames of other types omitted\n"
     )
     said = ran("explain", (EXAMPLE * 20).hex(), "-f", "scan_start", "-s", sensor.id, code=4).stderr
     assert "no scan_start frame in" in said
@@ -294,12 +295,12 @@ def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> 
 @pytest.mark.parametrize(
     ("word", "told"),
     [
-        ("speed=10m", "speed: expected deg/s, cannot convert from 'm'"),
+        ("speed=10m", "speed: the unit 'm' cannot be converted; expected deg/s"),
         ("start_angle=700deg", "start_angle = 700.0 is outside 0.0 .. 655.35 deg"),
         ("speed=70000", "speed = 70000 is outside 0 .. 65535"),
         ("speed=1.5", "give it a unit: 1.5deg/s"),
         ("speed=fast", "expected a number, got 'fast'"),
-        ("points.distance=1m", "points.distance is in 1 array"),
+        ("points.distance=1m", "points.distance is inside 1 array"),
         ("points[*].range=1m", "unknown field 'points[*].range'"),
         ("header=5g", "expected bytes in hexadecimal"),
     ],

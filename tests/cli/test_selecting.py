@@ -128,7 +128,7 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
 
 def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Path) -> None:
     failed = ran("convert", drive, tmp_path / "out.npy", "--organized", code=2)
-    assert "can hold one scan only, but several are selected" in failed.stderr
+    assert "can contain only one scan, but several are selected" in failed.stderr
     source = tmp_path / "in.bin"
     source.write_bytes(EXAMPLE * 3)
     failed = ran(

@@ -167,7 +167,7 @@ def test_reported_values_configure_the_sensor_and_its_recording(tmp_path: Path) 
         (
             b"",
             lambda reply: {"table": [1.0]},
-            "table must be a number, bytes or a string, got list",
+            "`learns` must return a number, bytes or a string for table, got list",
         ),
         (b"", lambda reply: {"tables": b""}, "unknown option 'tables'"),
         (b"", lambda reply: {"frame": b"rep103"}, "frame must be one of rep103, vendor"),

@@ -303,7 +303,7 @@ def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
         )
         assert device.stats.lost == device.stats.duplicates == 0
         read_until(device, lambda: device.stats.foreign == 120)
-        (said,) = (warning for warning in device.warnings if "also sends data" in warning)
+        (said,) = (warning for warning in device.warnings if "and ignoring data from" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
         assert (
             f"udp://:{number}: reading data from {senders[0]}, and ignoring data from {senders[1]}"
@@ -378,7 +378,7 @@ def test_two_senders_of_one_address_are_separated_by_port() -> None:
             device, lambda: device.stats.foreign >= 28
         )  # the very first may be that of a restarted sensor
         assert sum(map(len, found)) <= 30
-        assert f"ignoring 127.0.0.2:{other.getsockname()[1]}, which" in device.warnings[-1]
+        assert f"ignoring data from 127.0.0.2:{other.getsockname()[1]};" in device.warnings[-1]
 
 
 def test_a_sensor_that_returns_with_another_port_is_read() -> None:

@@ -101,7 +101,7 @@ def test_a_live_device_by_name_is_live(folder: Path) -> None:
 
 
 def test_hexadecimal_digits_are_no_name(folder: Path) -> None:
-    assert "needs 1 byte, 0 left" in ran("parse", "aa5500", code=4).stderr
+    assert "requires 1 byte, but has 0" in ran("parse", "aa5500", code=4).stderr
 
 
 def settings_of_the_user(folder: Path, text: str) -> Path:

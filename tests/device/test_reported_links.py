@@ -102,7 +102,11 @@ def test_data_comes_from_the_port_that_a_reply_reports() -> None:
         ({"request_handle": page(error="busy")}, "", "request_handle: the sensor reports 'busy'"),
         ({"request_handle": page(handle="s9")}, "", "the sensor reports 'no such handle'"),
         ({"request_handle": page(handle="s10&a=b")}, "", "handle must consist of letters"),
-        ({"request_handle": page(handle=[1])}, "", "handle must be a number or a string, got list"),
+        (
+            {"request_handle": page(handle=[1])},
+            "",
+            "`provides` must return a number or a string for handle, got list",
+        ),
         ({"request_handle": page()}, "", "start: handle is unknown"),
         ({"request_handle": [("page", {"status": 500, "body": b""})]}, "", "status 500"),
         ({"set_name": [("page", {"status": 200, "body": b"[]"})]}, "set_name", "TypeError"),
@@ -291,11 +295,11 @@ def test_an_argument_of_a_template_must_be_in_it() -> None:
         HANDLES.commands["set_rate"], args={"speed": ("path", 1, 2), "rate": ("path", Text(3))}
     )
     sensor = dataclasses.replace(HANDLES, commands={**HANDLES.commands, "set_rate": command})
-    with pytest.raises(SpecError, match=r"the argument 'speed' must be in the text"):
+    with pytest.raises(SpecError, match=r"the argument 'speed' must be named in the text"):
         sensor.command("set_rate", speed=1, rate="a")
     changed = dataclasses.replace(command, args={"rate": ("path", bytes)})
     sensor = dataclasses.replace(HANDLES, commands={**HANDLES.commands, "set_rate": changed})
-    with pytest.raises(SpecError, match=r"the argument 'rate' must be in the text"):
+    with pytest.raises(SpecError, match=r"the argument 'rate' must be named in the text"):
         sensor.command("set_rate", rate=b"1")
 
 

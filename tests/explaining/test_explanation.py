@@ -390,7 +390,7 @@ def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
 
 def test_look_ahead_and_implausible_frames_are_noted() -> None:
     ahead = explain(SHAPES["shape-ahead"].example("data"), SHAPES["shape-ahead"])
-    assert any("direction unknown without other frames" in row.meaning for row in ahead.rows)
+    assert any("the direction is unknown" in row.meaning for row in ahead.rows)
     values = ls.sensor("ldrobot-stl27l").parse(EXAMPLE)
     values.start_angle = 36001
     found = explain(ls.sensor("ldrobot-stl27l").build("data", values), ls.sensor("ldrobot-stl27l"))

@@ -52,10 +52,14 @@ def test_kinds_of_damage_are_distinguished() -> None:
     for damaged, size, verdict in (
         (flipped, 47, "flipped bit explains the damage"),
         (headless, 47, "one flipped bit explains the damage: byte 0 bit 0, header"),
-        (data[:SPOT] + data[SPOT + 1 :], 46, "a single lost byte explains the damage, at one of"),
+        (data[:SPOT] + data[SPOT + 1 :], 46, "one lost byte explains the damage; "),
         (data[1:], 46, "one lost byte explains the damage: 0x54 before byte 0, in header"),
         (data[:SPOT] + b"\x77" + data[SPOT:], 48, "byte 20, 0x77"),
-        (data[:11], 11, "frame ends at byte 11 of 47: points[1].intensity needs 1 byte, 0 left"),
+        (
+            data[:11],
+            11,
+            "the frame ends at byte 11 of 47: points[1].intensity requires 1 byte, but has 0",
+        ),
     ):
         ((frame, length, said),) = list_damaged(sent([damaged]))
         assert (frame, length) == ("data", size)

@@ -40,7 +40,7 @@ SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 #: fields of these names get an underscore, since functions of the whole frame have them.
 OWN = ("frame_length", "is_frame")
 #: the reason of the refusal of parts that C cannot say.
-_PARTS = "the offset of a part depends on the sizes"
+_PARTS = "C does not support parts with an offset that depends"
 #: the shapes that C cannot say, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",

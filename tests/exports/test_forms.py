@@ -50,11 +50,11 @@ def test_json_is_enough_to_decode_frames(name: str) -> None:
 @pytest.mark.parametrize("kind", ["c", "ksy", "wireshark"])
 def test_text_frames_are_left_out_and_named(kind: str) -> None:
     text = export(mixed.SENSOR, kind)
-    assert "left out, because the frames have a wire form: line (Tokens)" in text
+    assert "frames of text or of escaped bytes are omitted: line (Tokens)" in text
     fields = text.replace("line (Tokens)", "")
     assert "latitude" in fields
     assert "satellites" not in fields
-    assert "left out" not in export(receiver.SENSOR, kind)
+    assert "are omitted" not in export(receiver.SENSOR, kind)
 
 
 def test_json_has_text_frames_with_their_wire_form() -> None:

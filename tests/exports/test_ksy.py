@@ -40,7 +40,7 @@ from tests.exports.trees import (
 
 #: the shapes that are exported; of oddities there are own ones below.
 SHAPED = {name: sensor for name, sensor in trees.SHAPED.items() if name != "shape-oddities"}
-_CONSTANTS = "Kaitai cannot distinguish parts by their constants"
+_CONSTANTS = "Kaitai cannot distinguish kinds of parts by their constants"
 #: the shapes that Kaitai cannot say, and why.
 REFUSED = {
     "shape-text": "Decimal is Python code",
@@ -183,7 +183,7 @@ def test_sensors_that_kaitai_cannot_express_are_refused() -> None:
 
 
 def test_other_refusals_have_reasons_too() -> None:
-    with pytest.raises(ExportError, match="a float of 2 bytes"):
+    with pytest.raises(ExportError, match="this float has 2 bytes"):
         export(make_sensor("half" / Float16b), "ksy")
     with pytest.raises(ExportError, match="two members with the Kaitai name 'speed'"):
         export(make_sensor("speed" / Int8ul, "Speed" / Int8ul), "ksy")

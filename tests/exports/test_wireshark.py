@@ -27,7 +27,7 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 #: the shapes that Wireshark cannot be told, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
-    "shape-fragments": "messages in several datagrams",
+    "shape-fragments": "messages that consist of several datagrams",
     **find_recoded(SHAPED.values()),
 }
 #: The installed sensors that Wireshark does not support, for the same reason as shape-fragments.

@@ -17,7 +17,7 @@ from tests.shapes import SHAPES
 #: the invented sensors that have frames, by id.
 SHAPED = {sensor.id: sensor for sensor in (*SHAPES.values(), oddities.SENSOR) if sensor.frames}
 #: The reason of the refusal of a sensor that has only frames in a wire form.
-RECODED = "this export does not support frame types with a wire form"
+RECODED = "this export does not support frames of text or of escaped bytes"
 #: The installed sensors that other languages cannot read because of a struct, with the reason.
 NULL_TERMINATED = dict.fromkeys(
     ("hokuyo-urg04lx", "hokuyo-utm30lx", "hokuyo-utm30lxew"), "NullTerminated is Python code"

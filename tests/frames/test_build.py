@@ -39,7 +39,7 @@ def make_command_sensor(**args: Any) -> Sensor:
         (("nothing", 0, 9), "'nothing'"),
         (("t", 0, 9), "'t'"),
         (("v[2]", 0, 9), "2 elements"),
-        (("t.u[0]", 0, 9), "0 arrays"),
+        (("t.u[0]", 0, 9), "arrays around the field is 0"),
         (("t.u", Text(3)), "'t.u'"),
     ],
 )

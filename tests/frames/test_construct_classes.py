@@ -486,7 +486,7 @@ PLAIN: dict[str, Case] = {
     "If in elements of elements": case(
         "r" / Array(2, Array(1, Struct("k" / Int8ub, "v" / If(this.k, Int8ub)))),
         frames="000102 0000",
-        reason="Parts(struct, count) supports this",
+        reason="declare it as Parts(struct, count)",
     ),
     "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
     "GreedyBytes": case("a" / GreedyBytes, frames="616263 61", reason="rest", is_rest=True),

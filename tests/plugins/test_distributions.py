@@ -44,7 +44,7 @@ FAILING = {
     "broken-plausible": "no such luck",
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
-    "broken-shape": "the arrays have different lengths",
+    "broken-shape": "the arrays of the points have different lengths",
     "broken-result": "must return Polar or Cartesian",
 }
 

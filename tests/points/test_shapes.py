@@ -502,11 +502,11 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
-            r"along 'other\[\]', but none of their fields does \(.*other\[\] 3",
+            r"along 'other\[\]', but no field in them does \(.*other\[\] 3",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))),
-            r"axes 'near' and 'other' belong to different arrays",
+            r"values along the arrays 'near' and 'other' cannot be combined",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("further", ANGLES)),
@@ -514,7 +514,7 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
         ),
         (
             lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),
-            r"along 'other(\[\])?', but none of their fields does",
+            r"along 'other(\[\])?', but no field in them does",
         ),
         (lambda f: Polar(range=f.first, azimuth=f.first.index), r"a field inside an array"),
     ],
@@ -536,7 +536,8 @@ def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None
         replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)), backend
     ).decode([bytes(16)])
     with pytest.raises(
-        SpecError, match=r"the arrays have different lengths: 1: other 4 x other\[\] 3, 2: other 3"
+        SpecError,
+        match=r"have different lengths: 1: other 4 x other\[\] 3, 2: other 3",
     ):
         terms.points()
     parts = reader(
@@ -545,7 +546,7 @@ def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None
     ).decode([bytes(16)])
     with pytest.raises(
         SpecError,
-        match=r"the arrays have different lengths: range: other 4 x other\[\] 3, azimuth: other 2",
+        match=r"have different lengths: range: other 4 x other\[\] 3, azimuth: other 2",
     ):
         parts.points()
 

@@ -83,7 +83,9 @@ def test_column_compared_with_bytes_says_that_it_is_numbers() -> None:
         source="none",
     )
     counters = sensor.decode(b"\xa5\x5atext").stats
-    assert "a column has numbers and cannot be combined with b''" in str(counters.failure("a-b"))
+    assert "a column consists of numbers and cannot be combined with b''" in str(
+        counters.failure("a-b")
+    )
 
 
 def test_advice_on_examples_names_an_argument_that_exists() -> None:

@@ -331,7 +331,7 @@ def test_packets_have_no_place_elsewhere(tmp_path: Path) -> None:
         "convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2
     ).stderr
     assert (
-        "out.csv: .csv does not support --packets; formats that do: .mcap, .bag, .rosbag2, .db3"
+        "out.csv: .csv does not support --packets; these formats do: .mcap, .bag, .rosbag2, .db3"
         in said
     )
     assert not list(tmp_path.glob("out.*"))

@@ -125,7 +125,7 @@ def test_lost_halves_are_in_the_contents_of_a_file(packets: list[bytes], tmp_pat
         path.write_text("\n\n".join(packet.hex() for packet in sent))
         command = [sys.executable, "-m", "lidarspec", "info", str(path)]
         text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        line = f"returns incomplete in {count} groups of packets, because packets were lost"
+        line = f"returns {count} groups of packets lack a return, because packets were lost"
         assert (line in " ".join(text.split())) == (count > 0)
         text = subprocess.run([*command, "--json"], check=True, capture_output=True, text=True)
         assert json.loads(text.stdout)["contents"][0]["incomplete_returns"] == count
