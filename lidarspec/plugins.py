@@ -343,8 +343,8 @@ class Registry:
         names = {other.name for other in self._offered[home] if other.value == entry.value}
         if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"the entry point is named {entry.name!r}, but the sensor that it loads"
-                f" ({entry.value}) has another id and no such alias",
+                f"the entry point {entry.name!r} loads {entry.value}, a sensor with another id"
+                " and without this alias",
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
@@ -418,8 +418,9 @@ class Registry:
                 return None
             claiming = list(dict.fromkeys(home[0] for home in self._claims[name]))
             error = UsageError(
-                f"{name}: {' and '.join(claiming)} each have a sensor of this name; choose one in"
-                f' {own_settings()}: [owners] {name} = "{claiming[0]}"'
+                f"{name}: {' and '.join(claiming)} each contain a sensor with this name; choose"
+                f" one of these distributions in {own_settings()}, below [owners]: {name} ="
+                f' "{claiming[0]}"'
             )
             raise suggest(error, "lidarspec plugins")
         for entry in self._offered.get(home, []):
@@ -618,7 +619,7 @@ class Registry:
         for name in (sensor.id, *sensor.aliases):
             if sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError(
-                    "another sensor has this id already: one of the same plugin",
+                    "another sensor of the same plugin has this id",
                     sensor=name,
                     rule="LS005",
                 )
@@ -684,7 +685,8 @@ def named_owners() -> dict[str, str]:
             isinstance(value, str) for value in named.values()
         ):
             raise UsageError(
-                f'{file}: [owners]: expected ids and distributions, such as acme-x1 = "acme-lidars"'
+                f"{file}: [owners]: expected the id of a sensor and the name of a distribution,"
+                ' such as acme-x1 = "acme-lidars"'
             )
     except LidarSpecError as error:
         warnings.warn(f"{error}; its [owners] are ignored", stacklevel=2)
@@ -778,7 +780,7 @@ def _reseal(frame: Frame, algorithm: Any) -> Frame:
     struct = prepare(frame.struct)
     seal = next(seals(struct), None)
     if seal is None:
-        raise SpecError("returns a checksum for a frame without one")
+        raise SpecError("returns a checksum for a frame type that declares no checksum")
     seal.algorithm = algorithm
     return replace(frame, struct=struct)
 
@@ -897,7 +899,7 @@ def _trial(*homes: Home) -> tuple[str, str]:
     if not ended:
         if "Timeout (" in complaints:  # of `faulthandler.dump_traceback_later`
             return hangs, ""
-        return f"it ends the process with code {done.returncode}", ""
+        return f"loading it ends the process with the exit status {done.returncode}", ""
     text = " ".join((printed + complaints).split())
     effects = list[str]()
     if text:
@@ -953,7 +955,7 @@ def load_verb(entry: EntryPoint) -> click.Command:
         for command in commands:
             if command.name == entry.name:
                 return command  # type: ignore[no-any-return]
-    raise SpecError(f"its lidarspec_verbs has no verb {entry.name!r}", path=entry.distribution)
+    raise SpecError(f"its lidarspec_verbs returns no verb {entry.name!r}", path=entry.distribution)
 
 
 @contextlib.contextmanager
@@ -1011,7 +1013,8 @@ def _from_file(text: str) -> Sensor:
         ids = local.add(module, name=str(file))
     if not ids:
         raise SpecError(
-            "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
+            "the file must define a function lidarspec_sensors, decorated with @hookimpl, that"
+            " returns a sensor",
             path=str(file),
             rule="LS006",
         )

@@ -132,7 +132,7 @@ def resolve_beside(folder: Path, value: object) -> Path:
     else:
         path = folder
     if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
-        raise UsageError(f"{value!r} is not a file in the folder that names it")
+        raise UsageError(f"{value!r} is not a file in {folder}")
     return path
 
 

@@ -18,7 +18,7 @@ def test_each_missing_tool_is_named_once_with_its_files_and_its_remedy() -> None
         ),
         (
             "tests/testing/test_conformance.py::Test_x::test_vectors_hold",
-            "Skipped: no file of golden vectors",
+            "Skipped: there is no file with golden vectors",
         ),
     ]
     tools, captures = describe_missing(skipped)

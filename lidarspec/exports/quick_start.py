@@ -32,7 +32,10 @@ def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
             detect,
             (f"lidarspec read {source} {sensor_option} -f {frame}", f"print {frame} frames"),
             record,
-            (f"lidarspec convert a.lsr a.csv -f {frame}", "write their fields as a table"),
+            (
+                f"lidarspec convert a.lsr a.csv -f {frame}",
+                "write the fields of these frames as a table",
+            ),
             ("lidarspec stats a.lsr", "count frames and losses"),
         ]
     return [

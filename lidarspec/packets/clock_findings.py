@@ -27,59 +27,65 @@ class FindingType(NamedTuple):
     is_fault: bool = True
 
 
-CHECK_MASTER = "check the source of time: its antenna, its cable, its PTP domain and profile"
+CHECK_MASTER = "check the antenna and the cable of the time source, or its PTP domain and profile"
 #: The codes, the most serious first: states at fault, events that were faults, and the others.
 FINDING_TYPES = MappingProxyType(
     {
         "not_locked": FindingType("not locked: {state}", CHECK_MASTER),
         "tai": FindingType(
             "runs on TAI: {value:.0f} s ahead of UTC",
-            "-O epoch=tai, or set the grandmaster's currentUtcOffset",
+            "pass -O epoch=tai, or set the grandmaster's currentUtcOffset",
         ),
         "gps": FindingType(
             "runs on GPS time: {value:.0f} s ahead of UTC",
-            "-O epoch=gps, or let the receiver apply the leap seconds",
+            "pass -O epoch=gps, or let the receiver apply the leap seconds",
         ),
         "utc": FindingType(
-            "runs on UTC, expected {epoch}", "-O epoch=utc, or let the grandmaster send TAI"
+            "runs on UTC, expected {epoch}", "pass -O epoch=utc, or let the grandmaster send TAI"
         ),
         "behind_utc": FindingType(
-            "{behind:.0f} s behind UTC: it subtracts the offset of TAI from a time in UTC",
+            "{behind:.0f} s behind UTC: the sensor subtracts the TAI offset from a time that is"
+            " already UTC",
             "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
         ),
         "second_off": FindingType(
-            "{value:+.3f} s off: a pulse (PPS) was probably combined with the wrong sentence",
-            "check that the NMEA sentence follows the pulse that it belongs to",
+            "{value:+.3f} s off: the sensor probably paired its PPS pulse with the wrong NMEA"
+            " sentence",
+            "check that each NMEA sentence is sent after the pulse to which it belongs",
         ),
         "wrong_date": FindingType(
-            "its date is {days:.0f} days off: it was probably never set",
-            "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
+            "the date is {days:.0f} days off: the sensor's clock was probably never set",
+            "connect a time source (PTP, or GPS with PPS), and select it in the sensor",
         ),
         "offset": FindingType(
             "{value:+.3f} s off the clock of this computer",
-            "synchronize both to one source; chronyc tracking shows this computer's",
+            "synchronize both clocks to one source; chronyc tracking shows the state of this"
+            " computer's clock",
         ),
         "drift": FindingType(
-            "drifts by {value:+.1f} ppm", "synchronize the sensor by PTP or PPS, or use --time host"
+            "drifts by {value:+.1f} ppm",
+            "synchronize the sensor by PTP or PPS, or repeat with --time host",
         ),
         "unsynchronized": FindingType(
             "counts from power-up, expected {epoch}",
             "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
         ),
         "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
-        "restart": FindingType("restarted: its time began again", "check its power supply"),
+        "restart": FindingType("restarted, and its time began again", "check its power supply"),
         "leap_second": FindingType(
-            "set by {value:+.3f} s at a leap second", "record such a time again, or use --time host"
+            "stepped by {value:+.3f} s at a leap second",
+            "use --time host for the data around the leap second",
         ),
         "second_step": FindingType(
-            "set by {value:+.3f} s: its pulse (PPS) is a second off",
+            "stepped by {value:+.3f} s: the sensor probably paired its PPS pulse with the wrong"
+            " NMEA sentence",
             "check that the NMEA sentence follows the pulse that it belongs to",
         ),
         "jump": FindingType(
             "set by {value:+.3f} s", "use --time host for the data around this time"
         ),
         "free_running": FindingType(
-            "counts from power-up: no date", "use --time host for dates", is_fault=False
+            "counts from power-up, so it has no date", "use --time host for dates", is_fault=False
         ),
         "lock_gained": FindingType("locked: {state}", is_fault=False),
         "state_changed": FindingType("state: {state}", is_fault=False),
@@ -87,7 +93,7 @@ FINDING_TYPES = MappingProxyType(
         "no_arrival_times": FindingType(
             "the source has no arrival times to compare with", is_fault=False
         ),
-        "too_short": FindingType("too few packets to judge", is_fault=False),
+        "too_short": FindingType("too few packets to judge the clock", is_fault=False),
         "ok": FindingType("in order", is_fault=False),
     }
 )

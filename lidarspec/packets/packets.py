@@ -392,8 +392,8 @@ def _nested_dtype(
         here = prefix + name
         if len(_list_forms(schema, here)) > 1:
             raise SpecError(
-                "in some branches this is a value, in others a struct or an array: read its columns"
-                " separately",
+                "this is a value in some frames, and a struct or an array in others: read each"
+                " of its columns by its full name",
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]

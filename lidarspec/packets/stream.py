@@ -224,8 +224,8 @@ class PacketStream:
             return times
         if self._epoch.ns is None:
             self.stats.undated = (
-                f"times count from the start of the sensor's clock: no {self._epoch.frame}"
-                " frame with the date has arrived"
+                "times count from the start of the sensor's clock, because no"
+                f" {self._epoch.frame} frame with the date has arrived"
             )
             return times
         self.stats.undated = ""

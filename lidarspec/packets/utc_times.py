@@ -70,7 +70,7 @@ class UtcSource:
         if self.kind == "arrival":
             text = f"the arrival times, because the sensor's clock {self.reason}"
         elif self.kind == "hour":
-            text = "the sensor's clock, with the hour of the arrival time"
+            text = "the sensor's clock within the hour; the hour comes from the arrival time"
         elif self.epoch == "utc":
             text = "the sensor's clock"
         else:
@@ -247,14 +247,17 @@ class UtcTimes:
         return utc_s * SECOND_NS + fractions_ns
 
     def _explain_no_clock(self) -> UsageError:
-        error = UsageError(f"{self._sensor} has no clock, so that UTC is known by arrival only")
+        error = UsageError(
+            f"{self._sensor} has no clock, so UTC can only come from the arrival times"
+        )
         return suggest(error, "repeat with --time host")
 
     def _explain_unknown(self, source: UtcSource) -> UsageError:
         """Return the error for times that cannot be converted."""
         error = UsageError(
-            f"{self._name} has no arrival times, and the clock of {self._sensor} {source.reason},"
-            f" so that UTC is unknown; record with arrival times (lidarspec record -o drive.lsr)"
+            f"UTC is unknown, because {self._name} has no arrival times, and the clock of"
+            f" {self._sensor} {source.reason}; record with arrival times: lidarspec record -o"
+            " drive.lsr"
         )
         return suggest(error, "repeat with --time sensor")
 

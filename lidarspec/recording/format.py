@@ -132,8 +132,8 @@ class Header:
             configured: Sensor = installed.configure(**options)
         except UsageError as error:
             raise UsageError(
-                "it was recorded with an option that must be passed again, as in -s"
-                f" {self.sensor} -O ...: {error}"
+                f"pass the options of the recorded sensor again, as in -s {self.sensor} -O"
+                f" NAME=VALUE: {error}"
             ) from None
         return configured
 

@@ -207,4 +207,4 @@ def _describe_missing_end(rule: Split) -> str:
         )
     if isinstance(rule, Every):
         return "no scan was completed"
-    return f"{rule.name} has not shown the end of a scan"
+    return f"{rule.name} did not mark the end of a scan"

@@ -66,7 +66,7 @@ class ClockFaults:
     def __post_init__(self) -> None:
         if self.follows not in ("", *DATED_EPOCHS):
             raise UsageError(
-                f"a clock cannot follow {self.follows!r}: expected {', '.join(DATED_EPOCHS)}"
+                f"a clock cannot count {self.follows!r}: expected one of {', '.join(DATED_EPOCHS)}"
             )
         if not abs(self.drift_ppm) <= MAX_DRIFT_PPM:
             raise UsageError(f"drift must be at most {MAX_DRIFT_PPM:g} ppm, not {self.drift_ppm:g}")
@@ -98,8 +98,8 @@ def parse_clock_faults(text: str) -> ClockFaults:
         else:
             names = (*DATED_EPOCHS, *_READERS)
             raise UsageError(
-                f"invalid clock fault {part.strip()!r}: expected {', '.join(names)}"
-                f"{did_you_mean(name, names)}"
+                f"invalid clock fault {part.strip()!r}: expected one of"
+                f" {', '.join(names)}{did_you_mean(name, names)}"
             )
     return faults
 
@@ -110,7 +110,9 @@ def _add_drift(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
     except ValueError:
         drift_ppm = math.nan
     if not math.isfinite(drift_ppm) or start_s:
-        raise UsageError(f"invalid drift {value!r}: expected millionths since power-on, as 50ppm")
+        raise UsageError(
+            f"invalid drift {value!r}: expected parts per million without a time, such as 50ppm"
+        )
     return replace(faults, drift_ppm=drift_ppm)
 
 

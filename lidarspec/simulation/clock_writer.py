@@ -257,7 +257,7 @@ class ClockWriter:
             base = np.datetime64(self.read(table).item() // DAY_NS, "D")
             self._date = _DateFields(*paths, base, (year, month, day))
         elif date:
-            raise self._make_error("the fields of its date were not all found")
+            raise self._make_error("not all fields of its date were found")
         self._set_fields(linear)
 
     def _set_fields(self, fields: list[_TimeField]) -> None:
@@ -349,13 +349,14 @@ class FrameClock:
         """
         if self._writer is None:
             raise UsageError(
-                f"{self._sensor.id} has no clock in {self._frame!r} frames, so that the clock"
-                " cannot have faults"
+                f"{self._sensor.id} has no clock in {self._frame!r} frames, so clock faults"
+                " cannot be simulated"
             )
         if faults.follows and not self._writer.can_follow_dates:
             raise UsageError(
-                f"the clock of {self._sensor.id} cannot follow {faults.follows.upper()}: it wraps"
-                f" at {self._writer.period_ns / 1e9:g} s, which does not divide a day"
+                f"the clock of {self._sensor.id} cannot count {faults.follows.upper()}, because"
+                f" it wraps at {self._writer.period_ns / 1e9:g} s, and a day is no multiple of"
+                " this period"
             )
 
     def check_status(self) -> None:

@@ -437,8 +437,8 @@ class PointPlacement(Measurement):
                     own > length for own, length in zip(stacked.shape[1:], shape, strict=False)
                 ) or stacked.ndim > 1 + len(shape):
                     raise SpecError(
-                        f"azimuth and elevation {azimuth.shape} do not broadcast to the shape"
-                        f" of the points of frame {number}, {shape}"
+                        f"azimuth and elevation have the shape {azimuth.shape}, which does not"
+                        f" broadcast to the shape {shape} of the points of frame {number}"
                     )
                 corner: Any = tuple(
                     slice(0, length if length > 1 else None) for length in stacked.shape[1:]

@@ -185,12 +185,13 @@ class Frame:
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
                 raise SpecError(
-                    f"{name} must have one path of parts, got {', '.join(own) or 'none'}",
+                    f"{name} must map exactly one path (of a field with Parts) to a function, got"
+                    f" {', '.join(own) or 'none'}",
                     path=name,
                 )
         if self.data and self.clock is not None:
             raise SpecError(
-                "a data frame uses the clock of the sensor: declare it there", path="clock"
+                "a data frame uses the sensor's clock: pass clock= to the Sensor", path="clock"
             )
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)

@@ -201,8 +201,8 @@ class SizeOf(layer.SizeField):
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
         if not hasattr(subcon, "parse") or not isinstance(part, str) or not isinstance(plus, int):
             raise SpecError(
-                "SizeOf requires a field, the name of a part and a number, as in SizeOf(Int16ub,"
-                f' "body", 2), got {part!r} and {plus!r}'
+                "SizeOf requires a field, the name of a part, and the number of bytes to add, as"
+                f' in SizeOf(Int16ub, "body", 2), got {part!r} and {plus!r}'
             )
         super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
 
@@ -248,7 +248,10 @@ class Checksummed(layer.SealedStruct):
         while isinstance(inner, Checksummed):
             if self.over is None and inner.over is None:
                 both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
-                raise SpecError(f"{both}: declare over= on the inner Checksummed")
+                raise SpecError(
+                    f"{both}: name the fields that the inner Checksummed covers, with its"
+                    " argument over="
+                )
             inner = inner.subcon
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -429,8 +432,8 @@ class Parts(layer.Partition):
             following is None
         ):
             raise SpecError(
-                "Parts requires one of count=, within=, or size= with following=, to find the"
-                " last part"
+                "Parts requires count=, or within=, or size= with following=; only one of them"
+                " may determine the last part"
             )
         if isinstance(kinds, Mapping):
             self.cases = dict(kinds)
@@ -454,7 +457,7 @@ class Parts(layer.Partition):
             part = self.cases[kind]._parsereport(stream, context, place)
             self._append(parsed, kind, part, (offset, stream.tell()), announced, place)
             if stream.tell() - start > self.limit:
-                raise RangeError("the parts are longer than the frame may be", path=place)
+                raise RangeError("the parts exceed the maximum length of the frame", path=place)
         return parsed
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -472,7 +475,7 @@ class Parts(layer.Partition):
             stream.write(data)
         if next_size(built) != 0:
             raise RangeError(
-                f"the frame announces more parts than the {len(built)} that were given", path=path
+                f"the frame announces more parts than the {len(built)} given parts", path=path
             )
         return built
 

@@ -160,8 +160,8 @@ class SensorDescription:
         if not self.has_points:
             example = next(iter(self.incoming), "")
             raise UsageError(
-                f"{self.id} has no points: name a frame type, such as frame={example!r}; it has"
-                f" {', '.join(self.incoming) or 'none'}"
+                f"{self.id} has no points: select one of its frame types"
+                f" ({', '.join(self.incoming) or 'none'}), as in frame={example!r}"
             )
 
     def require_imu(self) -> None:
@@ -232,7 +232,7 @@ class SensorDescription:
         else:
             having = "no frame type of the sensor has"
         raise SpecError(
-            f"this frame type has no IMU samples; {having} them", path=frame, sensor=self.id
+            f"this frame type has no IMU samples; {having} IMU samples", path=frame, sensor=self.id
         )
 
     def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
@@ -344,8 +344,8 @@ def _check_reported(sensor: SensorDescription, name: str) -> None:
         if opening in sensor.commands
     ):
         raise SpecError(
-            "`reported` requires the data link, and a command in `on_open` over another link that"
-            " provides the port",
+            "only the data link may have the port `reported`, and a command in `on_open`, sent"
+            " over another link, must provide the port",
             path=f"links.{name}",
             sensor=sensor.id,
         )
@@ -390,7 +390,7 @@ def _check_facts(sensor: SensorDescription) -> None:
     for name, frame in sensor.frames.items():
         if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
             raise SpecError(
-                f"{frame.endless.reason}; without one, it can only be sent in datagrams",
+                f"{frame.endless.reason}; frames without an end can only be sent in datagrams",
                 path=f"{name}.{frame.endless.path}".strip("."),
                 sensor=sensor.id,
                 rule=frame.endless.rule,
@@ -444,7 +444,7 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
         other.starts or other.stops for other in sensor.commands.values()
     ):
         raise SpecError(
-            "only_stopped requires a command that starts or stops the data",
+            "only_stopped requires that one of the sensor's commands starts or stops the data",
             path=f"commands.{name}",
         )
     if command.learns is not None and not (command.replies and sensor.configure is not None):
@@ -642,7 +642,9 @@ def _check_epoch(sensor: SensorDescription, epoch: object) -> None:
             f" {shown(epoch)}"
         )
     if epoch == "hour" and sensor.clock is not None and sensor.clock.wraps_at != HOUR_S:
-        raise UsageError(f"{sensor.id}: epoch cannot be hour, because the clock counts further")
+        raise UsageError(
+            f"{sensor.id}: epoch cannot be hour, because the clock counts beyond one hour"
+        )
 
 
 def _check_shared(sensor: SensorDescription, options: Mapping[str, Any]) -> None:

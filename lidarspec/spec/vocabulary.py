@@ -346,12 +346,12 @@ def _refuse_folded(turn: Array, full: float) -> None:
     moved = angles[angles != 0]
     if moved.size and not np.mod(moved, full).any():
         reason = (
-            f"spread(start, end): each end is a whole number of revolutions of {full:g} from"
-            " its start, so all points would have one angle"
+            "spread(start, end): all points would have the same angle, because each end differs"
+            f" from its start by a multiple of a revolution ({full:g})"
         )
         raise SpecError(
-            f"{reason}; full= must be the full circle in the unit of the angles; use"
-            " steps(count) for the index of a sample",
+            f"{reason}; full= must be one revolution in the unit of the angles; for the index of"
+            " a sample use steps(count)",
             rule="LS215",
         )
 

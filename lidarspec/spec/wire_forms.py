@@ -441,7 +441,7 @@ class Tokens:
     def __post_init__(self) -> None:
         if len(self.start) != 1 or len(self.sep) != 1 or not self.end:
             raise SpecError(
-                "start and sep of tokens must be one byte, and end at least one",
+                "start and sep of tokens must each be one byte, and end at least one byte",
                 path="wire",
             )
         if len({self.start, self.sep, self.end[:1]}) < 3:
@@ -503,7 +503,7 @@ class Tokens:
             return stop, None
         begin = stop - self.check.size
         if data[begin : begin + 1] != self.check.mark or begin < 1:
-            reason = f"{self.check.mark.decode()} and a checksum are missing before the end"
+            reason = f"the frame does not end with {self.check.mark.decode()} and a checksum"
             return stop, Problem(stop, reason, is_checksum=True)
         got = data[begin:stop]
         expected = self.check.write(data[1:begin])
@@ -815,8 +815,8 @@ class Echoes:
         room = self.most * self.size
         if len(characters) % room:
             raise SpecError(
-                f"expected groups of {self.most} echoes of {self.size} characters after the"
-                f" head, got {len(characters)} characters",
+                f"the characters after the head must be a multiple of {room} ({self.most} echoes"
+                f" of {self.size} characters), got {len(characters)} characters",
                 path="wire",
             )
         echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
@@ -1161,7 +1161,8 @@ class Escaped:
             or special & {b ^ self.xor for b in special}
         ):
             raise SpecError(
-                "flag and escape must be two different bytes that no escaped byte equals",
+                "flag and escape must be two different bytes, and no escaped byte may equal one"
+                " of them",
                 path="wire",
             )
 

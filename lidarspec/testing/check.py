@@ -110,7 +110,8 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
         target.findings += _check_taken_ids(target.sensors, file)
         if not target.sensors:
             raise SpecError(
-                "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
+                "the file must define a function lidarspec_sensors, decorated with @hookimpl,"
+                " that returns a sensor",
                 rule="LS006",
             )
     except SourceError:
@@ -135,7 +136,7 @@ def _find_folder_target(folder: Path) -> CheckTarget:
     else:
         name = None
     if not isinstance(name, str):
-        raise SourceError(f"{file} does not name a project")
+        raise SourceError(f"{file} contains no name of a project")
     entries = _find_entry_points(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
@@ -658,7 +659,10 @@ def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]
     sensor = subject.sensor
     missing = lacking(subject)
     if missing:
-        yield "vectors", f"{missing}; x and y of points in two quadrants would verify these values"
+        yield (
+            "vectors",
+            f"{missing}; vectors with points in two quadrants would verify these values",
+        )
     yield (
         "vendor_axes",
         f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared",
@@ -692,7 +696,7 @@ def _make_report(
             & set(tested_property.unless)
         )
         reason = tested_property.lacks(subject) or (
-            f"{', '.join(violated)} was found" if violated else ""
+            f"not tested because of {', '.join(violated)}" if violated else ""
         )
         if reason:
             report.skipped[tested_property.name] = reason
@@ -703,7 +707,7 @@ def _make_report(
         report.held += not findings
         report.findings += findings
         if any(finding.code in FATAL_RULES for finding in report.findings):
-            report.skipped[REMAINING_PROPERTIES] = "cannot be tested until the findings are fixed"
+            report.skipped[REMAINING_PROPERTIES] = "not tested until these findings are fixed"
             break
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()

@@ -68,11 +68,11 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
     command = sensor.commands[name]
     data = sensor.command(name, **arguments_given)
     if command.frame is None:
-        assert data == b"", "a command without a frame has bytes"
+        assert data == b"", "the command declares no frame, but it has bytes"
         return
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, (
-        "building the parsed values gives different bytes"
+        "parsing the command and building it again gives different bytes"
     )
     fields = make_schema(sensor.frames[command.frame].tree).fields
     for path, value in command.fixed.items():
@@ -118,7 +118,8 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
                 continue
             raise ViolationError(
                 "LS602",
-                f"{key} = {outside} is accepted, but {format_argument_type(kind)} is declared",
+                f"{key} = {outside} is accepted, but the declared values are"
+                f" {format_argument_type(kind)}",
                 f"commands.{name}.args.{key}",
             )
 
@@ -137,12 +138,14 @@ def an_exchange_holds(
         require(
             built == data,
             "LS605",
-            f"sends {built.hex(' ')}, expected {data.hex(' ')}",
+            f"the command sends {built.hex(' ')}, expected {data.hex(' ')}",
             path,
         )
         if answer is None:
             return
-        require(command.replies, "LS605", "it has a reply, but the command declares no reply", path)
+        require(
+            command.replies, "LS605", "the vector has a reply, but the command declares none", path
+        )
         session = Session(sensor)
         pending = session.request(name, 0, **given)
         kind = identify(sensor, answer)
@@ -186,7 +189,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
             if name in subject.sensor.simulation.answers:
                 raise
             cause = f"{error.path}: {error.reason}".removeprefix(": ")
-            what = f"cannot simulate its reply without answers= of the Simulation: {cause}"
+            what = f"the reply can only be simulated with answers= of the Simulation: {cause}"
             raise ViolationError("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
         _learn(subject, name, reply)
@@ -208,7 +211,7 @@ def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
         else:
             which = "without"
         what = (
-            f"cannot read options from its reply, simulated {which} answers= of the"
+            f"no options can be read from the reply, which was simulated {which} answers= of the"
             f" Simulation: {error}"
         )
         raise ViolationError("LS604", what, f"commands.{name}") from error

@@ -124,7 +124,8 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         require(
             worst <= MAX_BACK_STEP_RAD,
             "LS504",
-            f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from its expected direction",
+            f"{turn}: the direction of a point differs from the expected direction by"
+            f" {np.rad2deg(worst):.1f} degrees",
             f"{name}.points",
         )
 

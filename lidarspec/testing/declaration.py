@@ -108,11 +108,15 @@ def _check_sensor(sensor: Sensor) -> Findings:
     if "data" not in sensor.links:
         yield "LS211", "link 'data' is missing", "links"
     if sensor.points is not None and not sensor.has_points:
-        yield "LS211", "no frame is declared with data=True, but points is given", "frames"
+        yield "LS211", "points is declared, but no frame has data=True", "frames"
     if sensor.range_limits is not None:
         low, high = sensor.range_limits
         if not 0 <= low < high:
-            yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
+            yield (
+                "LS210",
+                f"range_limits must be two rising numbers, at least 0, not {low:g} .. {high:g}",
+                "range_limits",
+            )
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
@@ -234,7 +238,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
 def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     engine = get_codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
-        yield "LS114", f"it is a {type(frame.struct).__name__}", name
+        yield "LS114", f"the frame is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
         reason = getattr(engine, "reason", "its layout cannot be computed")
         if NAME_IS_COMPARED in reason:
@@ -351,7 +355,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
         ):
             yield (
                 "LS201",
-                f"{info.name!r} is a measured value without a unit (Scaled)",
+                f"{info.name!r} is a measured value, but has no unit",
                 f"{name}.{path}",
             )
 
@@ -443,7 +447,8 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
                 reported.add(path)
                 yield (
                     "LS205",
-                    f"no checksum of the frame covers byte {min(own - under)}",
+                    f"no checksum of the frame covers byte {min(own - under)}, which belongs to"
+                    " this field",
                     f"{name}.{path}",
                 )
 
@@ -455,7 +460,7 @@ def _check_sync(
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:
-        yield "LS204", "the frame has no constant bytes, so that every offset is a candidate", name
+        yield "LS204", "the frame has no constant bytes, so a frame may begin at every offset", name
         return
     seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
     data = np.frombuffer(
@@ -474,7 +479,7 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        yield "LS204", f"its constants occur at {share:.1%} of the offsets in payloads", name
+        yield "LS204", f"{share:.1%} of the offsets in its content match its constant bytes", name
 
 
 def _check_strength(
@@ -551,7 +556,8 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
             others = ", ".join(info.path for info in own if info is not None)
             yield (
                 "LS218",
-                f"it comes from {others}, and no column uses this field",
+                f"the intensity of points is calculated from {others}, and no column uses this"
+                " field",
                 f"{name}.{path}",
             )
             return
@@ -582,14 +588,16 @@ def _check_range_limit(subject: SensorUnderTest) -> Findings:
         declared = "{:g} .. {:g}".format(*limits)
         held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
         subject.picture[f"{name}: range"] = (
-            f"{held[0]:.4g} .. {held[1]:.6g} m can be represented, {declared} m is declared"
+            f"{held[0]:.4g} .. {held[1]:.6g} m can be represented, and range_limits are"
+            f" {declared} m"
         )
         reach.append((held[1], f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if limits[1] > furthest * 1.001:
         yield (
             "LS210",
-            f"its largest value is {furthest:g} m, but range_limits end at {limits[1]:g} m",
+            f"the largest value of the field is {furthest:g} m, but range_limits end at"
+            f" {limits[1]:g} m",
             path,
         )
 
@@ -603,7 +611,7 @@ def _check_column(
     if column == "range" and measured and all(CODE_NAMES.fullmatch(info.name) for info in measured):
         yield (
             "LS219",
-            "the range of points comes from this field, but its name is that of a code",
+            "the range of points is calculated from this field, but its name suggests a code",
             f"{name}.{measured[0].path}",
         )
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
@@ -627,6 +635,6 @@ def _check_column(
                 problem = f"it has no unit, expected {' or '.join(units)}"
             yield (
                 "LS201",
-                f"the {column} of points comes from this field, but {problem}",
+                f"the {column} of points is calculated from this field, but {problem}",
                 f"{name}.{first.path}",
             )

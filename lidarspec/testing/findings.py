@@ -42,15 +42,15 @@ LS101 construct hides this field name | `parsed.items` is a method of the Contai
 LS102 the field name is reserved | `f.state` and `column.on` have another meaning in `points` | choose another name
 LS103 the field name is not a public identifier | == ignores names that begin with _ | choose an identifier without a leading _
 LS104 two fields have the same name | the last one replaces the others | number the names: reserved_1, reserved_2
-LS105 the field has no name | its bytes are lost on a round trip | declare "reserved" / Bytes(n)
-LS106 a part loses bytes | they are not built as they were read
+LS105 the field has no name | its bytes are lost when a parsed frame is built again | declare "reserved" / Bytes(n)
+LS106 a part loses bytes | they are missing when a parsed frame is built again
       | end the part with "rest" / GreedyBytes, or make it a named member of a Struct
-LS107 Flag is used for a whole byte | seven of its bits are lost on a round trip | declare all eight bits in a BitStruct
-LS108 the struct contains FlagsEnum | bits without a name are lost on a round trip | use a BitStruct
-LS109 the struct contains Union | edits of all but one reading are ignored when the frame is built
+LS107 Flag is used for a whole byte | seven of its bits are lost when a parsed frame is built again | declare all eight bits in a BitStruct
+LS108 the struct contains FlagsEnum | bits without a name are lost when a parsed frame is built again | use a BitStruct
+LS109 the struct contains Union | building uses one reading, and ignores edits of the others
       | declare one reading of the bytes
 LS110 the struct contains Pickled | it runs code from the wire | declare the fields
-LS111 a field is greedy | it has no end on a stream, or if its elements are empty | declare a count, a length or a terminator
+LS111 a field is greedy | nothing marks its end in a stream, or its elements may be empty | declare a count, a length or a terminator
 LS112 the struct contains Pointer or Seek | they read bytes outside the frame | declare fields in the order of the wire
 LS113 the struct contains Select or Optional | damaged bytes would select another alternative | use If or Switch on a header field
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
@@ -62,9 +62,9 @@ LS202 the sensor has no source | readers cannot verify its numbers | declare sou
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame
 LS204 the sync pattern is common | false candidates cost time and valid frames | declare more constant bytes or bits
 LS205 the checksum does not cover a field | a flipped bit in the field is not detected | add it to over=, or omit over=
-LS206 noise passes as a weak frame | it becomes false points | declare plausible= or confirm=
+LS206 noise may be accepted as this frame | it becomes false points | declare plausible= or confirm=
 LS207 `plausible` does not test columns | an expression of construct is always true | use plausible=lambda f: f.angle < 360
-LS208 `points` cannot be traced | it runs as ordinary NumPy, ten times slower | use ufuncs and functions of lidarspec.spec
+LS208 `points` cannot be compiled | it runs as ordinary NumPy, ten times slower | use ufuncs and functions of lidarspec.spec
 LS209 an acknowledgement has no finding or no reason | it would hide the next such finding | remove it, or give a reason
 LS210 the field cannot hold the range limit | the scale or the limit is wrong | compare both with the manual
 LS211 the declaration is incomplete | lidarspec cannot open, decode or detect the sensor | declare vendor, model, a data frame and a data link
@@ -73,14 +73,14 @@ LS212 the checksum is not verified | damaged frames are accepted
 LS213 a column is used as a condition of Python | a column has one truth value for each packet
       | use & | ~ and np.where: (f.a < 1) & (f.b < 2)
 LS214 columns have different shapes | a point needs one value of each
-      | give one value for each point or packet; along(...) sets an axis
+      | give one value for each point or packet; name the axis of an array with along(...)
 LS215 `spread` gives all samples one value | all points of a packet get the same angle or time
       | set full= to the circle in the angle's unit, or use steps(count)
 LS216 no data frame has this field | the scans, the clock or the counter need it | use a path that `lidarspec show` prints
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
-LS218 the intensity comes from another field | users expect the intensity that the sensor measured
+LS218 the intensity is calculated from another field | users expect the intensity that the sensor measured
       | use the field with this name
-LS219 the range comes from a code | errors become points | use the distance field
+LS219 the range is calculated from a code | error codes become points | use the distance field
 LS301 no example can be generated | the frame cannot be tested
       | declare Simulation(sweep=...), or strategies = {"frame.field": ...} in the test class
 LS302 parsing and building change the bytes | a replayed or edited frame differs | use fields that keep every bit
@@ -90,13 +90,13 @@ LS305 a field does not keep a written value | the value read differs from the va
 LS306 a frame is parsed as another type | its fields get another meaning | declare constants that differ, or another order
 LS307 a truncated frame is accepted | missing values are invented | declare the length of every field
 LS308 an undocumented exception is raised | callers catch LidarSpecError only | make lambdas valid for all values
-LS310 the checksum misses a flipped bit | damaged frames are accepted | use one that depends on every byte
+LS310 the checksum misses a flipped bit | damaged frames are accepted | use a checksum that depends on every byte
 LS311 examples are not repeatable or too long | a failure cannot be reproduced | use no random values and no clock
 LS312 a field that `Rebuild` fills in is not checked | a frame with another value is accepted, and built differently
       | compare it in `plausible`: f.length == f.size + 5
 LS401 a clean stream loses bytes | valid frames are lost without any damage | declare all parts of the frames
 LS404 scans depend on the split into packets | the same revolution is cut elsewhere | keep no state in `points`
-LS414 a function of the plugin raises an error | its packets are lost, and only counted | make it valid for every valid frame
+LS414 a function of the plugin raises an error | its packets are counted, but lost | make it valid for every valid frame
 LS415 the same bytes give different results | results cannot be reproduced | use the fields only
 LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians; 0 is no return
 LS502 angles are in degrees | radians are expected, so directions are wrong | use np.deg2rad(...)
@@ -105,7 +105,7 @@ LS504 angles run backwards across the full circle | one packet a turn is spread 
       | use spread(..., full=360.0)
 LS505 an angle of exactly the full circle is not folded | sensors send 360.00 degrees for 0
       | use wrap(angle, 360.0), or reject it in `plausible`
-LS506 angles are not in order | scans are cut in the wrong places | use the manual's direction, and spread or wrap
+LS506 angles are not in the order of the rotation | scans are cut at wrong angles | use the manual's direction, and spread or wrap
 LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`
 LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail | return the raw angles and counters of packet i
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
@@ -126,9 +126,9 @@ LS702 a vector cannot be read | it tests nothing | write {"frame": ..., "hex": .
 LS703 the checksum covers the wrong bytes | all frames of a real sensor are rejected | compare over= and the algorithm with the manual
 LS704 the byte order is wrong | 0x1234 is read as 0x3412 | Int16ub is big-endian, Int16ul little-endian
 LS705 a signed number is read as unsigned | -1 becomes 65535 | use Int16sl
-LS706 a vector has another value | the field reads these bytes differently | compare the field with the manual
+LS706 a vector has another value for a field | the field reads these bytes differently | compare the field with the manual
 LS707 a vector is not a valid frame | bytes of a real sensor are rejected | compare the struct with the manual
-LS708 a vector has its point elsewhere | coordinates are wrong | compare `points` with the manual
+LS708 a point of a vector has other coordinates | coordinates are wrong | compare `points` with the manual
 LS709 a point is mirrored | left and right are exchanged | use azimuth=-np.deg2rad(clockwise)
 LS710 the status requires vectors | no frame of a real sensor has been tested
       | add vectors.json with frames of the manual or a capture, or declare status="manual"
@@ -138,10 +138,10 @@ LS712 all points of the vectors are in one quadrant | a mirrored or rotated clou
       | add points in two quadrants, calculated by hand
 LS713 a vector exceeds the range limits | its byte order, its scale or the limit is wrong
       | compare byte order, scale and range_limits with the manual
-LS801 an exception is swallowed | errors are neither reported nor counted | remove the try
+LS801 an exception is ignored without a message | errors are neither reported nor counted | remove the try
 LS802 the wall clock is used | it jumps, and two runs differ | use the sensor's clock
-LS803 a short write is ignored | the rest of a command is never sent | use sendall
-LS804 `this` is used as a condition of Python | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
+LS803 a partial write is ignored | the rest of a command is never sent | use sendall
+LS804 an expression with `this` is used as a condition of Python | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
 LS805 hasattr(this, ...) is used | it is always true | test a header field
 """
 RULES = {

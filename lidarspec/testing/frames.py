@@ -73,7 +73,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     require(
         examples[:3] == again,
         "LS311",
-        "example(seed=...) returned different bytes for the same seed",
+        "two calls of example with the same seed returned different bytes",
         name,
     )
     longest = max(map(len, examples))
@@ -92,7 +92,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     require(
         len(set(examples)) > 1 or not free or len(examples) < 2,
         "LS301",
-        "all examples are the same",
+        "all examples are equal",
         name,
     )
 
@@ -193,7 +193,8 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
                 require(
                     built == other,
                     "LS312",
-                    f"{leaf.scalar(other)} is accepted, but {leaf.scalar(built)} is built",
+                    f"the value {leaf.scalar(other)} is accepted when parsing, but building"
+                    f" writes {leaf.scalar(built)}",
                     path,
                 )
 
@@ -230,12 +231,17 @@ def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     fitting = [
         other for other in subject.sensor.frames if is_valid_frame(subject.sensor, data, other)
     ]
-    require(name in fitting, "LS306", "its own example is not parsed as a frame of this type", name)
+    require(
+        name in fitting,
+        "LS306",
+        "an example of this frame type is not accepted as a frame of this type",
+        name,
+    )
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(
         any(same(subject.sensor.parse(data), values) for values in read),
         "LS306",
-        "parsing without a type gives the wrong type",
+        "if no type is given, the example is parsed as another type",
         name,
     )
 
@@ -273,7 +279,7 @@ def _raise_changed_bytes(
     if difference is None:
         was, became = (part[offset : offset + 1].hex() for part in (data, built))
         raise ViolationError(
-            code, f"byte {offset} of {len(data)} is {was} and becomes {became}", name
+            code, f"byte {offset} of {len(data)} changes from {was} to {became}", name
         )
     path, before, after = difference
     raise ViolationError(
@@ -375,14 +381,14 @@ def _check_edit(
         require(
             got == wanted or path in sealed,
             "LS305",
-            f"{wanted} is written, but {got} is read",
+            f"{wanted} was written, but {got} was read",
             f"{name}.{path}",
         )
     path = integers[edits[0]][2]
     require(
         subject.sensor.build(name, again) == built,
         "LS302",
-        f"after an edit of {path}, building the frame again gives different bytes",
+        f"a frame with an edited {path} is parsed and built again, and has different bytes",
         f"{name}.{path}",
     )
 
@@ -423,14 +429,16 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
             require(
                 0 <= error.offset <= end,
                 "LS307",
-                f"cut at byte {end}, but the error names byte {error.offset}",
+                f"the frame was truncated at byte {end}, but the error names byte {error.offset}",
                 name,
             )
         except Exception as error:
             raise _undocumented_error(error, f"cut at byte {end} of {len(data)}", name) from error
         else:
             raise ViolationError(
-                "LS307", f"accepted although it is cut at byte {end} of {len(data)}", name
+                "LS307",
+                f"the frame is accepted although it was truncated at byte {end} of {len(data)}",
+                name,
             )
 
 
@@ -493,7 +501,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
             require(
                 byte not in covered,
                 "LS310",
-                f"accepted although bit {bit} of byte {byte} is flipped",
+                f"the frame is accepted although bit {bit} of byte {byte} is flipped",
                 path,
             )
     if tried:

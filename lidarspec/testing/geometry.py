@@ -262,13 +262,13 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     require(
         azimuth <= (MAX_SWEEP_AZIMUTH_RAD if along else MAX_RANDOM_AZIMUTH_RAD),
         "LS502",
-        f"an azimuth of {azimuth:.4g} rad",
+        f"an azimuth is {azimuth:.4g} rad",
         where,
     )
     require(
         not along or elevation <= np.pi / 2 + 1e-6,
         "LS502",
-        f"an elevation of {elevation:.4g} rad",
+        f"an elevation is {elevation:.4g} rad",
         where,
     )
 
@@ -300,7 +300,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
             ).points()
         except SpecError as error:
             raise ViolationError(
-                "LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}"
+                "LS503", f"a frame with {path} = 1: {error.reason}", f"{name}.{path}"
             ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
             continue
@@ -310,7 +310,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
         require(
             np.isnan(examples.azimuth).all(),
             "LS503",
-            f"with {path} = 1, all azimuths are NaN",
+            f"all azimuths of a frame with {path} = 1 are NaN",
             f"{name}.{path}",
         )
 
@@ -345,7 +345,7 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
         require(
             same,
             "LS505",
-            f"{path} of {FULL_TURNS[info.unit]:g} {info.unit} and of 0 give different points",
+            f"{path} = {FULL_TURNS[info.unit]:g} {info.unit} and {path} = 0 give different points",
             f"{name}.{path}",
         )
 
@@ -374,7 +374,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
         axes = subject.sensor.vendor_axes
         expected = _sense_of(axes, first) if axes else 0
         message = (
-            f"points turn {words[sense]} as {path} grows, but angles in vendor_axes"
+            f"points turn {words[sense]} if {path} grows, but angles in vendor_axes"
             f" {', '.join(axes or ())} turn {words.get(expected)}"
         )
         is_proven = name in subject.placed
@@ -444,16 +444,16 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
         )
         if one_way < MIN_ONE_WAY_SHARE:
             message = (
-                f"only {one_way:.0%} of the steps have the same direction, but scans end at its"
-                " wrap"
+                f"only {one_way:.0%} of the steps of the azimuth have the same direction, but a"
+                " scan ends where it wraps"
             )
             require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
         elif back.any():
             index = int(np.flatnonzero(back)[0])
             before, after = np.rad2deg(angle[index : index + 2])
             message = (
-                f"from {before:.1f} to {after:.1f} degrees in packet {number[index + 1]} of the"
-                " sweep"
+                f"the azimuth steps back from {before:.1f} to {after:.1f} degrees in packet"
+                f" {number[index + 1]} of the sweep"
             )
             raise ViolationError(
                 "LS504" if number[index] == number[index + 1] else "LS506",
@@ -483,7 +483,7 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
             subject, name, frames, by_clock=False
         ).stats  # the clock would compensate for the counter
         message = (
-            f"in the sweep {stats.lost} packets count as lost, {stats.late} as late,"
+            f"{stats.lost} packets of the sweep count as lost, {stats.late} as late, and"
             f" {stats.duplicates} as duplicates"
         )
         require(
@@ -498,7 +498,8 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
         require(
             back.min() >= 0,
             "LS509",
-            f"packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before the one before it",
+            f"the time of packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before that"
+            f" of packet {index}",
             name,
         )
 
@@ -689,7 +690,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     require(
         share > 0.5,
         "LS507",
-        f"only {share:.0%} of the beams in a closed room return",
+        f"only {share:.0%} of the beams have a return, although the scene is a closed room",
         f"{name}.points",
     )
     apart = distance_outside(room, cloud.xyz[:count][valid].astype(np.float64))
@@ -714,7 +715,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     require(
         inside,
         "LS507",
-        f"ranges of {ranges.min() if len(ranges) else 0:.3f} to"
-        f" {ranges.max() if len(ranges) else 0:.3f} m",
+        f"the ranges of simulated points are {ranges.min() if len(ranges) else 0:.3f} to"
+        f" {ranges.max() if len(ranges) else 0:.3f} m, outside of range_limits",
         name,
     )

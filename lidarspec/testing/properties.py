@@ -30,10 +30,13 @@ def _no_points(subject: SensorUnderTest) -> str:
 def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
-        return "it declares no `sweep`, so that it cannot be simulated"
+        return "it cannot be simulated, because it declares no `sweep`"
     alone = [name for name in names if not get_codec(subject.sensor.frames[name]).is_compiled]
     if alone:
-        return f"{', '.join(alone)} is not compiled, so that it cannot be simulated"
+        return (
+            "it cannot be simulated, because these frame types are not compiled:"
+            f" {', '.join(alone)}"
+        )
     return ""
 
 

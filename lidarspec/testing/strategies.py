@@ -282,7 +282,9 @@ def _packets_per_scan(sensor: Sensor) -> int:
         if any(scan.complete for scan in sensor.scans(_delivery(sensor, packets))):
             return count
         count *= 2
-    raise SpecError(f"no complete scan in {MAX_PACKETS} packets", path="scan", sensor=sensor.id)
+    raise SpecError(
+        f"{MAX_PACKETS} simulated packets contain no complete scan", path="scan", sensor=sensor.id
+    )
 
 
 @st.composite

@@ -38,7 +38,7 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     require(
         (stats.bytes_skipped, stats.pending) == (0, 0),
         "LS401",
-        f"{stats.bytes_skipped} bytes skipped, {stats.pending} pending",
+        f"{stats.bytes_skipped} bytes were skipped, and {stats.pending} are still pending",
     )
 
 
@@ -84,7 +84,7 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
         whole = _scans_in_batches(subject.sensor, frames, len(frames))
         if whole:
             break
-    require(whole, "LS404", "no scan found")
+    require(whole, "LS404", "no scan was found")
     for size in BATCH_SIZES:
         parts = _scans_in_batches(subject.sensor, frames, size)
         require(

@@ -95,7 +95,10 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
         ("an object of numbers and strings", lambda value: _is_table(value, _is_value)),
     ),
     "units": ("an object of numbers", lambda value: _is_table(value, _is_number)),
-    "points": ("an object of points by number, each an object of numbers", _are_points),
+    "points": (
+        "an object that maps the numbers of points to objects of columns with numbers",
+        _are_points,
+    ),
 }
 
 
@@ -110,7 +113,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
     for key, vector in chosen.items():
         if isinstance(vector, ViolationError):
             raise vector
-        require(str(vector.get("source", "")).strip(), "LS701", "source missing", key)
+        require(str(vector.get("source", "")).strip(), "LS701", "the source is missing", key)
         data = parse_hex(vector["hex"])
         name = vector["frame"]
         parsed = _parse_vector(subject, name, data, key)
@@ -144,11 +147,11 @@ def lacking(subject: SensorUnderTest) -> str:
     Returns "" if it has vectors, or if the file is invalid (`vectors_hold` reports that).
     """
     if subject.vectors is None:
-        return "no file of golden vectors"
+        return "there is no file with golden vectors"
     try:
         if _read_entries(subject):
             return ""
-        return f"{Path(subject.vectors).name} has no vectors of {subject.sensor.id}"
+        return f"{Path(subject.vectors).name} contains no vectors of {subject.sensor.id}"
     except ViolationError:
         return ""
 
@@ -172,7 +175,7 @@ def the_status_is_proven(subject: SensorUnderTest) -> None:
     """
     missing = lacking(subject)
     status = subject.sensor.status
-    require(status != "vectors" or not missing, "LS710", f"status is {status!r}, but: {missing}")
+    require(status != "vectors" or not missing, "LS710", f"status is {status!r}, but {missing}")
 
 
 def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:
@@ -233,12 +236,16 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     require(
         not len(ranges) or ranges.max() <= far * (1 + POINT_TOLERANCE),
         "LS713",
-        f"{ranges.max(initial=0):.4g} m, but range_limits end at {far:g} m",
+        f"{ranges.max(initial=0):.4g} m is the largest range in the vectors, but range_limits end"
+        f" at {far:g} m",
         name,
     )
     if vectors:
         require(
-            len(quadrants) > 1, "LS712", f"x and y of points are in {number} only", f"{name}.points"
+            len(quadrants) > 1,
+            "LS712",
+            f"all points of the vectors are in {number}",
+            f"{name}.points",
         )
         subject.placed.add(name)
 
@@ -271,7 +278,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     for match in _find_common_matches(frames) if is_told and not sealing else []:
         path = _find_checksum_field(subject, name, match, frames[0])
         if path in (named or free) and (named or match.evidence_bits >= PROOF_BITS):
-            fits = f"{_describe_match(match, len(frames[0]))} fits every vector"
+            fits = f"{_describe_match(match, len(frames[0]))} matches every vector"
             raise ViolationError(
                 "LS212", f"{fits}, but no Checksummed verifies it", f"{name}.{path}"
             )
@@ -466,15 +473,16 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
     family = subject.family
     ids = [named] if isinstance(named, str) else named
     message = (
-        f'sensor missing, such as "sensor": "{subject.sensor.id}"; the file is shared by'
-        f" {', '.join(family)}"
+        f"several sensors share this file ({', '.join(family)}), so the vector must name one:"
+        f' "sensor": "{subject.sensor.id}"'
     )
     require(ids or len(family) < 2, "LS702", message, entry_key)
     unknown_ids = [name for name in ids if family and name not in family]
     require(
         not unknown_ids,
         "LS702",
-        f"no sensor {', '.join(map(repr, unknown_ids))}; the file is shared by {', '.join(family)}",
+        f"the vector names {', '.join(map(repr, unknown_ids))}, but these sensors share the file:"
+        f" {', '.join(family)}",
         entry_key,
     )
     return not ids or subject.sensor.id in ids
@@ -523,7 +531,10 @@ def _compare_values(
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:
         require(
-            path in parsed_values, "LS702", f"no field {path!r} in the frame", f"{entry_key} {name}"
+            path in parsed_values,
+            "LS702",
+            f"the frame has no field {path!r}",
+            f"{entry_key} {name}",
         )
         info = fields.get(re.sub(r"\[\d+\]", "", path))
         raw = parsed_values[path]
@@ -584,7 +595,7 @@ def _compare_points(
         require(
             -len(cloud) <= number < len(cloud),
             "LS708",
-            f"no point {number}: the frame has {len(cloud)} points",
+            f"point {number} does not exist: the frame has {len(cloud)} points",
             f"{entry_key} {name}",
         )
         got = {}
@@ -592,7 +603,7 @@ def _compare_points(
             require(
                 column in columns_of_points,
                 "LS702",
-                f"points have no column {column!r}",
+                f"the points have no column {column!r}",
                 f"{entry_key} {name}",
             )
             got[column] = float(cloud.columns[column][number])

@@ -127,7 +127,7 @@ class RecordingTransport(Transport):
                 self.unread = self._recording.leftover
         if self._invalid_events:
             self.warnings.append(
-                f"{self._recording.path}: ignored {self._invalid_events} events without a name"
+                f"{self._recording.path}: {self._invalid_events} events without a name were ignored"
             )
 
     def skip_until(self, time_ns: int) -> bool:
@@ -163,8 +163,8 @@ class RecordingTransport(Transport):
         if name == "clock" and not self._has_clock_warning:
             self._has_clock_warning = True
             text = (
-                "the clock of the computer was set during the recording; arrival times"
-                " continue without a step"
+                "the computer's clock was changed during the recording; the arrival times do not"
+                " contain this change"
             )
             self.warnings.append(f"{self._recording.path}: {text}")
         return is_interruption
@@ -391,7 +391,7 @@ def open_file(
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
                 f"{name} is {log.description}{' in a compressed file' * (file is not plain)},"
-                " which cannot be read this way: pass the path of the log itself"
+                " which can only be read from an uncompressed file: pass its path"
             )
         refuse_container(name, start)
         if log is not None and is_remote(path):

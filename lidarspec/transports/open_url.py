@@ -179,12 +179,13 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
         return opened
     if opened is not None:
         raise SpecError(
-            f"{name} link: expected a LiveTransport from the plugin, got a {type(opened).__name__}"
+            f"the plugin must return a LiveTransport for the {name} link, not a"
+            f" {type(opened).__name__}"
         )
     if not isinstance(link, Tcp | Udp | Http):
         raise UsageError(
-            f"{source}: no installed plugin opens a {type(link).__name__} link, which {name}"
-            " requires"
+            f"{source}: the link {name!r} is a {type(link).__name__} link, which no installed"
+            " plugin can open"
         )
     raise source_error(
         f"{source}: the address of the {name} link is unknown",
@@ -209,7 +210,7 @@ def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
         )
     if not isinstance(plugged, Transport):
         raise SpecError(
-            f"{address.scheme!r} sources: expected a Transport from the plugin, got a"
+            f"the plugin must return a Transport for {address.scheme!r} sources, not a"
             f" {type(plugged).__name__}"
         )
     return plugged

@@ -140,14 +140,14 @@ class BagTransport(Transport):
         if not self._links:
             topics = (
                 "; ".join(
-                    f"{link.topic} has type {link.msgtype}"
+                    f"the topic {link.topic} has the type {link.msgtype}"
                     for link in (with_packets or self._log.connections)[:MAX_LISTED_TOPICS]
                 )
                 or "it is empty"
             )
             self.warnings.append(
-                f"{path} is {log.description} without"
-                f" packets{f' of {sender}' if sender else ''}: {topics}"
+                f"{path} is {log.description} without packets{f' of {sender}' if sender else ''}:"
+                f" {topics}"
             )
 
     def chunks(self) -> Iterator[Chunk]:

@@ -336,7 +336,9 @@ class Served(ClosingContext):
             SourceError: if no program opens the port.
         """
         if self._clock is None:
-            raise UsageError("the port runs in real time: open it with virtual_time=True")
+            raise UsageError(
+                "the time of this port cannot be advanced: open it with virtual_time=True"
+            )
         self._clock.advance(seconds)
         limit = time.monotonic() + _LISTENER_TIMEOUT_S
         while self._clock.is_behind:

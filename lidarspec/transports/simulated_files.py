@@ -109,7 +109,7 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
-        return UsageError(f"nothing was written: all sent frames ({frames}) were lost")
+        return UsageError(f"nothing was written, because all sent frames ({frames}) were lost")
     if device.deadline is not None:
         due = f"its next frame is due after {device.deadline / SECOND:g} s"
         return UsageError(
@@ -124,7 +124,7 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
         )
     recognized = ", ".join(device.commands_received) or "no command"
     missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
-    cause = f"no command starts its data after {recognized}"
+    cause = f"the sensor received {recognized}, and sends no data until another command starts it"
     if missed:
         cause = f"the command {missed[0]!r} was sent, but the sensor recognized {recognized}"
     return SpecError(

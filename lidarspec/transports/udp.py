@@ -407,7 +407,7 @@ class UdpTransport(LiveTransport):
             )
         if error.errno == errno.EACCES:
             return source_error(
-                f"{self.label}: UDP port {port} requires rights that you do not have", doctor
+                f"{self.label}: UDP port {port} can only be opened by the administrator", doctor
             )
         if error.errno == errno.EADDRNOTAVAIL:
             return source_error(
@@ -416,8 +416,8 @@ class UdpTransport(LiveTransport):
             )
         if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
             return source_error(
-                f"{self.label}: no interface has a route to the group {group}; specify one, as"
-                f" in udp://ADDRESS:{port}",
+                f"{self.label}: no network interface has a route to the multicast group {group};"
+                f" give the address of an interface, as in udp://ADDRESS:{port}",
                 doctor,
             )
         return source_error(f"{self.label}: UDP port {port}: {system_reason(error)}", doctor)

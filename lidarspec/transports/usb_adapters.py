@@ -127,7 +127,7 @@ def describe_missing_driver(device: UsbDevice, kind: AdapterKind, platform: str)
     if platform.startswith("linux"):
         text = f"{adapter} has no serial port: the driver {kind.module} is not loaded"
         if kind.brltty and Path("/usr/bin/brltty").exists():
-            text += ", or the program brltty has taken the adapter"
+            text += ", or the program brltty uses the adapter"
             return MissingDriver(text, "sudo apt remove brltty")
         return MissingDriver(text, f"sudo modprobe {kind.module}")
     text = f"{adapter} has no serial port: install the driver from {kind.website}"

@@ -29,7 +29,7 @@ def test_a_clean_file_says_so() -> None:
     assert re.search(
         r"measured  data, with a checksum: undetected single-bit errors: 0 %", done.output
     )
-    assert "skipped   vectors_hold: no file of golden vectors" in done.output
+    assert "skipped   vectors_hold: there is no file with golden vectors" in done.output
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_measured_values_are_listed_beside_references() -> None:
     assert lines == [
         lines[0],
         "  data: first beam: at azimuth 0.0 deg where start_angle is 0 (0 is ahead, 90 is left)",
-        "  data: range: 0.001 .. 65.535 m can be represented, 0.03 .. 25 m is declared",
+        "  data: range: 0.001 .. 65.535 m can be represented, and range_limits are 0.03 .. 25 m",
         lines[3],
         "  data: sense: clockwise as start_angle grows, seen from above",
         "  data: step: 0.166 deg clockwise from point to point along the sweep",
@@ -79,8 +79,8 @@ def test_measured_values_are_listed_beside_references() -> None:
     assert re.fullmatch(r"  data: rate: 21[56]\d\d points per second, simulated", lines[3])
     unproven = ran("check", STRANGER, "--max-examples", "3").output
     assert (
-        "  vectors: no file of golden vectors;"
-        " x and y of points in two quadrants would verify these values"
+        "  vectors: there is no file with golden vectors;"
+        " vectors with points in two quadrants would verify these values"
     ) in unproven
 
 

@@ -41,7 +41,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_decoding_needs_the_name_of_a_frame_type() -> None:
     data = b"".join(FRAMES)
-    there_are = "frame='fix'; it has fix, warmth, rate_reply"
+    there_are = r"its frame types \(fix, warmth, rate_reply\), as in frame='fix'"
     for read in (SENSOR.decode, SENSOR.scans):
         with pytest.raises(ls.UsageError, match=there_are):
             read(data)
@@ -70,9 +70,9 @@ def test_a_device_yields_the_packets_of_several_types(recording: Path) -> None:
                 counts[name] += len(packets)
     assert counts == {"fix": FIX_COUNT, "warmth": 10}
     with ls.open(recording, SENSOR) as device:
-        with pytest.raises(ls.UsageError, match="it has fix"):
+        with pytest.raises(ls.UsageError, match="its frame types \\(fix"):
             next(device.packets())
-        with pytest.raises(ls.UsageError, match="it has fix"):
+        with pytest.raises(ls.UsageError, match="its frame types \\(fix"):
             device.latest(0)
 
 

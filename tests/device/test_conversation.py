@@ -314,8 +314,8 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
     source, plugins = f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", Registry()
     with use_registry(plugins):
         for opened, error, said in [
-            (None, UsageError, "no installed plugin opens a Loop link, which control requires"),
-            (3, SpecError, "got a int"),
+            (None, UsageError, "'control' is a Loop link, which no installed plugin can open"),
+            (3, SpecError, "not a int"),
         ]:
             plugin.opened = opened
             with (

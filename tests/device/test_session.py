@@ -434,7 +434,7 @@ def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
         ReplyTimeout, match="the sensor replies only while it is stopped: send 'stop' first"
     ):
         pending.result()
-    with pytest.raises(ls.SpecError, match="requires a command that starts or stops the data"):
+    with pytest.raises(ls.SpecError, match="requires that one of the sensor's commands"):
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
 
 

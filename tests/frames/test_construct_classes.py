@@ -554,7 +554,7 @@ def test_frames_are_found_in_datagrams_and_streams(name: str) -> None:
     packets = ours.decode(frames)
     assert len(packets) == len(frames)
     if one.is_rest:
-        with pytest.raises(SpecError, match="it can only be sent in datagrams"):
+        with pytest.raises(SpecError, match="can only be sent in datagrams"):
             of_links(ours, Serial(9600))
         assert len(ours.decode(b"".join(frames))) == 0
         return

@@ -270,8 +270,8 @@ def test_the_first_of_two_plugins_with_one_id_wins(
     [
         (
             "liar-x2 = liar",
-            "liar-x1: the entry point is named 'liar-x2', but the sensor that it loads"
-            " (liar:liar_x2) has another id and no such alias",
+            "liar-x1: the entry point 'liar-x2' loads liar:liar_x2, a sensor with another"
+            " id and without this alias",
         ),
         ("odd-x1 = odd", "lidarspec_sensors must return sensors, got int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
@@ -317,7 +317,9 @@ def test_hooks_apply_to_sensors_of_entry_points(
     assert isinstance(found.sensor("acme-x1").points, HookedPoints)
     found.sensor("acme-x1")
     found.add(plugins["acme"], name="again")
-    with pytest.raises(UsageError, match="acme-x1: dist and again each have a sensor of this name"):
+    with pytest.raises(
+        UsageError, match="acme-x1: dist and again each contain a sensor with this name"
+    ):
         found.sensor("acme-x1")
 
 
@@ -423,7 +425,8 @@ def test_an_id_without_owner_is_an_error_only_when_used(
         "one-lidars: acme-x2 = again, acme-x3 = again", "two-lidars: acme-x1 = acme, acme-x2 = acme"
     )
     with pytest.raises(
-        UsageError, match=r'one-lidars and two-lidars each have .*\[owners\] acme-x2 = "one-lidars"'
+        UsageError,
+        match=r'one-lidars and two-lidars each contain .*\[owners\]: acme-x2 = "one-lidars"',
     ):
         found.sensor("acme-x2")
     assert sorted(found.sensors()) == ["acme-x1", "acme-x3"]
@@ -543,7 +546,7 @@ def test_a_verb_runs_beside_a_plugin_that_hangs(tmp_path: Path) -> None:
 
 #: plugins that do odd things when they are loaded: code, error and remark.
 ODD = {
-    "ends": ("import os\nos._exit(7)", "it ends the process with code 7", ""),
+    "ends": ("import os\nos._exit(7)", "loading it ends the process with the exit status 7", ""),
     "exits": ("import sys\nsys.exit('leaving')", "SystemExit: leaving", ""),
     "prints": (
         "import sys\nprint('hello')\nprint('\\x1b[2J', file=sys.stderr)",

@@ -537,17 +537,17 @@ ANGLES = "Channel,Elevation,Azimuth\n" + "".join(
 @pytest.mark.parametrize(
     ("value", "told"),
     [
-        (1, "calibration: 1 is not a file in the folder that names it"),
-        ("1", "calibration: '1' is not a file in the folder that names it"),
-        ("/dev/stdout", "is not a file in the folder that names it"),
-        ("../angles.csv", "is not a file in the folder that names it"),
-        ("link.csv", "is not a file in the folder that names it"),
+        (1, "calibration: 1 is not a file in"),
+        ("1", "calibration: '1' is not a file in"),
+        ("/dev/stdout", "is not a file in"),
+        ("../angles.csv", "is not a file in"),
+        ("link.csv", "is not a file in"),
         (
             ["angles.csv"],
-            r"calibration: \['angles.csv'\] is not a file in the folder that names it",
+            r"calibration: \['angles.csv'\] is not a file in",
         ),
-        ("a\0b", "is not a file in the folder that names it"),
-        ("here.csv", "is not a file in the folder that names it"),
+        ("a\0b", "is not a file in"),
+        ("here.csv", "is not a file in"),
     ],
 )
 def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
@@ -567,9 +567,7 @@ def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
     (folder / "a.lsr").write_bytes(
         MAGIC + pack_record(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :]
     )
-    with pytest.raises(
-        UsageError, match=rf"a\.lsr: it was recorded with an option .*-s {HESAI} -O .*{told}"
-    ):
+    with pytest.raises(UsageError, match=rf"a\.lsr: pass the options of .*-s {HESAI} -O .*{told}"):
         ls.open(folder / "a.lsr")
 
 
@@ -601,7 +599,7 @@ def test_an_invalid_event_is_damage_of_the_recording(path: Path) -> None:
         file.write(b"".join(pack_record(3, event) for event in NO_EVENTS))
     with contextlib.closing(open_transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
-    assert opened.warnings == [f"{path}: ignored {len(NO_EVENTS)} events without a name"]
+    assert opened.warnings == [f"{path}: {len(NO_EVENTS)} events without a name were ignored"]
 
 
 KILLED = """

@@ -325,7 +325,7 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             "all sent frames",
         ),
         (SimulatedDevice(polled), 0.1, UsageError, "sends only replies to commands"),
-        (SimulatedDevice(stopped), 0.1, SpecError, "no command starts its data after stop"),
+        (SimulatedDevice(stopped), 0.1, SpecError, "the sensor received stop, and sends no data"),
         (
             SimulatedDevice(mistaken),
             0.1,

@@ -351,8 +351,8 @@ def test_directions_that_do_not_fit_and_fields_that_are_not_there_are_named() ->
     with pytest.raises(
         PluginError,
         match=(
-            r"azimuth and elevation \(9,\) do not broadcast to the shape of the points of"
-            r" frame 0, "
+            r"the shape \(9,\), which does not broadcast to the shape \(.*\) of the points of"
+            r" frame 0"
         ),
     ):
         simulate(turned_sensor(lambda i: (np.zeros(9), 0)), 1)

@@ -309,13 +309,13 @@ def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
     with pytest.raises(ViolationError) as found:
         values_survive_building_and_parsing(SensorUnderTest(sound.sensor(kind=Lossy), 80), "data")
     assert (found.value.code, found.value.path) == ("LS305", "data.tilt")
-    assert found.value.what == "-101 is written, but 101 is read"
+    assert found.value.what == "-101 was written, but 101 was read"
 
 
 @pytest.mark.slow
 def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
     frame = sound.frame(sound.make_frame(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
-    with pytest.raises(ViolationError, match="-101 is written, but 101 is read"):
+    with pytest.raises(ViolationError, match="-101 was written, but 101 was read"):
         values_survive_building_and_parsing(
             SensorUnderTest(sound.sensor(frame, Lossy), 200), "data"
         )
@@ -395,10 +395,10 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
         json.loads(BY_VECTORS.read_text(encoding="utf-8")),
     )
     assert list_lacking(proven, None) == [
-        "LS710 : status is 'vectors', but: no file of golden vectors"
+        "LS710 : status is 'vectors', but there is no file with golden vectors"
     ]
     assert list_lacking(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
-        "LS710 : status is 'vectors', but: vectors.json has no vectors of broken-one"
+        "LS710 : status is 'vectors', but vectors.json contains no vectors of broken-one"
     ]
     assert (
         list_lacking(
@@ -416,11 +416,11 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
 def test_vectors_of_several_sensors_name_their_sensor() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = list_lacking(sound.sensor(), known, "broken-one", "broken-two")
-    assert 'sensor missing, such as "sensor": "broken-one"' in asked[0]
+    assert 'so the vector must name one: "sensor": "broken-one"' in asked[0]
     asked = list_lacking(
         sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
     )
-    assert "no sensor 'borken-one'; the file is shared by broken-one" in asked[0]
+    assert "the vector names 'borken-one', but these sensors share the file: broken-one" in asked[0]
 
 
 def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
@@ -441,11 +441,11 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
 def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
     first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     assert list_lacking(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == [
-        "LS713 data: 4.66 m, but range_limits end at 4 m"
+        "LS713 data: 4.66 m is the largest range in the vectors, but range_limits end at 4 m"
     ]
     del second["points"]
     assert list_lacking(sound.sensor(), [first, second]) == [
-        "LS712 data.points: x and y of points are in 1 quadrant only"
+        "LS712 data.points: all points of the vectors are in 1 quadrant"
     ]
 
 
@@ -515,7 +515,7 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
     said = (
         "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes,"
-        " in a field that is little-endian, fits every vector"
+        " in a field that is little-endian, matches every vector"
     )
     assert list_lacking(sound.sensor(plain), vectors)[0].startswith(said)
     assert not any(text.startswith("LS212") for text in list_lacking(sound.sensor(sealed), vectors))
@@ -564,11 +564,11 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     )
     (empty,) = finding(learning, page)
     assert empty.startswith(
-        "LS604 commands.ask: cannot read options from its reply, simulated without answers="
+        "LS604 commands.ask: no options can be read from the reply, which was simulated"
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
-        "LS604 commands.ask: cannot simulate its reply without answers= of the Simulation:"
+        "LS604 commands.ask: the reply can only be simulated with answers= of the Simulation:"
         " page: cannot be simulated"
     )
 
@@ -651,8 +651,8 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
         ),
         ('[{"units": {"a": "1"}}]', "units: expected an object of numbers"),
         ('[{"units": {"a": NaN}}]', "units: expected an object of numbers"),
-        ('[{"points": {"a": {}}}]', "points: expected an object of points by number"),
-        ('[{"points": {"0": [1]}}]', "points: expected an object of points by number"),
+        ('[{"points": {"a": {}}}]', "points: expected an object that maps the numbers of points"),
+        ('[{"points": {"0": [1]}}]', "points: expected an object that maps the numbers of points"),
         ('[{"args": 1}]', "args: expected an object of numbers and strings"),
     ],
 )

@@ -52,7 +52,7 @@ def test_a_minimal_transport_of_a_plugin_has_defaults() -> None:
 
 
 def test_anything_else_is_the_fault_of_the_plugin() -> None:
-    with pytest.raises(ls.SpecError, match="expected a Transport"):
+    with pytest.raises(ls.SpecError, match="must return a Transport"):
         open_transport("other:")
     with pytest.raises(ls.UsageError, match="unknown scheme"):
         open_transport("unknown:")

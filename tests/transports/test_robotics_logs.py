@@ -215,7 +215,8 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
         assert list(opened.chunks()) == []
         assert opened.warnings == [
             f"{path} is an MCAP file (ROS 2 bag) without packets of /left:"
-            f" /front/packets has type {scan}; /rear/packets has type {scan}"
+            f" the topic /front/packets has the type {scan};"
+            f" the topic /rear/packets has the type {scan}"
         ]
 
 
@@ -240,7 +241,8 @@ def test_a_log_of_points_says_that_it_has_no_packets(tmp_path: Path) -> None:
         "convert", tmp_path / "a.bag", tmp_path / "out.csv", "-s", "velodyne-vlp16", code=4
     ).stderr
     assert (
-        "a.bag is a ROS 1 bag without packets: /points has type sensor_msgs/msg/PointCloud2" in said
+        "a.bag is a ROS 1 bag without packets: the topic /points has the type"
+        " sensor_msgs/msg/PointCloud2" in said
     )
 
 

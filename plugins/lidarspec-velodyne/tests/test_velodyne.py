@@ -483,7 +483,7 @@ def test_without_a_date_times_start_at_the_hour_with_a_warning(nmea: bytes, pps:
     packets = decode(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
     assert packets.time_ns.tolist() == [2_000_000_000]
     assert packets.stats.undated == (
-        "times count from the start of the sensor's clock: no position frame with the date"
+        "times count from the start of the sensor's clock, because no position frame with the date"
         " has arrived"
     )
 
