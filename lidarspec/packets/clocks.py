@@ -281,7 +281,7 @@ def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
 
 @lru_cache(maxsize=256)
 def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
-    """Return the axis and the kind of the parts that have the fields of a clock.
+    """Return the axis and the kind of the parts that contain a clock's fields.
 
     Returns None if the frame itself has these fields.
     """

@@ -32,7 +32,7 @@ class PacketType:
         loss_clock: the clock that shows losses; None without a clock, or if the parts of a frame
             have the clock, because a frame without parts then has no time.
         loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
-        counter_clock: the clock that the counter is compared with; None if there is no such clock.
+        clock_of_counter: the clock that checks the packet counter; None if there is no such clock.
         is_counted: whether the packets have a counter.
         is_ordered_by_clock: whether the packets are ordered by their clock: datagrams that have a
             clock, but no counter.
@@ -46,7 +46,7 @@ class PacketType:
     timed_sensor: SensorDescription
     loss_clock: Clock | None
     loss_clock_step_ns: float
-    counter_clock: Clock | None
+    clock_of_counter: Clock | None
     is_counted: bool
     is_ordered_by_clock: bool
 
@@ -69,10 +69,10 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
     timed_sensor = sensor
     if clock is not None and clock is not sensor.clock:
         timed_sensor = replace(sensor, clock=clock)
-    counter_clock = None
+    clock_of_counter = None
     if is_main and clock is not None:
-        counter_clock = sensor.clock
-    loss_clock = counter_clock
+        clock_of_counter = sensor.clock
+    loss_clock = clock_of_counter
     step_ns = 0.0
     if loss_clock is not None:
         fields = clock_fields(loss_clock)
@@ -92,7 +92,7 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
         timed_sensor,
         loss_clock,
         step_ns,
-        counter_clock,
+        clock_of_counter,
         is_counted,
         not is_counted and loss_clock is not None and sensor.datagrams,
     )

@@ -92,7 +92,7 @@ class PacketStream:
         self._clock_order: ClockOrder | None = None
         loss_clock = self._type.loss_clock
         if self._type.is_counted:
-            self._counter_order = CounterOrder(sensor, stats, self._type.counter_clock)
+            self._counter_order = CounterOrder(sensor, stats, self._type.clock_of_counter)
         elif loss_clock is not None and self._type.is_ordered_by_clock:
             self._clock_order = ClockOrder(stats, loss_clock, MaskedGaps(sensor))
         self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)

@@ -105,8 +105,8 @@ def evaluate_plainly(
 
     Args:
         carry: the state left by the previous batch.
-        final: whether no packets follow. Values that depend on following packets (`following`) are
-            then nan, and no packet waits.
+        final: whether no packets follow. If True, values that depend on following packets
+            (`following`) are nan, and the points of all packets are returned.
         epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:

@@ -300,8 +300,8 @@ class Checksummed(layer.SealedStruct):
     def _marked(self) -> Construct:
         """The struct with recorded member offsets.
 
-        The struct of a frame has recorded offsets already. Here they are added if the struct is
-        used without a frame.
+        The struct of a frame has recorded offsets already. This property adds them to a struct
+        that is used without a frame.
         """
         if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct):
             return self.subcon
@@ -409,8 +409,8 @@ class Parts(layer.Partition):
             matching constants is used, so a last Struct without constants matches all other parts.
         count: the number of parts.
         size: the size of the first part in bytes, 0 if there are no parts; requires `following`.
-        following: an expression of the fields of a part for the size of the next part in bytes; 0
-            after the last part.
+        following: an expression of the fields of a part, with the size of the next part in bytes.
+            It is 0 in the last part.
         within: the total size of all parts in bytes.
 
     Raises:

@@ -13,7 +13,7 @@ it.
     Block           bytes that contain one or more integers as bits (`Part`)
     Repeat          an array: one element, repeated
     Parts           frames within the frame, one after another, each with its own size
-    When one of two nodes, by a condition
+    When            one of two nodes, by a condition
     Select          one of several nodes, by a key
     Empty           no bytes
     Check           no bytes; a condition that the frame must meet
@@ -25,15 +25,15 @@ Counts, lengths, conditions and keys are formulas, which consist of numbers, ref
 (`Ref`) and operations on both (`Op`). An expression that cannot be converted to a formula is
 `Untraced`. construct then reads the frames.
 
-The tree has each kind of parts twice. The paths in `Kind.element` start at the top of the frame, as
-in the plugin's struct. `Kind.root` describes the part as a frame of its own, so its paths start at
-the part. Layouts and tables are made from `Kind.root`.
+The tree contains two nodes for each kind of part. The paths in `Kind.element` start at the top of
+the frame, as in the plugin's struct. `Kind.root` describes the part as a frame of its own, so its
+paths start at the part. Layouts and tables are made from `Kind.root`.
 
-A field that declares the size of a part (`FieldInfo.held`) has a formula that adds the sizes of the
-nodes of the part (`size`). The size of padding is a formula as well. An array is identified by its
-axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of an array contains
-an index. A wire form, which decodes the bytes before they are parsed, belongs to the `Frame`, not
-to the tree.
+If a field declares the size of a part (`FieldInfo.held`), its formula is the sum of the sizes of
+the nodes in this part (`size`). The size of padding is a formula as well. An array is identified by
+its axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of an array
+contains an index. A wire form, which decodes the bytes before they are parsed, belongs to the
+`Frame`, not to the tree.
 """
 
 from __future__ import annotations

@@ -101,7 +101,8 @@ class AlongAxis(NDArrayOperatorsMixin):
         Axes that the numbers do not have get the length 1.
 
         Args:
-            names: the last names of paths of arrays, including all arrays in `axes`.
+            names: the arrays of the result's axes, in their order, each by the last name of its
+                path. They must include all arrays in `axes`.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])

@@ -276,7 +276,10 @@ def test_invalid_lengths_are_plugin_errors_or_wire_errors(
 @pytest.mark.parametrize(
     ("part", "reason"),
     [
-        (Computed(lambda found: int(found.a) + 1), "a Python function of other fields"),
+        (
+            Computed(lambda found: int(found.a) + 1),
+            "a Python function calculates the value from other fields",
+        ),
         (
             BitStruct(
                 "n" / BitsInteger(8),
@@ -362,7 +365,7 @@ def test_a_count_is_bounded_by_the_size_of_a_frame_that_declares_no_longest_leng
 
 
 BOUNDED: dict[str, tuple[Any, bytes, Any]] = {
-    "after its length": (Prefixed(Int8ub, GreedyRange(Int16ub)), b"\4\0\1\0\2", [1, 2]),
+    "declare a length field": (Prefixed(Int8ub, GreedyRange(Int16ub)), b"\4\0\1\0\2", [1, 2]),
     "of none": (Prefixed(Int8ub, GreedyRange(Int16ub)), b"\0", []),
     "of a fixed size": (FixedSized(4, GreedyRange(Int16ub)), b"\0\1\0\2", [1, 2]),
     "of structs": (
@@ -415,7 +418,7 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
         (Prefixed(Int8ub, GreedyRange(GreedyBytes)), "GreedyBytes has no end in a stream"),
         (
             Array(2, Aligned(4, Int8ub)),
-            "a rebuilt frame loses the padding of Aligned, unless it is a named member of a Struct",
+            "a rebuilt frame loses the padding of Aligned, unless Aligned is a named member",
         ),
         (
             Array(2, FixedSized(4, Int8ub)),
@@ -477,7 +480,7 @@ def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str)
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
         (Transformed(Int16ub, invert, 2, invert, 2), "in `points`"),
         (FixedSized(8, CString("ascii")), "use Bytes(n)"),
-        (Computed(lambda found: int(found.k) * 2), "use an expression of numbers"),
+        (Computed(lambda found: int(found.k) * 2), "use an expression with this"),
         (
             Array(2, Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub)))),
             "Parts(struct, count)",

@@ -447,16 +447,18 @@ PLAIN: dict[str, Case] = {
         "n" / Int8ub,
         "a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Bytes(this._.n)),
         frames="014b01 004b",
-        reason="PrefixedArray and FocusedSeq must be a named",
+        reason="a PrefixedArray or FocusedSeq must be a named",
     ),
     "FocusedSeq in an array": case(
         "a" / Array(2, FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub)),
         frames="4b014b02",
-        reason="PrefixedArray and FocusedSeq must be a named",
+        reason="a PrefixedArray or FocusedSeq must be a named",
     ),
     "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
     "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
-    "CString": case("a" / CString("utf8"), frames="616200 00 c3a900", reason="text has no numbers"),
+    "CString": case(
+        "a" / CString("utf8"), frames="616200 00 c3a900", reason="a text is not a number"
+    ),
     "NullTerminated": case(
         "a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001", reason="terminator"
     ),
@@ -716,7 +718,7 @@ REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
         "ExprAdapter changes 128 to 0",
     ),
     "Optional": (lambda: construct.Optional(Byte), "use If or Switch"),
-    "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array below it"),
+    "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array inside it"),
     "FocusedSeq of two": (lambda: FocusedSeq("v", "k" / Byte, "v" / Byte), "loses 'k'"),
     "ProcessXor before others": (
         lambda: Struct("x" / ProcessXor(1, GreedyBytes), "y" / Byte),

@@ -257,7 +257,7 @@ class _Builder:
             info = _describe_integer(place.info)
             offset = place.offset()
             if offset is None:
-                reason = f"{info.path}: Tell in an array, or after a part of unknown size"
+                reason = f"{info.path}: Tell is used in an array, or after a part of unknown size"
                 offset = tree.Untraced(reason, "?")
             self._add_value(place, offset)
             return tree.Derived(info, "offset")
@@ -582,7 +582,10 @@ class _Builder:
         if isinstance(con, construct.RepeatUntil) or place.room is None:
             return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
-            reason = "elements of variable size that fill a length: use Parts(element, within=...)"
+            reason = (
+                "the elements have different sizes, and fill a length: use Parts(element,"
+                " within=...)"
+            )
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)
 
@@ -856,7 +859,7 @@ class _Builder:
             fields = None
         if fields is None:
             reason = (
-                "a bit block with values that are not plain bits: declare the bits, and"
+                "a bit block contains values that are not plain bits: declare the bits, and"
                 " convert them in `points`"
             )
             return tree.Opaque(
@@ -1051,41 +1054,59 @@ _OPAQUE_REASONS = {
     "ProcessXor": _TRANSFORMED_REASON.format("ProcessXor"),
     "ProcessRotateLeft": _TRANSFORMED_REASON.format("ProcessRotateLeft"),
     "Compressed": _TRANSFORMED_REASON.format("Compressed"),
-    "NamedTuple": "NamedTuple has no numbers: use the Array or Struct inside it",
+    "NamedTuple": "a NamedTuple is not a number: use the Array or Struct inside it",
     "StringEncoded": (
-        "text has no numbers and no fixed offset: use Bytes(n), and decode it for display"
+        "a text is not a number, and the fields after it have no fixed offset: use Bytes(n), and"
+        " decode the bytes for display"
     ),
     "Mapping": (
-        "Mapping to values that are not names: use Enum, or Scaled(field, step, unit) for numbers"
+        "a Mapping has values that are not names: use Enum for names, or Scaled(field, step,"
+        " unit) for numbers"
     ),
     "ExprAdapter": (
-        "ExprAdapter is Python code: use Scaled(field, step, unit, offset), or compute it in"
-        " `points`"
+        "an ExprAdapter is Python code: use Scaled(field, step, unit, offset), or calculate the"
+        " value in `points`"
     ),
     "ExprValidator": (
-        "a test without a list of values: use OneOf with the valid values, or"
-        " plausible=lambda f: ..."
+        "the valid values of an ExprValidator cannot be listed: use OneOf with the valid values,"
+        " or plausible=lambda f: ..."
     ),
     "Computed": (
-        "a Python function of other fields: use an expression of numbers, such as this.a * 2 + 1"
+        "a Python function calculates the value from other fields: use an expression with this,"
+        " such as this.a * 2 + 1"
     ),
-    "Peek": "Peek of a part without a fixed size: declare its bytes as a field",
-    "Tell": "Tell in Parts: use SizeOf for the length of a part",
+    "Peek": "Peek reads a part without a fixed size: declare the bytes of the part as a field",
+    "Tell": "Tell is used in Parts: use SizeOf for the length of a part",
     "Index": "Index is not on the wire: in `points` the index of an element is f.x.index",
     "LazyBound": "a part that contains itself has no fixed offset: use Parts for a sequence",
-    "VarInt": "VarInt has no fixed offset: use a WireForm for numbers of variable size",
-    "ZigZag": "ZigZag has no fixed offset: use a WireForm for numbers of variable size",
+    "VarInt": (
+        "the fields after a VarInt have no fixed offset: use a WireForm for numbers of variable"
+        " size"
+    ),
+    "ZigZag": (
+        "the fields after a ZigZag have no fixed offset: use a WireForm for numbers of variable"
+        " size"
+    ),
     "FocusedSeq": (
-        "PrefixedArray and FocusedSeq must be a named member of a Struct, and use no other fields:"
-        " Struct('points' / PrefixedArray(...))"
+        "a PrefixedArray or FocusedSeq must be a named member of a Struct, and must not use"
+        " other fields: Struct('points' / PrefixedArray(...))"
     ),
     "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",
-    "GreedyBytes": "it reads the rest of a datagram: use Bytes(n) after its length",
-    "GreedyRange": ("it reads the rest of a datagram: use PrefixedArray or Prefixed(GreedyRange)"),
-    "NullTerminated": "text up to a terminator has no fixed offset: use Bytes(n)",
+    "GreedyBytes": (
+        "GreedyBytes reads the rest of a datagram: declare a length field, and then Bytes with"
+        " this length"
+    ),
+    "GreedyRange": (
+        "GreedyRange reads the rest of a datagram: use PrefixedArray, or Prefixed with GreedyRange"
+    ),
+    "NullTerminated": (
+        "the fields after a text with a terminator have no fixed offset: use Bytes(n) for the text"
+    ),
     "Terminated": "Terminated expects the end of the datagram: leave it out",
-    "RepeatUntil": ("RepeatUntil has no fixed offset: use Array with a count, or Parts"),
+    "RepeatUntil": (
+        "the fields after RepeatUntil have no fixed offset: use Array with a count, or Parts"
+    ),
 }
 
 #: Constructs that read all available bytes unchanged.

@@ -54,13 +54,16 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Aligned: (
         "LS106",
         (
-            "a rebuilt frame loses the padding of Aligned, unless it is a named member of a Struct:"
-            " Struct('part' / Aligned(4, ...))"
+            "a rebuilt frame loses the padding of Aligned, unless Aligned is a named member of a"
+            " Struct: Struct('part' / Aligned(4, ...))"
         ),
     ),
-    construct.Slicing: ("LS106", "Slicing loses the other elements: use the Array below it"),
-    construct.Indexing: ("LS106", "Indexing loses the other elements: use the Array below it"),
-    construct.Pointer: ("LS112", "Pointer reads outside the frame"),
+    construct.Slicing: ("LS106", "Slicing loses the other elements: use the Array inside it"),
+    construct.Indexing: ("LS106", "Indexing loses the other elements: use the Array inside it"),
+    construct.Pointer: (
+        "LS112",
+        "Pointer reads outside the frame: declare fields in the order of the wire",
+    ),
     construct.Seek: (
         "LS112",
         "Seek reads outside the frame: declare those bytes, 'reserved' / Bytes(n)",
@@ -161,8 +164,8 @@ def _check_ends(
     if isinstance(con, (*GREEDY, *RECODING)) and not bounded:
         what = "count" if isinstance(con, construct.GreedyRange) else "length"
         reason = (
-            f"{author_class(con)} has no end in a stream: use a {what}, a terminator, Prefixed"
-            " or FixedSized"
+            f"{author_class(con)} has no end in a stream: declare a {what} or a terminator, or"
+            " use Prefixed or FixedSized"
         )
         endless = SpecError(reason, path=path, rule="LS111")
         if not is_last:

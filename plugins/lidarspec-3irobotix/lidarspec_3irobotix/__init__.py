@@ -43,11 +43,11 @@ SPEED = Scaled(Int8ub, 0.05, "Hz")
 DATA = Checksummed(
     Struct(
         "header" / Const(b"\xaa"),
-        "length" / Rebuild(Int16ub, this.size + 8) * "bytes before the checksum",
+        "length" / Rebuild(Int16ub, this.size + 8) * "number of bytes before the checksum",
         "version" / Int8ub * "protocol version, 0 or 1",
         "type" / Const(0x61, Int8ub),
-        "command" / Const(0xAD, Int8ub) * "speed and samples",
-        "size" / Int16ub * "bytes from the speed to the last sample",
+        "command" / Const(0xAD, Int8ub) * "AD: the packet contains the speed and samples",
+        "size" / Int16ub * "number of bytes from the speed to the last sample",
         "speed" / SPEED,
         "zero_offset" / Scaled(Int16sb, 0.01, "deg"),
         "start_angle" / Scaled(Int16ub, 0.01, "deg") * "azimuth of the first sample",
@@ -66,7 +66,7 @@ SPEED_STRUCT = Checksummed(
         "header" / Const(b"\xaa\x00\x09"),
         "version" / Int8ub * "protocol version, 0 or 1",
         "type" / Const(0x61, Int8ub),
-        "command" / Const(0xAE, Int8ub) * "speed only",
+        "command" / Const(0xAE, Int8ub) * "AE: the packet contains only the speed",
         "size" / Const(1, Int16ub),
         "speed" / SPEED * "while the motor starts",
         "sum" / Int16ub,
@@ -148,7 +148,7 @@ MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
 def describe_difference(own: int, other: int) -> str | Relative:
     """Return how to distinguish two models by their packets per revolution."""
     if own == other:
-        return "identical packets; see the baud rate, or the label on the housing"
+        return "the packets are identical; the baud rate and the label on the housing may differ"
     return Relative(
         f"packets start every {360 / other:g} degrees", partial(starts_on_grid, packets=other)
     )

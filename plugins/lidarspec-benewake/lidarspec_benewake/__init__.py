@@ -63,7 +63,7 @@ IDS = {
     "factory_settings": FACTORY,
     "save": SAVE,
 }
-HEAD = "header" / Const(b"\x5a") * "followed by the length of the frame"
+HEAD = "header" / Const(b"\x5a") * "the next byte is the length of the frame"
 
 
 @cache
@@ -73,7 +73,9 @@ def make_data_frame(unit: str) -> Frame:
     struct = Struct(
         "header" / Const(b"\x59\x59"),
         "distance" / Scaled(Int16ul, step, "m") * "FFFC and above: no distance",
-        "strength" / Int16ul * "signal strength; below 100 and at FFFF the distance is unreliable",
+        "strength"
+        / Int16ul
+        * "signal strength; the distance is unreliable if it is below 100 or FFFF",
         "temperature" / Scaled(Int16ul, 1 / 8, "degC", -256) * "temperature of the chip",
         "checksum" / Int8ul,
     )
@@ -81,7 +83,7 @@ def make_data_frame(unit: str) -> Frame:
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
         data=True,
         plausible=lambda f: (f.distance <= 20) | (f.distance >= 0xFFFC * step),
-        acknowledged={"LS712": "its single beam points straight ahead"},
+        acknowledged={"LS712": "the only beam of the sensor points straight ahead"},
     )
 
 
@@ -121,7 +123,7 @@ def make_id(number: int) -> Any:
     return "id" / Const(number, Int8ul)
 
 
-RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "frames per second; 0: one per trigger"
+RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "frames per second; 0: one frame for each trigger"
 BAUD_FIELD = "baud" / Int32ul
 ID = "id" / Enum(Int8ul, **IDS)
 FRAMES = {
@@ -130,7 +132,9 @@ FRAMES = {
     ),
     "rate": make_message(6, make_id(RATE), RATE_FIELD),
     "baud": make_message(8, make_id(BAUD), BAUD_FIELD),
-    "setting": make_message(5, ID, "value" / Int8ul * "the setting; for an action, 0: success"),
+    "setting": make_message(
+        5, ID, "value" / Int8ul * "the setting; in the reply to an action, 0 means success"
+    ),
     "request": make_message(4, ID, out=True),
     "set_rate": make_message(6, make_id(RATE), RATE_FIELD, out=True),
     "set_baud": make_message(8, make_id(BAUD), BAUD_FIELD, out=True),
@@ -248,7 +252,7 @@ def make_rangefinder(name: str) -> Sensor:
         on_open=("output_on",),
         range_limits=limits,
         relatives={
-            other: "identical frames; see the label on the housing"
+            other: "the frames are identical; the label on the housing names the model"
             for other in MODELS
             if other != name
         },

@@ -70,14 +70,16 @@ PACKET = Struct(
         COLUMNS_PER_PACKET,
         Struct(
             "mark" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "from the right edge, 0 to 59.81",
+            "azimuth"
+            / Scaled(Int16ul, 0.01, "deg")
+            * "angle from the right edge of the field of view, 0 to 59.81",
             "pixels" / Array(PIXELS, PIXEL),
         ),
     ),
-    "timestamp" / Bytes(4) * "microseconds, of uncertain byte order",
+    "timestamp" / Bytes(4) * "microseconds; the byte order is uncertain",
     "factory" / Int16ul,
 )
-ORDER = Struct("text" / Bytes(COMMAND_BYTES) * "filled up with zeros")
+ORDER = Struct("text" / Bytes(COMMAND_BYTES) * "the bytes after the last value are zero")
 
 
 def points(f: Fields) -> Polar:
@@ -115,7 +117,7 @@ CE30D = Sensor(
         "data": Frame(
             PACKET,
             data=True,
-            acknowledged={"LS506": "a scan is a field of view, which begins on the right"},
+            acknowledged={"LS506": "a scan covers the field of view, beginning at its right edge"},
         ),
         "order": Frame(ORDER, direction="out"),
     },

@@ -186,8 +186,8 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
         channel for channel in range(1, channels + 1) if channel not in values_by_channel
     ]:
         raise UsageError(
-            f"{path!s}: contains {len(values_by_channel)} channels, expected 1 to {channels};"
-            f" channel {missing[0]} is the first missing one"
+            f"{path!s}: expected all channels from 1 to {channels}, got {len(values_by_channel)}"
+            f" channels; the first missing channel is {missing[0]}"
         )
     tables = list(
         np.array([values_by_channel[channel][1] for channel in sorted(values_by_channel)]).T
@@ -299,8 +299,9 @@ def check_spread(
             path,
             line,
             index,
-            f"the {column.name}s {description}, but those of this model have a spread of"
-            f" {nominal_spread:g} {column.units[0]}: does the file belong to another unit?",
+            f"the {column.name}s {description}, but for this model a spread of about"
+            f" {nominal_spread:g} {column.units[0]} is expected: does the file belong to another"
+            " sensor?",
         )
 
 

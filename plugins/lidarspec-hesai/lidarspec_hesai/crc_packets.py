@@ -52,7 +52,10 @@ def make_safety_part(crc: Construct) -> Construct:
             "state" / BitsInteger(3), "fault_type" / BitsInteger(2), "counter" / BitsInteger(3)
         ),
         "fault_number"
-        / BitStruct("count" / BitsInteger(4), "index" / BitsInteger(4) * "of this fault"),
+        / BitStruct(
+            "count" / BitsInteger(4),
+            "index" / BitsInteger(4) * "index of the fault in `fault_code`",
+        ),
         "fault_code" / Int16ul,
         "reserved" / Bytes(8),
         "crc" / crc,
@@ -72,8 +75,8 @@ FLAGS = BitStruct(
 )
 IMU = Struct(
     "temperature" / Scaled(Int16sl, 0.01, "degC"),
-    "acceleration_unit" / Int16ul * "step of an acceleration, millionths of g",
-    "rate_unit" / Int16ul * "step of a rate, hundredths of mdeg/s",
+    "acceleration_unit" / Int16ul * "size of one step of the accelerations, millionths of g",
+    "rate_unit" / Int16ul * "size of one step of the angular rates, hundredths of mdeg/s",
     "time" / Int32ul * "time of the sample, in steps of 25 ns",
     "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU; its axes are not documented",
     "rate" / Array(3, Int16sl),
@@ -128,13 +131,13 @@ def make_packet(
         *version,
         "status_version"
         / Int8ul
-        * "version of the tail; differs between models of one protocol version",
+        * "version of the tail, which differs between models with the same protocol version",
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
-        "first_return" / Int8ul * "which return the first block of a shot contains",
+        "first_return" / Int8ul * "the return that the first block of each shot contains",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
-        "return_count" / Int8ul * "returns per shot; for some models the maximum",
+        "return_count" / Int8ul * "number of returns per shot; some models send the maximum number",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if verify_crc else body),
         *safety_part,
@@ -172,7 +175,7 @@ UNSEEN = (
 )
 ACKNOWLEDGED = {
     "LS205": (
-        "observed in a captured stream: no CRC covers header, version of the safety part and"
+        "in a captured stream, no CRC covered the header, the version of the safety part and the"
         " signature"
     )
 }

@@ -82,11 +82,11 @@ DATA = Checksummed(
         ),
         "dirt"
         / Int32ul
-        * "soiling of the window, two bits per channel, first channel in the lowest bits",
+        * "soiling of the window, two bits per channel; the first channel has the lowest bits",
         "unit_state" / Int8ul,
         "reserved_id"
         / Int8ul
-        * "content of the next field: 12 to 15 software version, 16 to 19 hardware version",
+        * "meaning of reserved_info: 12 to 15: software version; 16 to 19: hardware version",
         "reserved_info" / Int16ul,
         "sequence" / Int16ul,
     ),

@@ -159,7 +159,7 @@ def make_tail(speed: float) -> Any:
     """Return the fields of the tail, with the motor's speed in steps of `speed` rpm."""
     return (
         "tail_reserved" / Bytes(9),
-        "azimuth_state" / Int16ul * "two bits per block, first block in the highest bits",
+        "azimuth_state" / Int16ul * "two bits per block; the first block has the highest bits",
         "operational_state"
         / Int8ul
         * "0: high performance; other values: standard or energy saving",
@@ -222,11 +222,11 @@ def relatives(own: str) -> dict[str, Relative]:
     """Return the other models with these packets; they have another status."""
     others = {
         "hesai-pandar128": Relative(
-            "a status below 128", lambda f: f.status_version < MIN_OT128_STATUS
+            "a status_version below 128", lambda f: f.status_version < MIN_OT128_STATUS
         ),
-        "hesai-ot128": Relative("a status from 128 to 136", is_ot128),
+        "hesai-ot128": Relative("a status_version from 128 to 136", is_ot128),
         "hesai-jt128": Relative(
-            "a status from 137 on", lambda f: f.status_version >= MIN_JT128_STATUS
+            "a status_version of 137 or more", lambda f: f.status_version >= MIN_JT128_STATUS
         ),
     }
     return {id: other for id, other in others.items() if id != own}

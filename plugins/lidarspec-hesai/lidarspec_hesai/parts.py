@@ -38,8 +38,8 @@ UTC = Struct(
     "year"
     / Int8ul
     * (
-        "70 and above: since 1900; below: since 2000; 0: the last five bytes are Unix seconds,"
-        " big-endian"
+        "70 or more: years since 1900; 1 to 69: years since 2000; 0: the next five bytes are"
+        " Unix seconds, big-endian"
     ),
     "month" / Int8ul,
     "day" / Int8ul,

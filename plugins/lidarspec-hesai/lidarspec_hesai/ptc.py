@@ -52,7 +52,7 @@ RETURN_SETTINGS = {
 }
 SETTINGS = {
     "speed": Struct("rate" / Scaled(Int16ub, 1, "rpm")),
-    "standby": Struct("standby" / Enum(Int8ub, run=0, stop=1) * "whether the motor is stopped"),
+    "standby": Struct("standby" / Enum(Int8ub, run=0, stop=1) * "stop: the motor stands still"),
     "return_mode": Struct(
         "mode" / Enum(Int8ub, **RETURN_SETTINGS) * "a mode that the model supports"
     ),

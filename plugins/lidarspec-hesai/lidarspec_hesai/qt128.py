@@ -104,7 +104,7 @@ TAIL = (
     "mode_flag"
     / BitStruct(
         "reserved" / BitsInteger(7),
-        "loop" / BitsInteger(1) * "loop of the packet, with dual return",
+        "loop" / BitsInteger(1) * "with dual return: the loop to which the packet belongs",
     ),
     "tail_reserved_2" / Bytes(6),
     "return_mode" / RETURN_MODE,

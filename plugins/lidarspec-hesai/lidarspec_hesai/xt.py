@@ -113,7 +113,7 @@ XT32 = make_spinning_sensor(
     range_limits=(0.05, 120.0),
     relatives={
         "hesai-xt32m": Relative(
-            "6 blocks per packet; an XT32 sends 8", lambda f: f.block_count == 6
+            "6 blocks in a packet; an XT32 sends 8 blocks", lambda f: f.block_count == 6
         )
     },
     status="capture",
@@ -148,7 +148,7 @@ XT32M = make_spinning_sensor(
     range_limits=(0.5, 300.0),
     relatives={
         "hesai-xt32": Relative(
-            "8 blocks per packet; an XT32M sends 6", lambda f: f.block_count == 8
+            "8 blocks in a packet; an XT32M sends 6 blocks", lambda f: f.block_count == 8
         )
     },
     status="vectors",

@@ -343,13 +343,13 @@ FAULTY = {
     "half a channel": ([HEAD, "1.5,1,1"], "line 2, column 1: channel 1.5 is out"),
     "a channel missing": (
         [HEAD, *ROWS[1:]],
-        "contains 15 channels, expected 1 to 16; channel 1 is the first missing",
+        "expected all channels from 1 to 16, got 15 channels; the first missing channel is 1",
     ),
     "radians": (
         [HEAD, *RADIANS],
         (
-            "line 2, column 2: the elevations have a spread of 0.523599, but those of this"
-            " model have a spread of 30 degrees"
+            "line 2, column 2: the elevations have a spread of 0.523599, but for this"
+            " model a spread of about 30 degrees is expected"
         ),
     ),
     "radians said": (
@@ -363,7 +363,7 @@ FAULTY = {
     "too far around": ([HEAD, ROWS[0], "2,1,-414"], "line 3, column 3: azimuth -414 is outside"),
     "zeros": (
         [HEAD, *(f"{i},0,0" for i in range(1, 17))],
-        "line 2, column 2: the elevations are all 0, but those",
+        "line 2, column 2: the elevations are all 0, but for this model",
     ),
     "no number": ([HEAD, "1,x,0"], "line 2, column 2: elevation must be a number, got 'x'"),
     "a cell short": ([HEAD, "1,2"], "line 2, column 3: azimuth must be a number, got ''"),
@@ -406,8 +406,8 @@ def test_firing_times_are_microseconds(tmp_path: Path) -> None:
     with pytest.raises(
         ls.UsageError,
         match=(
-            r"column 2: the fire times have a spread of 1\.5e-05, but those of this model"
-            r" have a spread of 45\.36 microseconds"
+            r"column 2: the fire times have a spread of 1\.5e-05, but for this model"
+            r" a spread of about 45\.36 microseconds is expected"
         ),
     ):
         XT16.configure(firing_times=file)

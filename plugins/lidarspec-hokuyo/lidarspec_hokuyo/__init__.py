@@ -64,10 +64,12 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
     """Return how to distinguish a scanner from another one."""
     if own.last == other.last:
-        return "identical scans; see the model in its reply to get_parameters"
+        return "the scans are identical; the reply to get_parameters names the model"
     if other.last > own.last:
-        return Relative(f"steps beyond {own.last}", lambda f: decimal_value(f.last) > own.last)
-    return "the packet rate, or the model in its reply to get_parameters"
+        return Relative(
+            f"scans with steps beyond {own.last}", lambda f: decimal_value(f.last) > own.last
+        )
+    return "the packet rate differs; the reply to get_parameters names the model"
 
 
 @cache
@@ -107,8 +109,8 @@ def configure(
         )
     if not (steps.first <= steps.last <= geometry.end and 1 <= cluster <= 99):
         raise UsageError(
-            f"{sensor.id}: expected steps from 0 to {geometry.end} and a cluster of 1 to 99,"
-            f" got {steps.text.decode()}"
+            f"{sensor.id}: the steps must be from 0 to {geometry.end}, and the cluster from 1 to"
+            f" 99, got {steps.text.decode()}"
         )
     return dataclasses.replace(sensor, **make_scan_parts(sensor.id, content, steps))
 

@@ -22,7 +22,8 @@ from lidarspec_hokuyo.scans import SCAN_COMMANDS
 STATUS = (
     "status"
     / Bytes(2)
-    * "00: success; reply to BM, 02: the laser is already on; else an error code"
+    * "00: success; 02 in the reply to BM: the laser is already on; other values: an error"
+    " code"
 )
 #: The values that a scanner reports, by reply: the command, and the first four letters of each line
 #: by name.

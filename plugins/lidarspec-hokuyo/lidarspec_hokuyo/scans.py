@@ -156,17 +156,17 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
     rest: tuple[Any, ...] = ()
     if is_continuous:
         rest = (
-            "skip" / Int8ub * "revolutions skipped between scans",
-            make_decimal("left", 2) * "remaining scans; 0: unlimited",
+            "skip" / Int8ub * "number of revolutions that are skipped between two scans",
+            make_decimal("left", 2) * "number of scans that remain; 0: unlimited",
         )
     struct = Struct(
         "command" / Const(command.encode()),
-        make_decimal("first", 4, geometry.end) * "first step",
-        make_decimal("last", 4, geometry.end) * "last step",
-        make_decimal("cluster", 2) * "number of steps combined to one distance",
+        make_decimal("first", 4, geometry.end) * "number of the first step",
+        make_decimal("last", 4, geometry.end) * "number of the last step",
+        make_decimal("cluster", 2) * "number of steps that are combined into one distance",
         *rest,
         "status" / Const(b"99" if is_continuous else b"00"),
-        "time" / Scaled(Int32ub, 0.001, "s") * "time at step 0; 24 bits",
+        "time" / Scaled(Int32ub, 0.001, "s") * "time at step 0; the time has 24 bits",
         "points"
         / Array(
             distance_count(this),
@@ -179,7 +179,9 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
         max_length=MAX_SCAN_CHARACTERS[echoes],
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry, echoes=echoes),
-        acknowledged={"LS711": "it has no four-digit step"} if geometry.end < 1000 else {},
+        acknowledged={"LS711": "this model has no step with four digits"}
+        if geometry.end < 1000
+        else {},
         wire=Lines(LINE_CHARACTERS, head=(15 if is_continuous else 12, 2, 4), bare=1, check=Scip())
         | SixBits(echoes=None if echoes == 1 else Echoes(fields.sizeof(), echoes)),
     )

@@ -78,7 +78,7 @@ def test_partial_and_clustered_scans_have_the_requested_directions() -> None:
     np.testing.assert_allclose(
         cloud.azimuth[:2], np.deg2rad(np.array([129.5, 133.5]) - 384) * 360 / 1024, atol=1e-6
     )
-    with pytest.raises(ls.UsageError, match="expected steps from 0 to 768"):
+    with pytest.raises(ls.UsageError, match="the steps must be from 0 to 768"):
         URG.configure(last=1080)
     with pytest.raises(ls.UsageError, match="content must be one of distances, short"):
         URG.configure(content="intensities")

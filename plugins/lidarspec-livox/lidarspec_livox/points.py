@@ -19,12 +19,15 @@ View = tuple[float, float, float, float]
 SOF = "sof" / Const(b"\xaa")
 GRAVITY = 9.80665  # m/s2
 REFLECTIVITY = (
-    "reflectivity" / Int8ul * "up to 150: diffuse target, 0 to 100 %; above: retroreflector"
+    "reflectivity"
+    / Int8ul
+    * "0 to 150: a diffuse target that reflects 0 to 100 %; above 150: a retroreflector"
 )
 TAG = (
     "tag"
     / Int8ul
-    * "confidence of the point, and the return number of first-generation models; 0: normal"
+    * "confidence of the point, 0 is normal; first-generation models also send the return"
+    " number"
 )
 MILLIMETRES = tuple(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz")
 CENTIMETRES = tuple(axis / Scaled(Int16sl, 0.01, "m") for axis in "xyz")

@@ -98,11 +98,15 @@ IMU_PORT = 56_002  # port of the host
 TIMESTAMP = Struct(
     "low"
     / Int32ul
-    * ("low part of nanoseconds; for a date: years since 2000, month, day and hour, a byte each"),
+    * (
+        "lowest 32 bits of the nanoseconds; in a date: years since 2000, month, day and hour,"
+        " each in one byte"
+    ),
     "middle" / Int16ul,
     "high"
     / Int16ul
-    * "high part of nanoseconds; for a date, `middle` and `high` are microseconds of the hour",
+    * "highest 16 bits of the nanoseconds; in a date: `middle` and `high` are the microseconds"
+    " within the hour",
 )
 
 
@@ -114,7 +118,7 @@ STATUS_CODE = ByteSwapped(
         "reserved" / BitsInteger(13),
         "time_sync" / Enum(BitsInteger(3), none=0, ptp=1, gps=2, pps=3, abnormal=4),
         "ptp_signal" / BitsInteger(1) * "1: present",
-        "self_heating" / BitsInteger(1) * "1: on, at a low temperature",
+        "self_heating" / BitsInteger(1) * "1: the heater is on, because the temperature is low",
         "fan" / Enum(BitsInteger(1), normal=0, warning=1),
         "service_life" / Enum(BitsInteger(1), normal=0, ends_soon=1),
         "pps_signal" / BitsInteger(1) * "1: present",
@@ -268,7 +272,7 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
         "version" / Const(1, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
         "packet_type" / Const(packet_type, Int8ul) * "0: command, 1: reply, 2: message",
-        "seq" / Int16ul * "message number; a reply repeats that of its command",
+        "seq" / Int16ul * "message number; a reply has the number of its command",
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")
@@ -294,7 +298,10 @@ POSE = (
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
 STATUS = (
-    "status_code" / Int32ul * "bits as in point packets; percent of the start-up while starting"
+    "status_code"
+    / Int32ul
+    * "the bits of `status_code` in point packets; during the start-up: its progress in"
+    " percent"
 )
 REQUEST = 0
 REPLY = 1
@@ -573,7 +580,7 @@ def make_lidar(name: str) -> Sensor:
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         relatives={
-            other: "the device type in its broadcast"
+            other: "its broadcast contains another device type"
             for other in MODELS
             if other != name and MODELS[other][2] == rate
         },
@@ -584,7 +591,9 @@ def make_lidar(name: str) -> Sensor:
         },
         status="manual",
         acknowledged=(
-            {"LS507": "a small room is nearer than its shortest range"} if limits[0] > 1 else {}
+            {"LS507": "the walls of the small simulated room are nearer than the shortest range"}
+            if limits[0] > 1
+            else {}
         ),
         source=(
             "Livox-SDK communication protocol 1.3.0; Livox-SDK 9306596; livox_ros_driver (lds.h);"

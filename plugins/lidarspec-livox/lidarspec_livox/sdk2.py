@@ -107,10 +107,12 @@ def make_packet(kind: int, *members: Any) -> Checksummed:
         "time_interval" / Scaled(Int16ul, 1e-7, "s") * "time from the first point to the last",
         "dot_num" / Int16ul,
         "udp_cnt" / Int16ul * "packet counter within the frame",
-        "frame_cnt" / Int8ul * "frame counter; unused with a non-repetitive pattern",
+        "frame_cnt" / Int8ul * "frame counter; not used if the scan pattern is non-repetitive",
         "data_type" / Const(kind, Int8ul),
         "time_type" / Enum(Int8ul, power_up=0, ptp_or_gptp=1, gps=2),
-        "pack_info" / Default(Int8ul, 0) * "format of the tags; only some firmware versions set it",
+        "pack_info"
+        / Default(Int8ul, 0)
+        * "format of the tags, which only some firmware versions set",
         "reserved" / Default(Bytes(11), bytes(11)),
         "crc32" / Int32ul * "CRC of all following bytes; 0: not set",
         "timestamp" / Scaled(Int64ul, 1, "ns") * "time of the first point",
@@ -170,7 +172,7 @@ def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: boo
         SOF,
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
-        "seq" / Int32ul * "message number; a reply repeats that of its request",
+        "seq" / Int32ul * "message number; a reply has the number of its request",
         "cmd_id" / (Int16ul if cmd_id is None else Const(cmd_id, Int16ul)),
         "cmd_type" / Const(int(ack), Int8ul) * "0: request, 1: reply",
         "sender_type" / Const(int(lidar), Int8ul) * "0: host, 1: Lidar",
@@ -661,9 +663,9 @@ def is_fast(f: Fields) -> Any:
 
 RELATIVES: dict[str, str | Relative] = {
     "livox-mid360": Relative(
-        "5 us between points", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
+        "the time between points is 5 us", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
     ),
-    "livox-hap": Relative("2.2 us between points", is_fast),
-    "livox-mid360s": "the device type 35 in its reply to a discovery",
+    "livox-hap": Relative("the time between points is 2.2 us", is_fast),
+    "livox-mid360s": "its reply to a discovery contains the device type 35",
 }
 MID360, HAP = SENSORS = [make_lidar(name) for name in MODELS]

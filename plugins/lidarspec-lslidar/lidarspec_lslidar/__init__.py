@@ -67,12 +67,14 @@ MAX_SAMPLES = 200  # of an M10P's packet: more than twice the limit of the drive
 START = Const(b"\xa5\x5a")
 MARK = Const(b"\xa5\x5a\x55")
 END = Const(b"\xfa\xfb")
-PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "time of a rotation by 15 degrees"
+PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "time in which the rotor turns by 15 degrees"
 ANGLE: Construct = Scaled(Int16ub, 0.01, "deg")
 DISTANCE: Construct = Scaled(Int16ub, 0.001, "m") * "0 or FFFF: no return"
 SAMPLE = BitStruct(
     "bright" / BitsInteger(1) * "1: strong reflection",
-    "distance" / Scaled(BitsInteger(15), 0.001, "m") * "0: no return, as is 7FFF with bright",
+    "distance"
+    / Scaled(BitsInteger(15), 0.001, "m")
+    * "0: no return; 7FFF with `bright`: no return",
 )
 TIME = (
     *DATE,
@@ -262,7 +264,7 @@ INFO = Frame(
         "compensation"
         / BitStruct(
             "negative" / BitsInteger(1),
-            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "not applied to points",
+            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "`points` does not apply this angle",
         ),
         "reserved" / Bytes(11),
         "end" / END,

@@ -84,8 +84,8 @@ DATA = Struct(
                 ),
             )
             * (
-                "two firings; with dual return the next block contains the other returns of the"
-                " same firings"
+                "two firings; with dual return, the next block contains the other returns of"
+                " these firings"
             ),
         ),
     ),

@@ -55,7 +55,7 @@ DATA = Checksummed(
         "header" / Const(b"\xfa"),
         "start_angle"
         / Scaled(Int8ul, 4, "deg", -4 * FIRST_INDEX)
-        * "index A0 to F9: angle of the first sample",
+        * "angle of the first sample, sent as an index from A0 to F9",
         "speed" / Scaled(Int16ul, 1 / 64, "rpm"),
         "samples"
         / Array(
@@ -64,8 +64,8 @@ DATA = Checksummed(
                 "range"
                 / ByteSwapped(
                     BitStruct(
-                        "invalid" / BitsInteger(1) * "1: the distance is an error number",
-                        "weak" / BitsInteger(1) * "1: less signal than expected",
+                        "invalid" / BitsInteger(1) * "1: `distance` contains an error code",
+                        "weak" / BitsInteger(1) * "1: the signal is weaker than expected",
                         "distance" / Scaled(BitsInteger(14), 0.001, "m"),
                     )
                 ),
@@ -81,7 +81,7 @@ LFCD = Struct(
     "header" / Const(b"\xfa"),
     "start_angle"
     / Scaled(Int8ul, 6, "deg", -6 * FIRST_INDEX)
-    * "index A0 to DB: angle of the first sample",
+    * "angle of the first sample, sent as an index from A0 to DB",
     "speed" / Scaled(Int16ul, 0.1, "rpm"),
     "samples"
     / Array(
@@ -94,7 +94,8 @@ LFCD = Struct(
     ),
     "trailer"
     / Bytes(2)
-    * "not checked; documented as FF minus the sum of all other bytes, in both bytes",
+    * "not checked; according to the documents, both bytes are FF minus the sum of all other"
+    " bytes",
 )
 
 
@@ -145,7 +146,7 @@ def sweep(i: int, count: int) -> dict[str, float]:
     return {"start_angle": i * count % 360, "speed": 300}
 
 
-NO_DIFFERENCE = "identical packets; see the direction of rotation, or the label"
+NO_DIFFERENCE = "the packets are identical; the direction of rotation and the label differ"
 XV11_MODELS = ("neato-xv11", "xiaomi-lds01rr", "xiaomi-lds02rr")
 
 XV11 = Sensor(
@@ -190,7 +191,9 @@ HLS_LFCD2 = Sensor(
             data=True,
             plausible=is_lfcd_plausible,
             confirm=2,
-            acknowledged={"LS212": "its sources contradict each other about the trailer"},
+            acknowledged={
+                "LS212": "the documents of this sensor contradict each other about the trailer"
+            },
         ),
         "command": Frame(
             Struct("letter" / Enum(Int8ul, begin=ord("b"), end=ord("e"))), direction="out"

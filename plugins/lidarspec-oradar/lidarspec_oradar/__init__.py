@@ -75,7 +75,7 @@ def make_order(code: int, *content: Any) -> Frame:
             Struct(
                 "header" / Const(b"\xa5\xf5"),
                 "code" / Const(code, Int8ul),
-                "type" / Const(0xC1, Int8ul) * "sets a parameter",
+                "type" / Const(0xC1, Int8ul) * "C1: the command sets a parameter",
                 "size" / SizeOf(Int8ul, "content"),
                 "content" / Struct(*content),
                 "check" / Int8ul,
@@ -120,7 +120,7 @@ def sweep(i: int) -> dict[str, float]:
     }
 
 
-IDENTICAL = "identical frames; its commands begin with 54"
+IDENTICAL = "the frames are identical, but its commands begin with 54"
 MS200 = Sensor(
     "oradar-ms200",
     vendor="ORADAR",
@@ -145,7 +145,7 @@ MS200 = Sensor(
     turn=(5, 15),
     relatives={
         "ldrobot-stl27l": IDENTICAL,
-        "ldrobot-ld06": "identical frames; it accepts no commands",
+        "ldrobot-ld06": "the frames are identical, but it accepts no commands",
         "ldrobot-ld20": IDENTICAL,
         "ldrobot-stl06p": IDENTICAL,
         "ldrobot-ld14": IDENTICAL,

@@ -63,7 +63,7 @@ MODELS = {
 }
 #: The pixel fields that become columns in `extra`.
 EXTRA_FIELDS = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
-METADATA_ONLY = "identical packets; see the model in the metadata"
+METADATA_ONLY = "the packets are identical; the metadata name the model"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
@@ -225,7 +225,8 @@ def configure(
     if metadata is not None:
         if arguments:
             raise UsageError(
-                f"{sensor.id}: the metadata contain {' and '.join(arguments)}: omit this option"
+                f"{sensor.id}: {' and '.join(arguments)} cannot be set if metadata are given,"
+                " because the metadata contain this value"
             )
         unit = read_unit(metadata)
         models = [
@@ -233,7 +234,7 @@ def configure(
         ]
         if models and models[0] != sensor.model:
             raise UsageError(
-                f"{sensor.id}: the metadata belong to an {unit.product}: use -s"
+                f"{sensor.id}: the metadata are those of an {unit.product}: use -s"
                 f" ouster-{models[0].lower()}"
             )
         return dataclasses.replace(apply_unit(sensor, unit), on_open=())

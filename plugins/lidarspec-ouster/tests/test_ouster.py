@@ -368,7 +368,7 @@ def test_imu_measurements_come_in_si_units() -> None:
         ({"pixels_per_column": 32}, "has 16 angles, expected 32"),
         ({"udp_profile_lidar": "RNG99"}, "RNG99 is not supported"),
         ({"lidar_to_sensor_transform": [1, 2]}, "lidar_to_sensor_transform has 2 numbers"),
-        ({"prod_line": "OS-0-32"}, "to an OS-0-32: use -s ouster-os0"),
+        ({"prod_line": "OS-0-32"}, "those of an OS-0-32: use -s ouster-os0"),
     ],
 )
 def test_metadata_that_cannot_be_are_refused_by_name(

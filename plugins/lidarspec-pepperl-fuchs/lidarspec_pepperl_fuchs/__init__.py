@@ -98,25 +98,27 @@ SAMPLES_BY_TYPE: Mapping[str, Construct] = {
 STATUS_FLAGS = ByteSwapped(
     BitStruct(
         "reserved_31" / BitsInteger(1),
-        "device_defect" / BitsInteger(1) * "cannot be repaired",
+        "device_defect" / BitsInteger(1) * "1: the device has a defect that cannot be repaired",
         "reserved_21" / BitsInteger(9),
         "overload_error" / BitsInteger(1),
         "high_temperature_error" / BitsInteger(1),
         "low_temperature_error" / BitsInteger(1),
         "lens_contamination_error" / BitsInteger(1),
-        "device_error" / BitsInteger(1) * "any error",
+        "device_error" / BitsInteger(1) * "1: at least one of the four errors above",
         "reserved_13" / BitsInteger(3),
         "overload_warning" / BitsInteger(1),
         "high_temperature_warning" / BitsInteger(1),
         "low_temperature_warning" / BitsInteger(1),
         "lens_contamination_warning" / BitsInteger(1),
-        "device_warning" / BitsInteger(1) * "any warning",
+        "device_warning" / BitsInteger(1) * "1: at least one of the four warnings above",
         "reserved_5" / BitsInteger(3),
-        "skipped_packets" / BitsInteger(1) * "packets before this one were not sent",
-        "unstable_rotation" / BitsInteger(1) * "the scan frequency is not the set one",
+        "skipped_packets" / BitsInteger(1) * "1: packets before this one were not sent",
+        "unstable_rotation"
+        / BitsInteger(1)
+        * "1: the scan frequency differs from the configured one",
         "invalid_data" / BitsInteger(1),
-        "new_settings" / BitsInteger(1) * "settings changed during this packet",
-        "scan_data_info" / BitsInteger(1) * "any of the four above",
+        "new_settings" / BitsInteger(1) * "1: settings changed during this packet",
+        "scan_data_info" / BitsInteger(1) * "1: at least one of the four flags above",
     )
 )
 
@@ -136,7 +138,9 @@ def make_packet(letter: str) -> Construct:
         "scan_number" / Int16ul * "scan counter",
         "packet_number" / Int16ul * "number of the packet in its scan, from 1",
         "timestamp_raw" / make_time() * "time of the first sample since power-on",
-        "timestamp_sync" / make_time() * "synchronized time of the first sample; 0 without",
+        "timestamp_sync"
+        / make_time()
+        * "synchronized time of the first sample; 0 if the clock is not synchronized",
         "status_flags" / STATUS_FLAGS,
         "scan_frequency" / Scaled(Int32ul, 0.001, "Hz"),
         "num_points_scan" / Int16ul,
@@ -146,7 +150,7 @@ def make_packet(letter: str) -> Construct:
         "angular_increment" / Scaled(Int32sl, 0.0001, "deg") * "negative: clockwise",
         "more"
         / Bytes(this.header_size - MIN_HEADER_BYTES)
-        * "state and times of inputs and outputs, if the model has them",
+        * "state and times of the inputs and outputs, if the model has inputs and outputs",
         "samples" / Array(this.num_points_packet, SAMPLES_BY_TYPE[letter]),
     )
 
@@ -256,7 +260,9 @@ def read_reply(reply: Any) -> dict[str, Any]:
         page = json.loads(reply.body)
         code = page["error_code"]
     except (ValueError, KeyError, TypeError):
-        raise ValueError(f"no reply of PFSDP, HTTP status {reply.status}") from None
+        raise ValueError(
+            f"the reply is not JSON of PFSDP; its HTTP status is {reply.status}"
+        ) from None
     if code != 0:
         raise ValueError(f"{page.get('error_text')} (error {code})")
     return {name: page[name] for name in ("handle", "port") if name in page}

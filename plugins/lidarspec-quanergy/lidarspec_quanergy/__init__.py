@@ -52,7 +52,7 @@ MQ8_ELEVATION = np.array(
 
 POSITION: Construct = Scaled(Int16ub, 360 / POSITIONS_PER_TURN, "deg") * "counter-clockwise"
 DISTANCES: Construct = Array(
-    LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; 10 mm per step before version 5"
+    LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5, one step is 10 mm"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
 #: version_mismatch: the versions of software and firmware do not match.
@@ -88,7 +88,7 @@ THREE_RETURNS = Struct(
             "reserved" / Bytes(LASERS),
         ),
     ),
-    "body_seconds" / Int32ub * "as in the header",
+    "body_seconds" / Int32ub * "the same time as in the header",
     "body_nanoseconds" / Int32ub * "as in the header",
     "api" / Int16ub * "packet version",
     "status" / STATUS,
@@ -96,7 +96,7 @@ THREE_RETURNS = Struct(
 ONE_RETURN = Struct(
     *make_header(4, 2224),
     "status" / STATUS,
-    "return_id" / Int8ub * "which of the three returns this packet contains",
+    "return_id" / Int8ub * "number of the return that this packet contains",
     "reserved" / Bytes(1),
     "firings"
     / Array(
@@ -198,7 +198,8 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
                 points=partial(points, elevation=elevation),
                 simulation=Simulation(partial(sweep, more=more)),
                 acknowledged={
-                    "LS507": "with a wall each laser has one return, repeated in the other two"
+                    "LS507": "a wall gives each laser one return, which the packet repeats as the"
+                    " other two returns"
                 }
                 if more
                 else {},
@@ -211,9 +212,7 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
         clock=Clock(("seconds", "nanoseconds")),
         vendor_axes=("forward", "left", "up"),
         turn=(5.0, 20.0),
-        relatives={
-            f"quanergy-{other}": "identical packets; see the label, or the sensor's web page"
-        },
+        relatives={f"quanergy-{other}": "the packets are identical; the label names the model"},
         status="manual",
         source="quanergy_client; rate, speed and range are assumed",
         **facts,

@@ -311,8 +311,8 @@ class LidarNode(LifecycleNode):
                     and value != self._settings[name]
                 ):
                     raise UsageError(
-                        f"{name} is read when the node is configured: clean the node up, set it,"
-                        " and configure it again"
+                        f"{name} is only read when the node is configured: clean up the node, set"
+                        " the parameter, and configure the node again"
                     )
             self._settings = Settings({**self._settings.values, **ours})
         except UsageError as error:
@@ -337,7 +337,8 @@ class LidarNode(LifecycleNode):
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = (
-                        f"Argument of the service {name}, in the unit of its field, or with a unit."
+                        f"Argument of the service {name}. A number without a unit is in the unit"
+                        " of the field."
                     )
                     self.declare_parameter(
                         f"{name}.{argument}",

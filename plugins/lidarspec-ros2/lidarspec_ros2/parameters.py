@@ -56,14 +56,14 @@ class Parameter:
 #: Descriptions of the fields of `Mount`.
 _MOUNT_TEXTS = {
     **{
-        axis: f"Position of the sensor, metres {way} the carrier."
+        axis: f"Position of the sensor: metres {way} the origin of the carrier."
         for axis, way in (("x", "in front of"), ("y", "left of"), ("z", "above"))
     },
     **{
-        f"{turn}_deg": f"Rotation about {axis}, degrees."
+        f"{turn}_deg": f"Rotation of the sensor about the axis {axis}, degrees."
         for turn, axis in (("roll", "x"), ("pitch", "y"), ("yaw", "z"))
     },
-    "inverted": "The sensor is mounted upside down.",
+    "inverted": "Whether the sensor is mounted upside down.",
 }
 _MAX_OFFSET = 1e4  # metres, or seconds
 _MAX_RANGE_M = 1e6
@@ -71,20 +71,20 @@ PARAMETERS = (
     Parameter(
         "source",
         "",
-        "Port, address, file, simulated sensor, or a name in lidarspec.toml; the SOURCE of the"
-        " command line.",
+        "The source, as on the command line: a port, an address, a file, a simulated sensor, or"
+        " a name in lidarspec.toml.",
     ),
     Parameter(
         "sensor",
         "",
-        "Id, alias or file of the sensor; default: detected. As -s.",
+        "Id, alias or file of the sensor, as with -s. If empty, the sensor is detected.",
     ),
-    Parameter("options", [""], "Options of the sensor, each NAME=VALUE. As -O."),
-    Parameter("calibration", "", "Calibration file of this unit. As --calibration."),
+    Parameter("options", [""], "Options of the sensor, each NAME=VALUE, as with -O."),
+    Parameter("calibration", "", "Calibration file of this unit, as with --calibration."),
     Parameter(
         "autostart",
         True,
-        "Configure and activate the node when it starts; false: a lifecycle manager does.",
+        "Configure and activate the node when it starts. If false, a lifecycle manager does this.",
     ),
     *(
         Parameter(
@@ -94,18 +94,18 @@ PARAMETERS = (
         )
         for field in fields(Mount)
     ),
-    Parameter("frame_id", "laser", "frame_id of the messages.", live=True),
+    Parameter("frame_id", "laser", "The frame_id in the header of all messages.", live=True),
     Parameter(
         "publish_tf",
         False,
-        "Publish the mount on /tf_static, from parent_frame to frame_id, and do not transform"
-        " points.",
+        "Publish the mount as the transform from parent_frame to frame_id on /tf_static, and do"
+        " not transform points.",
     ),
-    Parameter("parent_frame", "base_link", "Frame of the carrier, for publish_tf."),
+    Parameter("parent_frame", "base_link", "The frame_id of the carrier, for publish_tf."),
     Parameter(
         "beams",
         0,
-        "Number of ranges in each LaserScan. 0: that of the sensor.",
+        "Number of ranges in each LaserScan. 0: the number that the sensor declares.",
         0,
         1 << 20,
         live=True,
@@ -113,7 +113,7 @@ PARAMETERS = (
     Parameter(
         "angle_min",
         0.0,
-        "First angle of scan, radians. If equal to angle_max: all angles.",
+        "First angle of the topic scan, radians. If it equals angle_max, all angles are published.",
         -10,
         10,
         live=True,
@@ -121,7 +121,7 @@ PARAMETERS = (
     Parameter(
         "angle_max",
         0.0,
-        "Last angle of scan, radians; if below angle_min, one turn is added.",
+        "Last angle of the topic scan, radians. If it is below angle_min, one revolution is added.",
         -10,
         10,
         live=True,
@@ -129,14 +129,21 @@ PARAMETERS = (
     Parameter(
         "returns",
         "all",
-        "Keep one return of each firing: first, last or strongest; all keeps all.",
+        "Which return of each firing to keep: first, last, strongest or all.",
         live=True,
     ),
-    Parameter("range_min", 0.0, "Drop nearer returns, metres.", 0, _MAX_RANGE_M, live=True),
+    Parameter(
+        "range_min",
+        0.0,
+        "Returns nearer than this range are dropped, metres.",
+        0,
+        _MAX_RANGE_M,
+        live=True,
+    ),
     Parameter(
         "range_max",
         0.0,
-        "Drop farther returns, metres. 0: the limit of the sensor.",
+        "Returns beyond this range are dropped, metres. 0: the sensor's range limit.",
         0,
         _MAX_RANGE_M,
         live=True,
@@ -144,7 +151,8 @@ PARAMETERS = (
     Parameter(
         "scan_ring",
         -1,
-        "The ring in scan, for a sensor with several rings. -1: not used.",
+        "The ring that is published on the topic scan, if the sensor has several rings. -1: no"
+        " ring is selected.",
         -1,
         1 << 16,
         live=True,
@@ -152,7 +160,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_min",
         0.0,
-        "Lowest z of points in scan, metres, for a sensor with several rings.",
+        "Lowest z of the points on the topic scan, metres, if the sensor has several rings.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
         live=True,
@@ -160,7 +168,8 @@ PARAMETERS = (
     Parameter(
         "scan_z_max",
         0.0,
-        "Highest z of points in scan, metres. If equal to scan_z_min: not used.",
+        "Highest z of the points on the topic scan, metres. If it equals scan_z_min, both limits"
+        " are ignored.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
         live=True,
@@ -168,36 +177,38 @@ PARAMETERS = (
     Parameter(
         "organized",
         True,
-        "Publish organised clouds: rows and columns, with nan for missing points.",
+        "Publish clouds in rows and columns. A missing point is nan.",
         live=True,
     ),
     Parameter(
         "use_device_time",
         True,
-        "Stamp by the sensor's clock, converted to the host's time; false: by arrival time.",
+        "Stamp messages by the sensor's clock, converted to the host's time. If false, by the"
+        " arrival time.",
         live=True,
     ),
     Parameter(
         "device_time_is_ros_time",
         False,
-        "Stamp with the sensor's time, which PTP or GPS sets.",
+        "Stamp messages with the sensor's own time, which PTP or GPS must set.",
         live=True,
     ),
     Parameter(
         "time_offset",
         0.0,
-        "Seconds added to every stamp; negative for a constant delay.",
+        "Seconds that are added to every stamp. A negative number compensates for a constant"
+        " delay.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
         live=True,
     ),
     Parameter(
-        "publish_packets", False, "Publish the packets of the sensor as received, on packets."
+        "publish_packets", False, "Publish the packets on the topic packets, as they were received."
     ),
     Parameter(
         "qos",
         "best_effort",
-        "Reliability of the data topics: best_effort or reliable.",
+        "Reliability of the topics with data: best_effort or reliable.",
     ),
     Parameter(
         "replay_speed",
@@ -306,7 +317,10 @@ class Settings:
             LidarSpecError: as on the command line.
         """
         if not self["source"]:
-            raise UsageError("source is missing, such as /dev/ttyUSB0, udp:// or sim:ID")
+            raise UsageError(
+                "the parameter source is missing: set it, for example to /dev/ttyUSB0, udp:// or"
+                " sim:ID"
+            )
         mount = None if self["publish_tf"] else self.find_mount()
         record_to = record if self["publish_packets"] else None
         return Device(

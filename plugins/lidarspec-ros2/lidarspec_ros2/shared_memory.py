@@ -113,17 +113,21 @@ def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
     for clouds in (CLOUDS, FEWER_CLOUDS):
         segment_bytes = _round_segment_bytes(clouds * assumed)
         if free >= FREE_SEGMENTS * segment_bytes:
-            reason = "" if cloud_bytes is not None else " (the size for this sensor is unknown)"
+            reason = (
+                ""
+                if cloud_bytes is not None
+                else " (assumed, because the size of this sensor's clouds is unknown)"
+            )
             notice = (
-                f"Fast DDS: shared memory of {format_megabytes(segment_bytes)} for clouds of up to "
-                f"{size}{reason}; set {profile_variable()} to use another profile"
+                f"Fast DDS uses {format_megabytes(segment_bytes)} of shared memory, for clouds of"
+                f" up to {size}{reason}; set {profile_variable()} to use another profile"
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
-        f"Fast DDS: default transports, which lose clouds of {size} with best effort:"
-        f" {SHARED_MEMORY_DIR} has {format_megabytes(free)} free,"
-        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} are required; in a container, use"
-        " docker run --shm-size=512m or --ipc=host, or publish with qos:=reliable"
+        f"Fast DDS uses its default transports, which lose clouds of {size} with best effort,"
+        f" because {SHARED_MEMORY_DIR} has only {format_megabytes(free)} of the required"
+        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} free; in a container, use docker run"
+        " --shm-size=512m or --ipc=host, or publish with qos:=reliable"
     )
     return SharedMemory(warning=warning)
 

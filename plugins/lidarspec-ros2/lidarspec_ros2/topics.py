@@ -210,8 +210,8 @@ class Topics:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise UsageError(
-                f"publish_tf requires tf2_msgs, which is not installed ({error});"
-                " static_transform_publisher is an alternative"
+                f"publish_tf requires tf2_msgs, which is not installed ({error}); install it, or"
+                " use static_transform_publisher"
             ) from None
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         stamp = self._node.get_clock().now().to_msg()
@@ -241,9 +241,9 @@ class Topics:
             return
         self._max_cloud_bytes = None
         self._node.get_logger().warning(
-            f"clouds of {format_megabytes(size)} may be lost: the size of the shared memory is for"
-            f" up to {format_megabytes(limit)}; name the sensor when the node starts, or set"
-            " qos:=reliable"
+            f"clouds of {format_megabytes(size)} may be lost, because the shared memory was made"
+            f" for clouds of up to {format_megabytes(limit)}; name the sensor when the node"
+            " starts, or set qos:=reliable"
         )
 
 

@@ -180,7 +180,7 @@ def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: 
     client.until(lambda: newest().header.frame_id == "rear" and newest().angle_max == 1.0)
     assert (len(newest().ranges), newest().range_max, newest().angle_min) == (450, 3.0, -1.0)
     assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
-    assert "source is read when" in client.set("source", "udp://")
+    assert "source is only read when" in client.set("source", "udp://")
     assert client.set("scan_z_min", 2.0) == "scan_z_min 2.0 is above scan_z_max 0.0"
     assert "5.0 to 3.0" in client.set("range_min", 5.0)
     assert client.set("beams", -1)

@@ -110,10 +110,10 @@ PIXEL = ByteSwapped(
         "elongation" / BitsInteger(4),
         "type" / Enum(BitsInteger(2), normal=0, ground=1, fog=2),
         "second" / BitsInteger(1) * "1: second return",
-        "strength" / BitsInteger(8) * "reflectance or intensity, see flags; 255: reflector",
+        "strength" / BitsInteger(8) * "reflectance or intensity, as `flags` says; 255: a reflector",
         "radius"
         / Scaled(BitsInteger(17), 0.005, "m")
-        * "to be doubled if `long` is 1; 0: no return",
+        * "0: no return; if `long` is 1, the radius is twice this value",
     )
 )
 
@@ -127,9 +127,11 @@ def make_packet(returns: int) -> Struct:
         "firmware_sequence" / Int16ul,
         "checksum" / Int32ul * "not checked: the vendor's header does not name the CRC",
         "size" / Int32ul,
-        "source" / Int8ul * "low bits: number of the lidar; high bits: type of time",
+        "source"
+        / Int8ul
+        * "the low bits are the number of the lidar, the high bits are the type of the time",
         "lidar_type" / Int8ul,
-        "start" / Scaled(Float64l, 1e-6, "s") * "start of the frame, since 1970",
+        "start" / Scaled(Float64l, 1e-6, "s") * "time of the start of the frame, since 1970",
         "mode" / Int8ul,
         "unit_status" / Int8ul,
         "frame" / Int64ul,
@@ -143,7 +145,7 @@ def make_packet(returns: int) -> Struct:
         / ByteSwapped(
             BitStruct(
                 "reserved" / BitsInteger(2),
-                "long" / BitsInteger(1) * "1: radii are to be doubled",
+                "long" / BitsInteger(1) * "1: all radii are twice the sent values",
                 "last_four" / BitsInteger(1),
                 "first_part" / BitsInteger(1),
                 "locked" / BitsInteger(1),
@@ -153,7 +155,9 @@ def make_packet(returns: int) -> Struct:
                 "confidence" / BitsInteger(2),
                 "returns"
                 / Enum(BitsInteger(3), single=1, two_strongest=2, strongest_and_farthest=3),
-                "reflectance" / BitsInteger(1) * "1: strength is reflectance, else intensity",
+                "reflectance"
+                / BitsInteger(1)
+                * "1: `strength` is the reflectance; 0: `strength` is the intensity",
                 "upwards" / BitsInteger(1),
             )
         ),

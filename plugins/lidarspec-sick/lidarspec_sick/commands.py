@@ -24,7 +24,9 @@ STRING = ("size" / Int16ub, "text" / Bytes(this.size))
 RANGE = (
     "sectors" / Int16ub,
     "step" / Scaled(Int32ub, 1e-4, "deg"),
-    "start" / Scaled(Int32sb, 1e-4, "deg") * "first angle, counter-clockwise; 90 is straight ahead",
+    "start"
+    / Scaled(Int32sb, 1e-4, "deg")
+    * "first angle, counter-clockwise; 90 degrees is straight ahead",
     "stop" / Scaled(Int32sb, 1e-4, "deg"),
 )
 CONTENT = (
@@ -35,7 +37,7 @@ CONTENT = (
     "unit" / Int8ub,
     "encoders" / Int16ub,
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
-    "interval" / Int16ub * "1: every scan is sent, 2: every second scan",
+    "interval" / Int16ub * "1: every scan is sent; 2: every second scan is sent",
 )
 #: The reasons for a refused command, numbered from 1 (8014631, error codes).
 ERRORS = (

@@ -93,7 +93,7 @@ def make_block(offsets: range | None = None) -> Struct:
 
 
 BEAM = Struct(
-    "distance" / Scaled(Int16ul, MM, "m") * "to be multiplied by `factor`",
+    "distance" / Scaled(Int16ul, MM, "m") * "before the multiplication by `factor`",
     "reflectivity" / Int8ul,
     "status"
     / BitStruct(
@@ -133,15 +133,15 @@ MESSAGE = Struct(
     "system_state" / Bytes(this.blocks.derived.offset - HEADER_BYTES),
     "derived"
     / Struct(
-        "factor" / Int16ul * "factor of all distances",
+        "factor" / Int16ul * "factor by which all distances are multiplied",
         "beams" / Int16ul,
         "scan_time" / Scaled(Int16ul, 0.001, "s"),
         "reserved" / Bytes(2),
         "start_angle"
         / Scaled(Int32sl, ANGLE_STEP_DEG, "deg")
-        * "first angle; 90 is straight ahead",
+        * "first angle; 90 degrees is straight ahead",
         "step" / Scaled(Int32sl, ANGLE_STEP_DEG, "deg"),
-        "interval" / Scaled(Int32ul, 1e-6, "s") * "time from beam to beam",
+        "interval" / Scaled(Int32ul, 1e-6, "s") * "time between two beams",
     ),
     "derived_rest"
     / Bytes(this.blocks.measurement.offset - this.blocks.derived.offset - DERIVED_BYTES),

@@ -171,9 +171,13 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
 def describe_difference(own: Kind, other: Kind) -> str | Relative:
     """Return how to recognize a scanner of another kind."""
     if own == other:
-        return "identical scans; see its reply to get_identity, or the label on the housing"
+        return (
+            "the scans are identical; the reply to get_identity and the label on the housing"
+            " name the model"
+        )
     return Relative(
-        "the scan rate, the angular step or the first angle", lambda f: other.fits(f) & ~own.fits(f)
+        "the scan rate, the angular step or the first angle differs",
+        lambda f: other.fits(f) & ~own.fits(f),
     )
 
 

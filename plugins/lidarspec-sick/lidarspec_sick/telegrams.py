@@ -37,7 +37,10 @@ from lidarspec.spec import Checksummed, Fields, Frame, Polar, Scaled, SizeOf, To
 #: The smallest distance before scaling: raw values below 16 are reserved (8023198).
 MIN_DISTANCE_M = 0.016
 AHEAD_DEG = 90.0  # the direction straight ahead on the wire (sick_scan_xd)
-DISTANCE = Scaled(Int16ub, 0.001, "m") * "before scaling; below 16: no distance"
+DISTANCE = (
+    Scaled(Int16ub, 0.001, "m")
+    * "before the multiplication by the scale factor; raw values below 16: no distance"
+)
 #: Higher rates are in Hz instead of 100 Hz, because of an error in some firmware (sick_scan_xd).
 MAX_BEAM_RATE_HZ = 1e6
 MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
@@ -85,7 +88,7 @@ def make_channel(
         "offset" / Float32b,
         "start"
         / Scaled(Int32sb, 1e-4, "deg")
-        * "first angle, counter-clockwise; 90 is straight ahead",
+        * "first angle, counter-clockwise; 90 degrees is straight ahead",
         "step" / Scaled(Int16ub, 1e-4, "deg"),
         "count" / (Int16ub if first else Rebuild(Int16ub, count)),
         "samples" / Array(count, values),
@@ -113,16 +116,16 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "serial" / Int32ub,
         "status"
         / Array(2, Enum(Int8ub, ok=0, error=1, pollution_warning=2, pollution_error=4))
-        * "the second value is the status of the device",
+        * "only the second value is the status of the device",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
-        "time" / Scaled(Int32ub, 1, "us") * "start of the scan, since power-up",
-        "sent" / Scaled(Int32ub, 1, "us") * "transmission time, since power-up",
+        "time" / Scaled(Int32ub, 1, "us") * "time of the start of the scan, since power-up",
+        "sent" / Scaled(Int32ub, 1, "us") * "time of the transmission, since power-up",
         "inputs" / Array(2, Int8ub),
         "outputs" / Array(2, Int8ub),
         "layer"
         / Scaled(Int16sb, 0.01, "deg")
-        * "layer angle, positive downwards; 0 except for the MRS1000",
+        * "angle of the layer, positive downwards; only an MRS1000 sends another value than 0",
         "scan_rate" / Scaled(Int32ub, 0.01, "Hz"),
         "beam_rate" / Scaled(Int32ub, 100, "Hz"),
         "encoder_count" / Int16ub,
@@ -211,7 +214,7 @@ def scaled_intensity(channel: Fields) -> Any:
 def make_scan_frame(cola: str, echoes: int) -> Frame:
     """Return the frame of a scan with `echoes` echoes, in CoLa "A" or "B"."""
     max_length = 200 + echoes * 2 * (40 + 2 * MAX_BEAMS)
-    kind = "kind" / Bytes(3) * "sSN sent automatically, sRA sent on request"
+    kind = "kind" / Bytes(3) * "sSN: sent automatically; sRA: sent on request"
     more = {
         "data": True,
         "plausible": partial(plausible, echoes=echoes),

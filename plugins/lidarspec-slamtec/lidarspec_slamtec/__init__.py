@@ -176,13 +176,16 @@ def make_rplidar(
         on_close=("stop", "stop_motor"),
         acknowledged={}
         if status == "manual"
-        else {"LS710": "the exchange is not redistributed; the project's tests read the original"},
+        else {
+            "LS710": "the license of the captured exchange allows no copy here; the project's"
+            " tests read the original file"
+        },
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=turn,
         relatives={
             f"slamtec-rplidar-{other.lower()}": (
-                "no public difference; see the label"
+                "no document describes a difference between the data; the label names the model"
                 if {name, other} == {*SAME_MODEL_NUMBER}
                 else "info.model"
             )
@@ -224,7 +227,7 @@ A3 = make_rplidar(
     range_limits=(0.2, 25.0),
     turn=(5.0, 15.0),
     status="vectors",
-    source="A3M1 data sheet; ultra capsules built from the SDK",
+    source="A3M1 data sheet; the ultra capsules were built according to the SDK",
 )
 S1 = make_rplidar(
     "S1",

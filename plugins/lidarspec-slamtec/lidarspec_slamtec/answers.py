@@ -101,7 +101,7 @@ VALUES: dict[int, Construct] = {
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
     ANSWER_TYPE: "answer_type"
     / Enum(Int8ul, **STREAMS)
-    * "type in the descriptor that precedes the data frames of the mode",
+    * "the type in the descriptor that is sent before the data frames of this mode",
 }
 _VALUE_BYTES = np.full(MODE_NAME + 1, np.nan)
 _VALUE_BYTES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
@@ -110,7 +110,7 @@ _VALUE_BYTES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 def make_descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
     """Return the fields of a descriptor of this type and mode."""
     block = BitStruct(
-        "mode" / Const(mode, BitsInteger(2)) * "0: one reply, 1: endless stream",
+        "mode" / Const(mode, BitsInteger(2)) * "0: one reply follows; 1: an endless stream follows",
         "length" / length,
     )
     return (
@@ -168,7 +168,9 @@ ANSWERS = {
     "info": make_reply(
         0x04,
         20,
-        "model" / Enum(Int8ul, **MODEL_NUMBERS) * "high nibble: series, low nibble: model",
+        "model"
+        / Enum(Int8ul, **MODEL_NUMBERS)
+        * "the high nibble is the series, the low nibble is the model",
         "firmware_minor" / Int8ul,
         "firmware_major" / Int8ul,
         "hardware" / Int8ul,

@@ -74,7 +74,7 @@ def make_capsule(*fields: Construct) -> Checksummed:
 
 def make_start() -> Construct:
     """Return the field of the first angle, and the flag of the first capsule."""
-    flag = "sync" / BitsInteger(1) * "S, 1: first capsule after a start"
+    flag = "sync" / BitsInteger(1) * "the bit S of the manual; 1: the first capsule after a start"
     return "start" / ByteSwapped(BitStruct(flag, "angle" / Scaled(BitsInteger(15), 1 / 64, "deg")))
 
 
@@ -108,12 +108,12 @@ ULTRA = make_capsule(
                 "predict2"
                 / Scaled(BitsInteger(10, signed=True), 1, "")
                 * (
-                    "difference to the next major, in steps given by the code word; 511, -512: no"
-                    " return"
+                    "difference to `major` of the next cabin, in steps that depend on its range;"
+                    " 511 and -512: no return"
                 ),
                 "predict1"
                 / BitsInteger(10, signed=True)
-                * "difference to this major; 511, -512: no return",
+                * "difference to `major` of this cabin; 511 and -512: no return",
                 "major" / BitsInteger(12) * "0: no return",
             )
         ),

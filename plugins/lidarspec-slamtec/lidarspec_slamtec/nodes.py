@@ -57,8 +57,8 @@ NODE = Struct(
     "head"
     / BitStruct(
         "quality" / BitsInteger(6),
-        "inverse" / BitsInteger(1) * "the inverse of start",
-        "start" / BitsInteger(1) * "S, 1: first node of a revolution",
+        "inverse" / BitsInteger(1) * "the inverse of the bit `start`",
+        "start" / BitsInteger(1) * "the bit S of the manual; 1: the first node of a revolution",
     ),
     "beam"
     / ByteSwapped(

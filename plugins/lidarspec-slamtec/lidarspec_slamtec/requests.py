@@ -67,7 +67,7 @@ PLAIN = Struct(
     ),
 )
 PAYLOAD = make_request(
-    "cmd" / Enum(Int8ul, **PAYLOAD_CODES) * "80 or above",
+    "cmd" / Enum(Int8ul, **PAYLOAD_CODES) * "code of the command, 80 or more",
     "size" / Int8ul * "bytes of the payload",
     "payload" / Bytes(this.size),
 )
@@ -77,7 +77,7 @@ REQUESTS = {
     "express_request": make_payload_request(
         0x82,
         5,
-        "mode" / Int8ul * "0: express scan; else a scan mode, see get_mode_count",
+        "mode" / Int8ul * "0: express scan; other values: a scan mode (see get_mode_count)",
         "flags" / Int16ul,
         "param" / Int16ul,
     ),

@@ -108,7 +108,7 @@ STATISTICS = Struct(
 TEMPERATURE = Struct(
     "type" / Const(9, Int32ul),
     "length" / Const(28, Int32ul),
-    "invalid" / Int32sl * "0: the following values are valid",
+    "invalid" / Int32sl * "0 if the following values are valid",
     "time" / Scaled(Int32ul, 0.001, "s") * "time since power-up",
     *(
         name / Scaled(Int16sl, 1, "degC")
@@ -130,11 +130,14 @@ DATA = Struct(
     "magic" / Const(bytes([2, 1, 4, 3, 6, 5, 8, 7])),
     "version"
     / Int32ul
-    * "SDK version: one byte each for major, minor, bugfix and build, major highest",
+    * "SDK version: major, minor, bugfix and build, each in one byte; major is the highest"
+    " byte",
     "length" / SizeOf(Int32ul),
     "platform" / Const(PLATFORM, Int32ul),
     "frame_number" / Int32ul,
-    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "time of a cycle counter, which restarts at 21.5 s",
+    "time"
+    / Scaled(Int32ul, CYCLE_NS, "ns")
+    * "time by a cycle counter, which restarts after 21.5 s",
     "detected" / Int32ul * "number of points",
     "tlv_count" / Int32ul,
     "subframe" / Int32ul,
@@ -147,7 +150,7 @@ DATA = Struct(
                 2,
                 "magnitudes"
                 / Array(this.length // 2, Int16ul)
-                * "logarithm to base 2, in steps of 1/512",
+                * "logarithm to the base 2; one step is 1/512",
             ),
             "noise_profile": make_part(
                 3,

@@ -102,7 +102,7 @@ NAV_PVT = make_ubx(  # p. 150
         "date" / BitsInteger(1),
     ),
     "time_accuracy" / Scaled(Int32ul, 1, "ns"),
-    "nano" / Scaled(Int32sl, 1, "ns") * "fraction of the second, may be negative",
+    "nano" / Scaled(Int32sl, 1, "ns") * "fraction of the second, which may be negative",
     "fix_type" / FIX_TYPES,
     "flags"
     / BitStruct(
@@ -192,13 +192,15 @@ SET_MESSAGE = make_ubx(  # UBX-CFG-MSG, p. 54
     3,
     "message_class" / Int8ul,
     "message_id" / Int8ul,
-    "rate" / Int8ul * "solutions per message; 0: never sent",
+    "rate"
+    / Int8ul
+    * "number of solutions after which the message is sent once; 0: it is never sent",
 )
 SET_RATE = make_ubx(  # UBX-CFG-RATE, p. 75
     b"\x06\x08",
     6,
     "period" / Scaled(Int16ul, 0.001, "s") * "time between measurements",
-    "cycles" / Int16ul * "measurements per solution",
+    "cycles" / Int16ul * "number of measurements for each solution",
     "time_reference" / Enum(Int16ul, utc=0, gps=1, glonass=2, beidou=3, galileo=4),
 )
 POLL_PVT = make_ubx(b"\x01\x07", 0)
@@ -220,10 +222,10 @@ OTHER_UBX = Checksummed(
 )
 
 RMC = Struct(  # p. 23
-    "talker" / Bytes(2) * "GP: GPS, GN: several systems",
+    "talker" / Bytes(2) * "GP: GPS; GN: several satellite systems",
     "formatter" / Const(b"RMC"),
-    "time" / Float64b * "hhmmss.ss, UTC",
-    "status" / Bytes(1) * "A: valid, V: warning",
+    "time" / Float64b * "UTC as hhmmss.ss",
+    "status" / Bytes(1) * "A: valid; V: warning",
     "latitude" / Float64b * "ddmm.mmmmm",
     "north_south" / Bytes(1),
     "longitude" / Float64b * "dddmm.mmmmm",
@@ -233,8 +235,10 @@ RMC = Struct(  # p. 23
     "date" / Bytes(6) * "ddmmyy",
     "variation" / Scaled(Float32b, 1, "deg") * "magnetic variation",
     "variation_east_west" / Bytes(1),
-    "mode" / Bytes(1) * "posMode of the manual; sent from NMEA 2.3 on",
-    "navigation_status" / Bytes(1) * "V: no navigational status is provided; sent from NMEA 4.1 on",
+    "mode" / Bytes(1) * "the manual calls it posMode; sent with NMEA 2.3 or later",
+    "navigation_status"
+    / Bytes(1)
+    * "V: the receiver provides no navigational status; sent with NMEA 4.1 or later",
 )
 GGA = Struct(
     "talker" / Bytes(2) * "GP: GPS, GN: several systems",
@@ -249,10 +253,10 @@ GGA = Struct(
     "horizontal_dop" / Float32b,
     "altitude" / Scaled(Float64b, 1, "m") * "height above mean sea level",
     "altitude_unit" / Bytes(1),
-    "separation" / Scaled(Float32b, 1, "m") * "difference between ellipsoid and mean sea level",
+    "separation" / Scaled(Float32b, 1, "m") * "height of mean sea level above the ellipsoid",
     "separation_unit" / Bytes(1),
     "age" / Scaled(Float32b, 1, "s") * "age of the differential corrections",
-    "station" / Bytes(4) * "station of the differential corrections",
+    "station" / Bytes(4) * "id of the station that sends the differential corrections",
 )
 OTHER_NMEA = Struct("address" / Bytes(5), "content" / Bytes(MAX_SENTENCE_BYTES - 12))
 

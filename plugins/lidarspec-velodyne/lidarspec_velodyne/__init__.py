@@ -225,12 +225,19 @@ VLS128_FRAMES = {
 # Other products with the same packets (velodyne_decoder, types.h). 0x21 does not identify a
 # product: a VLP-16 with old firmware sends it too.
 VLP32A_RELATIVE = {
-    "velodyne-vlp32a": Relative("product 0x23, VLP-32A or VLP-32B", lambda f: f.product == 0x23)
+    "velodyne-vlp32a": Relative(
+        "the product is 0x23 (VLP-32A or VLP-32B)", lambda f: f.product == 0x23
+    )
 }
-HI_RES_RELATIVE = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
+HI_RES_RELATIVE = {
+    "velodyne-puck-hi-res": Relative("the product is 0x24", lambda f: f.product == 0x24)
+}
 
 
-UNPUBLISHED = {"LS710": "the packet is not redistributed; the project's tests read the original"}
+UNPUBLISHED = {
+    "LS710": "the license of the captured packet allows no copy here; the project's tests read the"
+    " original file"
+}
 
 VLP16 = Sensor(
     "velodyne-vlp16",
@@ -259,7 +266,8 @@ VLP16 = Sensor(
     # 12 shots, or 6 with dual return, with periods of 110.592 and 46.080 us
     relatives={
         "velodyne-hdl32e": (
-            "one packet every 1327 us, with dual return 664 us; an HDL-32E: 553 and 276 us"
+            "it sends one packet every 1327 us (664 us with dual return), an HDL-32E every 553"
+            " us (276 us)"
         ),
         **HI_RES_RELATIVE,
         **VLP32A_RELATIVE,
@@ -307,7 +315,7 @@ HDL32E = make_related_model(
     range_limits=(0.9, 130.0),  # the default of ros-drivers/velodyne for this model
     relatives={
         "velodyne-vlp16": Relative(
-            "product 0x22; or one packet every 1327 us", lambda f: f.product == 0x22
+            "the product is 0x22, or one packet arrives every 1327 us", lambda f: f.product == 0x22
         ),
         **HI_RES_RELATIVE,
         **VLP32A_RELATIVE,
@@ -321,7 +329,7 @@ PUCK_HI_RES = make_related_model(
     HI_RES_FIRINGS,
     relatives={
         "velodyne-vlp16": Relative(
-            "product 0x22, or 0x21 with old firmware",
+            "the product is 0x22, or 0x21 with old firmware",
             lambda f: (f.product == 0x22) | (f.product == 0x21),
         ),
         "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),

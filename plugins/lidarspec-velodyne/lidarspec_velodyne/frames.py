@@ -59,7 +59,7 @@ def make_packet(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
         "intensity"
         / Int8ul
-        * "calibrated reflectivity; up to 100: diffuse target, above: retroreflector",
+        * "calibrated reflectivity; 0 to 100: a diffuse target; above 100: a retroreflector",
     )
     block = Struct(
         "flag" / flag,
@@ -112,7 +112,9 @@ POSITION = Struct(
     "adc_temperature"
     / Scaled(Int8ul, 1, "degC")
     * "temperature at the last calibration of the ADC",
-    "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "change since the last calibration",
+    "adc_temperature_change"
+    / Scaled(Int16sl, 1, "degC")
+    * "change of the temperature since the last calibration",
     "adc_age" / Scaled(Int32ul, 1, "s") * "time since the last calibration",
     "adc_reason" / Enum(Int8ul, none=0, power_on=1, manual=2, temperature=3, periodic=4),
     "adc_status"

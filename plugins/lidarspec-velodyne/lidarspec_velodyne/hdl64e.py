@@ -326,7 +326,8 @@ def make_sensor(series: str, unit: Unit, other: str) -> Sensor:
         turn=SPEED_LIMITS_HZ,
         relatives={
             f"velodyne-hdl64e-{other}": (
-                "one packet every 288 us (S2) or 346 us (S3); half of this with dual return"
+                "it sends one packet every 288 us (S2) or 346 us (S3), and with dual return"
+                " twice as often"
             )
         },
         status="manual",

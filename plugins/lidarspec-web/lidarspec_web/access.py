@@ -38,7 +38,7 @@ HEADERS = {
     "cache-control": "no-store",
 }
 OTHER_HOST = "this server has another host name: open the link that lidarspec printed"
-OTHER_PAGE = "request from another page refused"
+OTHER_PAGE = "the request was refused, because it comes from another page"
 TOKEN_NEEDED = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">

@@ -201,7 +201,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("each page pauses by itself")
+        self._refuse_live("each page can only pause its own view")
         self.paused = True
 
     def play(self) -> None:
@@ -222,7 +222,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("its next scan has not arrived")
+        self._refuse_live("the next scan cannot be selected, because it has not arrived yet")
         self.paused = True
         self._steps += 1
         self._has_request.set()

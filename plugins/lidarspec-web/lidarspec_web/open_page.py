@@ -119,7 +119,7 @@ class OpenPage:
                 if message is None:
                     await self._wait_for_news()
                 elif not await self._send_in_time(message):
-                    return "disconnected: it stopped reading"
+                    return "was disconnected, because it stopped reading"
         except WebSocketDisconnect:
             return "closed"
 
@@ -250,7 +250,7 @@ class OpenPage:
                 await asyncio.sleep(BUSY_CHECK_S)
         if message.get("code") in CLOSE_CODES:
             return "closed"
-        return "disconnected: it stopped replying"
+        return "was disconnected, because it stopped replying"
 
     @property
     def _is_busy(self) -> bool:
@@ -266,7 +266,7 @@ class OpenPage:
                 word = str(request.get("do"))
             if word not in self._handlers:
                 raise UsageError(
-                    f"invalid message: expected do to be one of {', '.join(self._handlers)}"
+                    f'invalid message: "do" must be one of {", ".join(self._handlers)}'
                 )
             self._handlers[word](self, request)
         except (ValueError, RecursionError):
@@ -375,7 +375,7 @@ class OpenPage:
             )
         on = request.get("on")
         if not isinstance(on, bool | None):
-            raise UsageError("on: expected true or false")
+            raise UsageError('"on" must be true or false')
 
         def change() -> None:
             if on is None:

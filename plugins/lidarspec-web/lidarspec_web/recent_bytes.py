@@ -57,7 +57,7 @@ class DamagedBytes:
     def verdict(self, sensor: Sensor) -> str:
         """Return the fault of the bytes in one sentence."""
         if not self.data:
-            return "an incomplete message: datagrams are missing"
+            return "the message is incomplete, because datagrams are missing"
         try:
             sensor.parse(self.data)
         except WireError as error:

@@ -206,7 +206,9 @@ class PageSite:
         if number.isdecimal() and len(number) < MAX_NUMBER_DIGITS:
             shown = self._broadcast.find_scan(int(number))
         if shown is None:
-            return PlainTextResponse("this scan is no longer available: pause before saving", 404)
+            return PlainTextResponse(
+                "this scan is no longer available: pause the view before saving", 404
+            )
         return self._saves.response(shown, suffix)
 
 

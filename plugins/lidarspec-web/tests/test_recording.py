@@ -27,7 +27,7 @@ def test_pages_that_press_at_once_agree(tmp_path: Path) -> None:
             page.say("record", on=False)
         for page in (one, other):
             page.state(lambda state: state["recording"] is None)
-        assert one.request("record", on="yes")["text"] == "on: expected true or false"
+        assert one.request("record", on="yes")["text"] == '"on" must be true or false'
     assert {path.name for path in tmp_path.glob("*.lsr")} == names
     with ls.open(tmp_path / names.pop()) as again:
         assert sum(len(packets) for packets in again.packets())

@@ -97,10 +97,10 @@ def make_data_frame(form: Form) -> Frame:
             "frequency"
             / frequency
             * (
-                "scans per second in a zero packet, 0: not given; in other packets the state of a"
-                " T-mini or an X4 Pro"
+                "in a zero packet: scans per second, 0 if unknown; in other packets: the state"
+                " of a T-mini or an X4 Pro"
             ),
-            "start" / BitsInteger(1) * "1: zero packet, a revolution begins",
+            "start" / BitsInteger(1) * "1: a zero packet, with which a revolution begins",
         ),
         "lsn" / Int8ul * "number of samples",
         "fsa" / make_angle() * "angle of the first sample",
@@ -172,12 +172,12 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
     """Return how to recognize another model with the same sample size."""
     if other.has_state and not own.has_state:
         return Relative(
-            "bits of CT are set in packets that do not begin a revolution",
+            "packets that do not begin a revolution have bits set in CT",
             partial(has_state, slowest=own.form.slowest),
         )
     if own.number and other.number:
         return "info.model"
-    return "identical packets; see the baud rate, or the label on the housing"
+    return "the packets are identical; the baud rate and the label on the housing may differ"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:

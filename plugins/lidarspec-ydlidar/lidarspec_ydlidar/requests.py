@@ -37,7 +37,7 @@ ANSWERS = {
         / Enum(Int8ul, **{name: model.number for name, model in MODELS.items() if model.number}),
         "firmware" / Struct("minor" / Int8ul, "major" / Int8ul),
         "hardware" / Int8ul,
-        "serial" / Bytes(16) * "one digit per byte",
+        "serial" / Bytes(16) * "each byte contains one digit",
         size=20,
     ),
     "health": make_reply(
@@ -48,7 +48,7 @@ ANSWERS = {
     ),
     "setting": make_reply(
         0x04,
-        "value" / Int8ul * "number of the sampling rate, or direction of rotation",
+        "value" / Int8ul * "number of the sampling rate, or the direction of rotation",
         size=1,
     ),
     "stamp": Frame(

@@ -66,7 +66,9 @@ SAMPLE_8 = make_packed_sample(REFLECTION, "intensity" / BitsInteger(8))
 
 TRIANGLE = Form(make_plain_distance(0.00025), correction=camera_angle)
 TRIANGLE_FLAGGED = Form(
-    make_packed_sample("flags" / BitsInteger(2) * "not 0: interference from another lidar"),
+    make_packed_sample(
+        "flags" / BitsInteger(2) * "other values than 0: interference from another lidar"
+    ),
     correction=camera_angle,
 )
 TRIANGLE_8 = Form(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
