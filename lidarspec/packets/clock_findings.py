@@ -82,7 +82,7 @@ FINDING_TYPES = MappingProxyType(
             "check that the NMEA sentence follows the pulse that it belongs to",
         ),
         "jump": FindingType(
-            "set by {value:+.3f} s", "use --time host for the data around this time"
+            "stepped by {value:+.3f} s", "use --time host for the data around this time"
         ),
         "free_running": FindingType(
             "counts from power-up, so it has no date", "use --time host for dates", is_fault=False
