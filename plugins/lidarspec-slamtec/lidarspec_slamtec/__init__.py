@@ -177,8 +177,8 @@ def make_rplidar(
         acknowledged={}
         if status == "manual"
         else {
-            "LS710": "the license of the captured exchange allows no copy here; the project's"
-            " tests read the original file"
+            "LS710": "the captured exchange is not part of this distribution; the project's tests"
+            " read the original file"
         },
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
