@@ -395,7 +395,7 @@ class Registry:
         return None
 
     def _find_same_names(self, home: Home, name: str) -> set[str]:
-        """Return all names of the sensor of a plugin that has this name.
+        """Return the id and the aliases of the sensor that a plugin has under a name.
 
         If the sensor is not loaded, these are the names of its entry points.
         """

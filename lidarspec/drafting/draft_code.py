@@ -259,7 +259,7 @@ def _find_constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[i
 
 
 def _describe_constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
-    """Return a comment with the value of constant bytes; () if they are not constant."""
+    """Return a comment line with the value of some bytes, or no line if they vary."""
     if not columns.size or not (columns == columns[0]).all():
         return ()
     is_long = columns.shape[1] > MAX_SHOWN_BYTES

@@ -304,8 +304,8 @@ def _assemble_part(part: tree.Part, raw: str) -> str:
 def ksy(sensor: Sensor) -> str:
     """Return the sensor's frame types as a .ksy document.
 
-    The format parses a sequence of data frames. If the sensor has only one frame type, the format
-    parses a sequence of these frames.
+    The document parses a sequence of data frames. If the sensor has none, it parses a sequence of
+    frames of the first type.
 
     Raises:
         ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names

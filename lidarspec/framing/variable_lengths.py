@@ -6,11 +6,11 @@ layout takes a few dozen NumPy calls, for one candidate as for a thousand. Most 
 differ only in the length of an array at their end: they have the same constants, checksums over the
 same bytes up to the same distance from the end, and tests of the same fields. `LayoutFamilies`
 finds such layouts. Their candidates become the rows of one array, and bytes after the end of a
-candidate are ignored. A checksum is computed over zeros in their place, which do not change the
-checksums in `ZERO_EXTENDED`. A test ignores elements after the end.
+candidate are ignored: for a checksum, they are replaced by zeros, which do not change a checksum in
+`ZERO_EXTENDED`. A test ignores elements after the end.
 
-The results are the same as those of `plausibility.CandidateChecker`, which is also used for all
-tests that are not a lookup of one or two bytes.
+The results are the same as those of `plausibility.CandidateChecker`. It also does all tests that
+are not a lookup of one or two bytes.
 """
 
 from __future__ import annotations

@@ -45,11 +45,13 @@ class ArrivalOrder:
     def push(
         self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
     ) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and the breaks before packets, (n,).
+        """Return the index of each packet in the stream, (n,), and the breaks before packets, (n,).
+
+        The index also counts lost packets. The breaks are those of `batch`, which follow skipped
+        bytes, and those that follow lost packets.
 
         Args:
-            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them;
-                this adds marks for lost packets.
+            batch: the packets.
             times: times by the sensor's clock, (n,) ns; None without a clock.
             skipped: number of bytes outside frames before each packet, (n,).
         """

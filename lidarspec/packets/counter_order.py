@@ -160,7 +160,10 @@ class CounterOrder:
     def _place_all(
         self, batch: Batch, times: Times | None
     ) -> tuple[NDArray[np.int64] | range, NDArray[np.bool_]]:
-        """Return the index of each packet, and the breaks before packets."""
+        """Return the index of each packet in the stream, and the breaks before packets.
+
+        The index also counts lost packets.
+        """
         count = len(batch)
         readings = self._read(batch, times)
         self._gaps.read(batch.table)

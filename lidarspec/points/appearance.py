@@ -73,7 +73,7 @@ class CloudAppearance:
 
 
 def list_ramps(cloud: PointCloud) -> list[str]:
-    """Return the names of the columns of a cloud that colours can show."""
+    """Return the names of a cloud's columns that can be shown as colours."""
     if cloud.intensity is None:
         return ["range", *cloud.extra]
     return ["range", "intensity", *cloud.extra]

@@ -47,7 +47,8 @@ class FieldWindow:
     This integer is the index in a lookup table.
 
     Attributes:
-        offset: the offset of the first byte in the frame, in the first element of each array.
+        offset: the offset of the window in the frame. For a field in arrays, it is the offset in
+            the first element of each array.
         size: the number of bytes, 1 or 2.
     """
 

@@ -208,7 +208,7 @@ class BackgroundWriter:
         raise NotImplementedError
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the line, if the format supports events."""
+        """Record an event of the connection, if the format supports events."""
 
     def sync(self) -> None:
         """Wait until all records so far are on the disk.

@@ -51,7 +51,7 @@ class Scene(Protocol):
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: start of the beams, metres; each of the three broadcasts against the beams.
+            origin: x, y and z of the start of the beams, metres; each broadcasts against the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
 
@@ -140,7 +140,7 @@ class Room:
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: start of the beams, metres; each of the three broadcasts against the beams.
+            origin: x, y and z of the start of the beams, metres; each broadcasts against the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
         level = np.cos(elevation)

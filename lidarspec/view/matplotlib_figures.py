@@ -311,7 +311,7 @@ class RateSeries:
         return (at - self._first) * 1e-9
 
     def _take(self) -> None:
-        """Count the last batch."""
+        """Add the newest batch of packets to the counts."""
         packets = self._live.packets
         if packets is None or not len(packets):
             return

@@ -2,16 +2,17 @@
 
 The points of one azimuth are a packet of 80 bytes, and an IMU sample is a packet of 34 bytes:
 
-    EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity),
-    dirt, state, sequence | CRC EE FF 01 08  time_version  01 | date, microseconds | acceleration,
-    rate, sequence | CRC
+    EE FF 01 08  time_version  00 | date, microseconds
+        | azimuth, 16 x (distance, reflectivity), dirt, state, sequence | CRC
+    EE FF 01 08  time_version  01 | date, microseconds
+        | acceleration, rate, sequence | CRC
 
 No captured packet was available. The azimuths per revolution and the rotation speed are not public.
-The simulation has 600 azimuths, as the vendor's code does, at 5 Hz, which is the limit of the baud
-rate. The axes of the IMU are not documented, so its samples are available as fields only.
+The simulation has 600 azimuths, as the vendor's code does, at 5 Hz, the most that the baud rate
+allows. The axes of the IMU are not documented, so its samples are available as fields only.
 
-Commands are not supported. They use a second line (RS232, 9600 baud), contain random numbers, and
-could read a unit's angles.
+Commands are not supported: they use a second line (RS232, 9600 baud), and contain random numbers.
+The angles of a unit, which a command could read, come from a correction file instead.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
 CRC; serial_source.cc: lengths; parameter_introduction.md: 3,125,000 baud; JT16 correction file).
