@@ -333,7 +333,15 @@ def test_lost_halves_of_dual_returns_are_a_figure(browser: Any, tmp_path: Path) 
     numbers = [number for number in range(1, 1261) if number % 100]  # 12 second halves are lost
     path = tmp_path / "dual.hex"
     frames = [
-        sensor.build("data", packet, pkt_psn=number, wave_mode=0, microseconds=number * 79)
+        # five seconds, so that the page gets figures while the file is played
+        sensor.build(
+            "data",
+            packet,
+            pkt_psn=number,
+            wave_mode=0,
+            seconds=number // 250,
+            microseconds=number % 250 * 4000,
+        )
         for number in numbers
     ]
     path.write_text("\n\n".join(frame.hex() for frame in frames))
