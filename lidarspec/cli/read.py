@@ -186,7 +186,12 @@ def _iter_packets(
             path: info for path, info in packets.table.schema.fields.items() if info.const is None
         }
         units = {path: info.unit for path, info in fields.items()}
-        columns = {path: packets[path] for path in fields}
+        texts = {
+            path for path, info in packets.table.schema.columns.items() if info.kind == "other"
+        }
+        columns = {
+            path: packets.table.raw(path) if path in texts else packets[path] for path in fields
+        }
         for index in range(len(packets)):
             place = {"offset": int(packets.offset[index]), "time_ns": int(packets.time_ns[index])}
             yield (
@@ -202,7 +207,7 @@ def _iter_packets(
 
 
 def _scalar(value: Any) -> Any:
-    if np.ndim(value):
+    if np.ndim(value) or isinstance(value, str):
         return value
     return float(value)
 
@@ -216,6 +221,8 @@ def _find_width(name: str) -> int:
 
 
 def _format_value(name: str, value: Any) -> str:
+    if isinstance(value, str):
+        return printable(value)
     if isinstance(value, int | np.bool_):
         return str(int(value))
     if not math.isfinite(value):

@@ -277,6 +277,10 @@ class CLayout:
                 return SizeFormula(entry.node.size)
             case tree.Blob(size=int() as size):
                 return SizeFormula(size)
+            case tree.Blob() if entry.node.ending is not None:
+                raise ExportError(
+                    f"{entry.path}: C does not support bytes whose end is found by their content"
+                )
             case tree.Blob():
                 return SizeFormula(
                     0,

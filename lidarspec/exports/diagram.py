@@ -176,7 +176,7 @@ class _ItemBuilder:
         )
 
     def _make_blob_cell(self, node: tree.Blob, start: SizeFormula) -> DiagramBox:
-        size = extent(node)
+        size = extent(node, node.name)
         if node.const is not None and len(node.const) <= 8:
             detail = node.const.hex(" ")
         else:

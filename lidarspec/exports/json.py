@@ -214,9 +214,16 @@ def node_data(node: tree.Node) -> dict[str, Any]:
                 "order": node.order,
             } | _info(node.info)
         case tree.Blob():
-            return {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)} | _info(
-                node.info
-            )
+            data = {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)}
+            if node.info.adapter is not None:
+                data["form"] = node.info.adapter.form
+            if node.ending is not None:
+                data["ending"] = {
+                    "mark": node.ending.mark.hex(),
+                    "mask": node.ending.mask.hex(),
+                    "is_content": node.ending.is_content,
+                }
+            return data | _info(node.info)
         case tree.Block():
             return {
                 "kind": "block",
@@ -340,8 +347,8 @@ def _algorithm(algorithm: Checksum) -> dict[str, Any]:
         elif isinstance(value, int | str | tuple):
             parameters[name] = value
     return {
+        **parameters,
         "kind": type(algorithm).__name__,
         "width": algorithm.width,
         "describe": algorithm.describe(),
-        **parameters,
     }

@@ -125,6 +125,21 @@ def number(formula: tree.Formula, scope: Scope) -> str:
     return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
+def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
+    """Return a formula of the fields of the last part, which is "_" in Kaitai.
+
+    Args:
+        scope: the scope of the frame around the parts.
+    """
+
+    def format_field(ref: tree.Ref) -> str:
+        if ref.path.startswith("_."):  # a field of the frame
+            return format_reference(scope, tree.Ref(ref.path[2:], ref.info))
+        return ".".join(["_", *map(identifier, ref.path.split("."))])
+
+    return tree.write(formula, format_field, _OPERATIONS)
+
+
 def to_condition(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula as a condition, true if it is not 0."""
     match formula:
@@ -366,6 +381,17 @@ class _KaitaiType:
         return {name: part for name, part in vars(self).items() if part or name == "seq"}
 
 
+def _find_terminator(path: str, ending: tree.Ending) -> int:
+    """Return the byte that ends a field of bytes.
+
+    Raises:
+        ExportError: if the end is not a single byte after the content.
+    """
+    if len(ending.terminator) != 1:
+        raise ExportError(f"{path}: Kaitai supports only one byte as the terminator of bytes")
+    return ending.terminator[0]
+
+
 @dataclass
 class _KaitaiWriter:
     """Writes the types of one frame.
@@ -453,15 +479,15 @@ class _KaitaiWriter:
         if node.count is not None:
             more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
-            ends = tree.write(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
+            ends = _format_of_last_part(kind.following, scope)
             if "if" in more:
                 condition = f"({more['if']}) and {number(node.size, scope)} != 0"
             else:
                 condition = f"{number(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
         elif kind.until is not None:
-            ends = tree.write(kind.until, lambda ref: f"_.{ref.path}", _OPERATIONS)
-            more |= {"repeat": "until", "repeat-until": ends}
+            ends = _format_of_last_part(kind.until, scope)
+            more |= {"repeat": "until", "repeat-until": f"{ends} != 0"}
         self._add_typed(kaitai, node.name, kind.element, scope, **more)
 
     def _add_typed(
@@ -524,12 +550,15 @@ class _KaitaiWriter:
         """Return the attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
         if isinstance(node, tree.Blob):
-            size = _size(node.size, scope)
-            kind: Attribute = (
-                {"size": size}
-                if node.const is None
-                else {"contents": [HexNumber(byte) for byte in node.const]}
-            )
+            kind: Attribute
+            if node.ending is not None and not node.ending.mark:
+                kind = {"size-eos": True}
+            elif node.ending is not None:
+                kind = {"terminator": HexNumber(_find_terminator(node.info.path, node.ending))}
+            elif node.const is not None:
+                kind = {"contents": [HexNumber(byte) for byte in node.const]}
+            else:
+                kind = {"size": _size(node.size, scope)}
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOAT_SIZES:

@@ -158,7 +158,7 @@ class _StubClasses:
             case Number():
                 return _number_type(node.info)
             case Blob():
-                return "bytes"
+                return _bytes_type(node.info)
             case Block() if not node.parts[0].names:
                 if len(node.parts) == 1:
                     return _number_type(node.parts[0].info)
@@ -191,6 +191,15 @@ def _number_type(info: FieldInfo) -> str:
     if info.labels:
         return "EnumValue"
     return "int"
+
+
+def _bytes_type(info: FieldInfo) -> str:
+    """Return the type of the parsed value of bytes, which a function may decode."""
+    if info.adapter is None:
+        return "bytes"
+    if info.adapter.form.startswith("text"):
+        return "str"
+    return {"i": "int", "f": "float", "u": "bytes"}.get(info.adapter.dtype.kind, "Any")
 
 
 def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:

@@ -552,7 +552,7 @@ for place, patterns in pairs(sensor.places) do
   end
 end
 
--- Ports are hints: on others, datagrams that are as a whole a frame with constants are taken too.
+-- On other ports, a datagram is accepted if it is exactly one frame with constant bytes.
 if sensor.has_udp and not sensor.is_stream then
   proto:register_heuristic("udp", function(tvb, pinfo, root)
     local frame = exact(tvb, 0, tvb:len(), last_before[pinfo.number])

@@ -230,6 +230,8 @@ class _TableWriter:
         return table | {"skip": self._skip(node.info, node.size)}
 
     def _blob(self, node: tree.Blob) -> Table:
+        if node.ending is not None:
+            raise ExportError(f"{node.info.path}: the end of the bytes is found by their content")
         name = node.name or "constant"
         if node.name:
             path = node.info.path

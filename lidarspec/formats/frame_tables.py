@@ -41,10 +41,14 @@ Batch = Mapping[str, Packets]
 def frame_columns(packets: Packets) -> Columns:
     """Return the columns of packets: `time_ns`, and all fields that are not constant."""
     columns: Columns = {"time_ns": packets.time_ns}
-    for path, info in packets.table.schema.fields.items():
+    schema = packets.table.schema
+    for path in schema.fields:
+        info = schema.columns[path]
         if info.const is not None:
             continue
-        if info.kind == "bytes":
+        if info.kind == "other":
+            columns |= _format_objects(path, packets.table.raw(path))
+        elif info.kind == "bytes":
             frame = packets.frame.partition(".")[0]  # the rest is the path of parts
             is_text = getattr(packets.sensor.frames[frame].wire, "is_text", False)
             columns[path] = _format_bytes(packets.table.raw(path), is_text=is_text)
@@ -85,6 +89,14 @@ def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
     if is_text:
         return [row.rstrip(b"\x00").decode("ascii", "backslashreplace") for row in rows]
     return [row.hex(" ") for row in rows]
+
+
+def _format_objects(path: str, values: NDArray[Any]) -> Columns:
+    """Return a column of texts for each element of a field whose values are texts or objects."""
+    return {
+        name: ["" if value is None else str(value) for value in column.tolist()]
+        for name, column in _split_elements(path, values).items()
+    }
 
 
 def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:

@@ -6,6 +6,7 @@ and build single frames, and to read tables of many frames. Modules in reading o
 * `schema`: the fields of a frame type as a table, without bytes.
 * `compilability`: a check for structs that have no layout.
 * `layout`: the offsets of all fields for one header variant, and functions that load and store.
+* `measured_size`: sizes that are found by reading the content, such as that of a text.
 * `parts`: searches the parts of many frames (frames within a frame) at once.
 * `layout_tree`: the layouts of a frame type, selected by header fields.
 * `wire_coder`: converts between encoded frames and the bytes of their structs.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from construct import Container, EnumIntegerString
+from construct import Container
 
 from lidarspec.errors import (
     LidarSpecError,
@@ -22,11 +23,14 @@ from lidarspec.frames.encode import encode, fill_counts, list_paths
 from lidarspec.frames.field_paths import put_value, split_path
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
-from lidarspec.frames.schema import Schema, make_schema
+from lidarspec.frames.schema import Schema, make_schema, without_indices
 from lidarspec.frames.wire_coder import SPELLING, frame_coder
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import WireNaN
-from lidarspec.spec.tree import FieldInfo
+from lidarspec.spec.tree import FieldInfo, Node
+
+#: A path with indices, such as "rows[3].value".
+PATH = re.compile(r"\w+(\[\d+\])*(\.\w+(\[\d+\])*)*")
 
 
 def build(
@@ -58,12 +62,12 @@ def build(
     checker = _ValueChecker(
         make_schema(declared.tree), list_paths(declared.tree), place, units=units
     )
-    checked = checker.check(_merge_values(value or {}, values), "")
+    _check_paths(values, declared.tree, place)
+    checked = checker.check(_merge_values(value or {}, values, place), "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
-        schema = make_schema(declared.tree)
-        fill_counts(checked, schema)
-        return build_plain(declared, _with_code_names(checked, "", schema), place)
+        fill_counts(checked, make_schema(declared.tree))
+        return build_plain(declared, checked, place)
     try:
         struct = encode(layouts, checked, place)
     except LidarSpecError:
@@ -81,34 +85,35 @@ def build(
     return data
 
 
-def _merge_values(value: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the fields of `value`; fields in `values` override them."""
+def _check_paths(values: Mapping[str, Any], root: Node, place: str) -> None:
+    """Raise `UnknownField` for a path in `values` that the frame does not have."""
+    known = list_paths(root)
+    for path in values:
+        if not path.isidentifier() and (
+            not PATH.fullmatch(path) or without_indices(path)[0] not in known
+        ):
+            raise UnknownField(path, [name for name in known if name], place=place)
+
+
+def _merge_values(
+    value: Mapping[str, Any], values: Mapping[str, Any], place: str
+) -> Mapping[str, Any]:
+    """Return the fields of `value`; fields in `values` override them.
+
+    Raises:
+        UsageError: for a path without the index of an array.
+    """
     nested = {name: new for name, new in values.items() if not name.isidentifier()}
     merged: dict[str, Any] = {**value, **values}
     if not nested:
         return merged
     merged = copy.deepcopy({name: old for name, old in merged.items() if name not in nested})
     for name, new in nested.items():
-        put_value(merged, split_path(name), new)
+        try:
+            put_value(merged, split_path(name), new)
+        except (AttributeError, TypeError, ValueError):
+            raise UsageError(f"{place}: {name} does not lead to a field of the values") from None
     return merged
-
-
-def _with_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Return values with each code of an Enum as construct has it: a string with a number.
-
-    `Const` and `Switch` of a struct that construct builds compare the names of codes.
-    """
-    if isinstance(value, Mapping):
-        return Container(
-            (name, _with_code_names(member, f"{path}.{name}" if path else name, schema))
-            for name, member in value.items()
-        )
-    if isinstance(value, list):
-        return [_with_code_names(element, path, schema) for element in value]
-    info = schema.all_fields.get(path)
-    if info is None or type(value) is not int or value not in info.labels:
-        return value
-    return EnumIntegerString.new(value, info.labels[value])
 
 
 class _ValueChecker:

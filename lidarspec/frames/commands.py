@@ -143,6 +143,14 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
             sensor=sensor.id,
         )
     if isinstance(declared.kind, Choice):
+        low, high = slot.info.limits
+        if slot.info.scaled or not low <= declared.kind.low <= declared.kind.high <= high:
+            raise SpecError(
+                f"Choice cannot set {declared.path!r}: it requires an integer without a scale, that"
+                " holds each of its numbers",
+                path=place,
+                sensor=sensor.id,
+            )
         names = {raw: text for text, raw in declared.kind.names.items()}
         return replace(slot, info=replace(slot.info, labels=names))
     return slot
@@ -225,6 +233,9 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
             value = _find_named(info, kind, value, f"{place}: {argument}")
         if not isinstance(value, int | float | np.number):
             raise UsageError(f"{place}: {argument} must be a number, not {value!r:.60}")
+        if isinstance(kind, Choice) and value not in kind.names.values():
+            choices = ", ".join(f"{name} ({number})" for name, number in kind.names.items())
+            raise UsageError(f"{place}: {argument} must be one of {choices}, not {value!r:.60}")
         if not kind.low <= value <= kind.high:
             raise OutOfRange(argument, value, kind.low, kind.high, unit=info.unit, place=place)
         raw = info.raw(value)
@@ -251,7 +262,7 @@ def list_choices(info: FieldInfo, kind: Range) -> dict[str, float]:
 
 def has_only_names(kind: Range, choices: Mapping[str, float]) -> bool:
     """Return whether each number that an argument takes has a name."""
-    return len(choices) > kind.high - kind.low
+    return isinstance(kind, Choice) or len(choices) > kind.high - kind.low
 
 
 def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:

@@ -36,6 +36,11 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             if in_array:
                 raise NotCompilableError(path, "it is a checksum inside an array")
             _ = node.algorithm
+        case tree.Blob() if in_array and node.ending is not None:
+            raise NotCompilableError(
+                node.info.path,
+                "the elements of the array end by their content: use an array of structs",
+            )
         case tree.PartSequence() if in_array:
             raise NotCompilableError(path, "it is a sequence of parts inside an array")
         case tree.Block():
@@ -64,9 +69,9 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
-    """Raise `NotCompilableError` if an array of parts has the name of something else.
+    """Raise `NotCompilableError` if a part of measured size has the name of a different field.
 
-    `build` takes the parts of an array before it knows which alternative the frame has.
+    `build` measures the part before it knows which alternative the frame has.
     """
     alternatives = tree.children(node)
     for alternative in alternatives:
@@ -74,13 +79,20 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
         is_only_one = all(isinstance(other, tree.Empty) for other in others)
         names = {path for other in others for path in _list_names(other)}
         for part in tree.nodes(alternative):
-            if not isinstance(part, tree.PartSequence) or not part.is_array:
-                continue
-            is_direct = part is alternative
-            if part.axis in names or (is_direct and not is_only_one):
+            path = _find_measured(part)
+            if path and (path in names or (part is alternative and not is_only_one)):
                 raise NotCompilableError(
-                    part.axis, "it is an array of parts, and another case has a different field"
+                    path, "its size is in its content, and another case has a different field"
                 )
+
+
+def _find_measured(node: tree.Node) -> str:
+    """Return the path of a part whose size is found by reading it; "" for other parts."""
+    if isinstance(node, tree.PartSequence) and node.is_array:
+        return node.axis
+    if isinstance(node, tree.Blob) and node.ending is not None:
+        return node.info.path
+    return ""
 
 
 def _list_names(node: tree.Node) -> set[str]:

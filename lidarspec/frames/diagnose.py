@@ -212,13 +212,20 @@ def _iter_condition_faults(
     examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
 ) -> Iterator[Fault]:
     for condition in layout.conditions:
-        if condition.formula is None:
+        is_of_field = condition.formula is None
+        if is_of_field and condition.fields[0].allowed is not None:
             continue  # `_find_value_fault` checks the allowed values of a field
         if layout.meet_condition(condition, row)[0]:
             continue
         leaves = [layout.leaves[info.path] for info in condition.fields]
         end = examined.start + max((leaf.byte_span[1] for leaf in leaves), default=0)
         path = f"{examined.prefix}.{_find_false_condition(condition, layout, row)}".strip(".")
+        adapter = condition.fields[0].adapter if is_of_field else None
+        if adapter is not None:
+            start, stop = leaves[0].byte_span
+            got = row[0, start:stop].tobytes().hex(" ")
+            yield Fault(VALUE, path, examined.start + start, adapter.form, got, end)
+            continue
         yield Fault(CONDITION, path, end, "a condition that is true", "false", end)
 
 

@@ -24,7 +24,8 @@ from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import split_path
 from lidarspec.frames.layout import Layout, Leaf, Seal
 from lidarspec.frames.layout_tree import TooLongError, find_kinds
-from lidarspec.frames.parts import FOUND, LayoutLookup, PartsSize
+from lidarspec.frames.measured_size import FOUND, MeasuredSize
+from lidarspec.frames.parts import LayoutLookup
 from lidarspec.frames.schema import Schema, counting_field, make_schema
 from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.syntax import WireNaN, get_member
@@ -89,7 +90,7 @@ class _Encoder:
         self._schema = make_schema(layouts.root)
         #: The paths of the fields with checksums, which need not be given.
         self._checksums = set[str]()
-        #: The total size of parts in bytes, by the path of this size in formulas.
+        #: The sizes of texts and the total sizes of parts in bytes, by their paths in formulas.
         self._totals: dict[str, int] = {}
         #: The raw values of each field, element by element.
         self._columns: dict[str, list[Any]] = {}
@@ -104,6 +105,7 @@ class _Encoder:
                 continue  # the header decides whether the frame has the array
             parts[axis] = self._encode_parts(node)
             self._totals[node.total.path] = sum(map(len, parts[axis]))
+        self._measure_texts()
         layout = self._layout()
         for seal in layout.seals:
             for leaf in seal.leaves:
@@ -126,6 +128,27 @@ class _Encoder:
         self._check(layout, row, parts)
         return row.tobytes()
 
+    def _measure_texts(self) -> None:
+        """Find the sizes of the given texts that a mark ends.
+
+        Raises:
+            UsageError: if a text contains its own mark.
+        """
+        for path, ending in self._schema.endings.items():
+            info = self._schema.fields[path]
+            value = get_member(self._given, path, None)
+            if value is not None and info.adapter is not None:
+                shown = self._make_shown_path(path)
+                value = self._encode_adapted(info.adapter, shown, value, 0)
+            if not isinstance(value, bytes | bytearray | memoryview):
+                continue  # the header decides whether the frame has the text
+            data = bytes(value)
+            if ending.find(data + ending.terminator) != len(data):
+                raise self._make_value_error(
+                    self._make_shown_path(path), f"bytes without {ending.mark.hex(' ')}", value
+                )
+            self._totals[ending.size.path] = len(data)
+
     def _layout(self) -> Layout:
         """Return the layout that the values of the header fields select."""
         try:
@@ -136,11 +159,11 @@ class _Encoder:
                 f" longer than {self._layouts.limit} bytes with these values"
             ) from None
 
-    def _read_header(self, leaf: Leaf | PartsSize) -> int:
+    def _read_header(self, leaf: Leaf | MeasuredSize) -> int:
         """Return the value of a field that the layout depends on."""
         path = leaf.info.path
-        if path in self._totals:
-            return self._totals[path]
+        if isinstance(leaf, MeasuredSize) and path not in self._totals:
+            raise self._make_missing_error(path.removesuffix(".size"))
         value = self.read(path)
         if value is None:
             raise self._missing_count_error(path)
@@ -150,6 +173,8 @@ class _Encoder:
         """Return the value of a field for a formula (see `lidarspec.spec.tree.Read`)."""
         if path.startswith("_."):
             return self._around[path[2:]]
+        if path in self._totals:
+            return self._totals[path]
         value: Any = self._given
         names = ""
         for step in split_path(path):

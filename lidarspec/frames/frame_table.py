@@ -208,8 +208,13 @@ class CompiledTable:
         elements.store(column, elements.table.raw(path[len(axis) + 1 :]))
         return column
 
-    def _present_of_elements(self, axis: str, path: str) -> NDArray[np.bool_] | None:
-        """Return which frames, or which elements, have a field of an array."""
+    def _present_of_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
+        """Return which frames have a field in an array of elements that differ in size.
+
+        The result is (n,) if the field is in all elements or in none of each frame: a frame whose
+        elements all lack it has none, and a frame with an empty array has it. Otherwise the result
+        is (n, *lengths), for each element.
+        """
         base, indices = without_indices(path)
         if indices:
             return _present_element(self, base, indices)
@@ -217,7 +222,6 @@ class CompiledTable:
         there = elements.table.present(path[len(axis) + 1 :])
         if there is None:
             there = np.ones(len(elements.table), np.bool_)
-        # A frame whose elements all lack the field lacks it itself, and an empty array has it.
         has_array = np.zeros(len(self), np.bool_)
         for group in self.groups:
             has_array[group.where] = axis in group.layout.regions

@@ -28,21 +28,22 @@ from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import group_by_value
 from lidarspec.frames.compilability import NotCompilableError, check_compilable
 from lidarspec.frames.layout import Condition, Derivation, Layout, LayoutRefusal, Leaf, Seal
+from lidarspec.frames.measured_size import MeasuredSize, TextSize
 from lidarspec.frames.parts import CONSTANT, FAILED, PartKind, PartRule, PartsSize, Region
-from lidarspec.frames.schema import PathMapping, without_indices
+from lidarspec.frames.schema import PathMapping, make_schema, without_indices
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 
 
 class UnknownSelectorError(Exception):
-    """The layout depends on a field, or the size of parts, that is not known yet.
+    """The layout depends on a field, or a size, that is not known yet.
 
     Attributes:
-        leaf: the position of the field or of the parts.
+        leaf: the field or the size.
     """
 
-    def __init__(self, leaf: Leaf | PartsSize) -> None:
+    def __init__(self, leaf: Leaf | MeasuredSize) -> None:
         self.leaf = leaf
         super().__init__(leaf.info.path)
 
@@ -117,11 +118,11 @@ def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     return walk.constants
 
 
-def _raise_unknown(leaf: Leaf | PartsSize, _: HeaderWalk) -> int:
+def _raise_unknown(leaf: Leaf | MeasuredSize, _: HeaderWalk) -> int:
     raise UnknownSelectorError(leaf)
 
 
-ValueRequest = Callable[[Leaf | PartsSize, "HeaderWalk"], int]
+ValueRequest = Callable[[Leaf | MeasuredSize, "HeaderWalk"], int]
 
 
 @dataclass
@@ -155,7 +156,7 @@ class HeaderWalk:
     #: The number of elements without bytes in all arrays.
     empty: int = 0
     #: The fields before the cursor, for formulas; None for a field that the frame does not have.
-    parts: dict[str, Leaf | PartsSize | None] = field(default_factory=dict)
+    parts: dict[str, Leaf | MeasuredSize | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """Return the layout that the walk found."""
@@ -193,8 +194,8 @@ class HeaderWalk:
         part = self.parts[path]
         if part is None:
             return None
-        if isinstance(part, PartsSize) and part.region.size is not None:
-            return part.region.size
+        if isinstance(part, MeasuredSize) and part.known is not None:
+            return part.known
         if path not in self.values:
             return self.request(part, self)
         return self.values[path]
@@ -402,6 +403,9 @@ class HeaderWalk:
                 if info.const is not None:
                     self._constant(node.encode(info.const))
             case tree.Blob():
+                if node.ending is not None:
+                    measured = TextSize(node.ending.size, node.ending, self.cursor, self.limit)
+                    self.parts[node.ending.size.path] = measured
                 size = self._count(node.size, path)
                 if node.name:
                     self._add(
@@ -415,6 +419,10 @@ class HeaderWalk:
                         )
                     )
                 self._constant(node.const or b"")
+                if node.ending is not None:
+                    self.cursor += size
+                    size = len(node.ending.terminator)
+                    self._constant(node.ending.terminator)
             case tree.Block():
                 size = node.size
                 self._block(node, path, shape, strides)
@@ -568,7 +576,7 @@ class HeaderNode:
 
     values: Mapping[str, int] = field(default_factory=dict)
     above: HeaderNode | None = None
-    leaf: Leaf | PartsSize | None = None
+    leaf: Leaf | MeasuredSize | None = None
     before: Mapping[str, Leaf] = field(default_factory=dict)
     constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     least: int = 0
@@ -946,7 +954,7 @@ class HeaderTree:
             if node.value_classes is not None:
                 values = node.value_classes.representatives(values)
             if np.count_nonzero(values == values[0]) < len(rows) or (
-                isinstance(leaf, PartsSize) and values[0] < 0
+                isinstance(leaf, MeasuredSize) and values[0] < 0
             ):
                 return None
             node = node.child(values.item(0))
@@ -980,7 +988,7 @@ class HeaderTree:
         """Return the layout of one frame; None if its header is incomplete."""
         return self._find_end(frame, self._root).result
 
-    def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
+    def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
         """Return the layout for these values of header fields.
 
         Args:
@@ -1026,7 +1034,7 @@ class HeaderTree:
             or neither if the frame is longer than the available bytes.
         """
 
-        def read_selector(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
+        def read_selector(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:
             nonlocal node
             node.leaf = leaf
             node.before = dict(walk.leaves)
@@ -1082,9 +1090,9 @@ class HeaderTree:
             if self._prefix.get(offset) != bits
         }
 
-    def _get_value_classes(self, leaf: Leaf | PartsSize) -> _ValueClasses | None:
+    def _get_value_classes(self, leaf: Leaf | MeasuredSize) -> _ValueClasses | None:
         if not isinstance(leaf, Leaf):
-            return None  # the size of parts is only known after a search
+            return None  # the size is only known after a search
         if leaf.info.path not in self._value_classes:
             self._value_classes[leaf.info.path] = _ValueClasses.of(leaf.info, self.root, self.limit)
         return self._value_classes[leaf.info.path]
@@ -1107,6 +1115,11 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
     """Return the layouts of a frame type, or the error if it cannot be compiled."""
     try:
         check_compilable(frame.tree)
+        endings = make_schema(frame.tree).endings
+        if frame.wire is not None and endings:
+            raise NotCompilableError(
+                next(iter(endings)), "bytes up to a terminator, in a frame with a wire form"
+            )
         return HeaderTree(frame.tree, frame.room)
     except NotCompilableError as reason:
         return reason

@@ -251,7 +251,8 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     """Return the values of a frame without verifying it.
 
     Raises:
-        WireError: if the frame is truncated, or if its header leads to no layout.
+        WireError: if the frame is truncated, if its header leads to no layout, or if a value cannot
+            be decoded.
     """
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilableError):
@@ -265,7 +266,10 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     if shortage is not None or examined.layout is None:
         assert shortage is not None
         raise _to_wire_error(sensor, name, data, shortage, decoded.offset)
-    return unpack(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
+    try:
+        return unpack(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
+    except Exception:  # bytes that a function cannot decode, such as an invalid text
+        raise _find_fault(sensor, name, data) from None
 
 
 def _convert_units(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:

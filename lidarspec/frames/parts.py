@@ -30,20 +30,18 @@ from lidarspec.frames.layout import (
     sort_constants,
     view_span,
 )
+from lidarspec.frames.measured_size import CUT_OFF, FOUND, LENGTH, MeasuredSize
 from lidarspec.spec import tree
 
 Offsets = NDArray[np.intp]
 
-#: The status of a frame if all parts were found.
-FOUND = 0
-#: The status of a frame if its bytes end before the end of its last part.
-CUT_OFF = 1
-#: The status of a frame if a part has an invalid length.
-LENGTH = 2
 #: The status of a frame if the constants of a part match no kind of parts.
 CONSTANT = 3
 #: The status of a frame if an expression of a plugin failed.
 FAILED = 4
+
+#: The maximum number of bits of fields that are compared as columns of signed integers.
+MAX_COLUMN_BITS = 63
 
 #: The announced size of a part if no field outside the part declares it.
 ANY = -1
@@ -73,7 +71,7 @@ class LayoutLookup(Protocol):
             Pairs of a layout or refusal and the indices of its candidates.
         """
 
-    def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
+    def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
         """Return the layout for the values of header fields, which `read` returns."""
 
 
@@ -396,7 +394,7 @@ class _PartWalk:
         if kind.node.until is not None:
             is_last = self._evaluate_all(kind, layout, kind.node.until, offsets)
             self._announced[which] = np.where(is_last == 0, ANY, 0)
-            self._status[which[is_last < 0]] = LENGTH
+            self._status[which[is_last < 0]] = FAILED
             return
         if formula is None:
             return
@@ -410,9 +408,11 @@ class _PartWalk:
         """Return the value of a formula in each part; -1 if the formula raises an error."""
         asked = tree.refs(formula)
         is_simple = isinstance(formula, tree.Ref) or (
-            isinstance(formula, tree.Op) and all(map(_is_comparison, tree.parts(formula)))
+            isinstance(formula, tree.Op) and all(map(_fits_columns, tree.parts(formula)))
         )
-        if is_simple and all(ref.path in layout.leaves for ref in asked):
+        if is_simple and all(
+            ref.path in layout.leaves and ref.info.bits <= MAX_COLUMN_BITS for ref in asked
+        ):
             columns = {
                 ref.path: layout.leaves[ref.path].read(self._buffer, offsets)[1].astype(np.int64)
                 for ref in asked
@@ -443,9 +443,14 @@ class _PartWalk:
             return -1
 
 
-def _is_comparison(formula: tree.Formula) -> bool:
-    """Return whether a part of a formula is a field, a number or a comparison."""
-    return not isinstance(formula, tree.Op) or formula.symbol in tree.COMPARISONS
+def _fits_columns(formula: tree.Formula) -> bool:
+    """Return whether columns of 64 bits represent a part of a formula exactly.
+
+    This is so for fields, for numbers, and for comparisons of both.
+    """
+    if isinstance(formula, tree.Op):
+        return formula.symbol in tree.COMPARISONS
+    return not isinstance(formula, int) or abs(formula) < 1 << MAX_COLUMN_BITS
 
 
 def match_constants_at(
@@ -495,14 +500,14 @@ def _is_start_of(data: bytes, word: Word) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class PartsSize:
-    """The total size of the parts of a region, with the methods of a header field.
+class PartsSize(MeasuredSize):
+    """The total size of the parts of a region."""
 
-    The layout of a frame depends on header fields and on this size.
-    """
-
-    info: tree.FieldInfo
     region: Region
+
+    @property
+    def known(self) -> int | None:
+        return self.region.size
 
     def read(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
@@ -522,13 +527,6 @@ class PartsSize:
         values[is_all] = -LENGTH
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]
-
-    def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return the size as `Leaf.read_first` does."""
-        values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
-        if len(values):
-            return int(values[0])
-        return None
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return sizes as `Leaf.load` does.

@@ -1,8 +1,7 @@
 """Parse and build frames that have no layout, with construct, one at a time.
 
-A frame has no layout if the offset of a part is not a formula of header fields. Examples are a part
-after a text with a terminator, and a length that is a Python function with branches. `lidarspec
-show` prints the part and the reason.
+A frame has no layout if the offset of a part cannot be computed. An example is a part after a
+length that is a Python function with branches. `lidarspec show` prints the part and the reason.
 """
 
 from __future__ import annotations
@@ -12,10 +11,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import construct
+from construct import Container, EnumIntegerString
 
 from lidarspec.errors import MissingField, SpecError, UsageError, WireError, struct_error
 from lidarspec.frames.diagnose import TRAILING
-from lidarspec.frames.schema import make_schema, without_indices
+from lidarspec.frames.schema import Schema, make_schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
@@ -50,10 +50,11 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     """
     sizes: dict[str, int] = {}
     data = b""
+    named = _add_code_names(values, "", make_schema(frame.tree))
     try:
         for _ in range(MAX_BUILDS):
             known = dict(sizes)
-            data = bytes(frame.prepared.build(values, _sizes=sizes))
+            data = bytes(frame.prepared.build(named, _sizes=sizes))
             if sizes == known:
                 break
     except MismatchError as fault:
@@ -71,6 +72,24 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     except Exception as fault:
         raise struct_error(fault, path=place) from fault
     return data
+
+
+def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
+    """Return values with each code of an Enum as construct has it: a string with a number.
+
+    `Const` and `Switch` of a struct that construct builds compare the names of codes.
+    """
+    if isinstance(value, Mapping):
+        return Container(
+            (name, _add_code_names(member, f"{path}.{name}" if path else name, schema))
+            for name, member in value.items()
+        )
+    if isinstance(value, list):
+        return [_add_code_names(element, path, schema) for element in value]
+    info = schema.all_fields.get(path)
+    if info is None or type(value) is not int or value not in info.labels:
+        return value
+    return EnumIntegerString.new(value, info.labels[value])
 
 
 def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:

@@ -16,6 +16,7 @@ from lidarspec.spec.tree import (
     Blob,
     Block,
     Derived,
+    Ending,
     FieldInfo,
     Formula,
     Node,
@@ -119,6 +120,8 @@ class Schema:
     derived: Mapping[str, FieldInfo] = field(default_factory=dict)
     #: The arrays whose length has different formulas in different branches.
     branched: frozenset[str] = frozenset()
+    #: The marks that end bytes of variable size, by the path of the bytes.
+    endings: Mapping[str, Ending] = field(default_factory=dict)
 
     @cached_property
     def columns(self) -> Mapping[str, FieldInfo]:
@@ -159,6 +162,11 @@ class Schema:
             key=len,
             default=(),
         )
+
+    @property
+    def has_measured_sizes(self) -> bool:
+        """Whether the layout depends on sizes that only the content determines."""
+        return bool(self.parts or self.endings)
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
@@ -292,6 +300,11 @@ def make_schema(root: Node) -> Schema:
         _add_struct_docs(inside, structs),
         derived,
         _find_branched(root),
+        {
+            node.info.path: node.ending
+            for node in nodes(root)
+            if isinstance(node, Blob) and node.ending is not None
+        },
     )
 
 

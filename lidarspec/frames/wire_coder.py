@@ -21,7 +21,7 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
-from lidarspec.frames.parts import PartsSize
+from lidarspec.frames.measured_size import MeasuredSize
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import (
     Decoded,
@@ -105,7 +105,7 @@ class _FieldFinder:
 
     def __call__(self, struct: bytes) -> Sequence[Run]:
         self._node = self._tree.header(struct, since=self._node)
-        if isinstance(self._node.leaf, PartsSize):
+        if isinstance(self._node.leaf, MeasuredSize):
             raise SpecError(
                 "frames of text cannot contain parts",
                 path=self._node.leaf.info.path,

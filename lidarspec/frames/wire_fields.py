@@ -16,7 +16,8 @@ import numpy as np
 
 from lidarspec.frames.layout import Layout, Leaf, Seal
 from lidarspec.frames.layout_tree import HeaderWalk, UnknownSelectorError, walk_layout
-from lidarspec.frames.parts import FOUND, PartKind, PartsSize, Region
+from lidarspec.frames.measured_size import FOUND, MeasuredSize
+from lidarspec.frames.parts import PartKind, Region
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 
@@ -194,7 +195,7 @@ def examine(
         is_bounded: for a part, whether the frame has bytes after its parts.
     """
 
-    def read(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
+    def read(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:
         value = leaf.read_first(data)
         if value is None:
             raise UnknownSelectorError(leaf)
@@ -344,7 +345,15 @@ class _Cursor:
         elif path not in self._known.leaves:
             self._is_over = True
         else:
-            yield self._value(node.info, shown, self._known.leaves[path].size, bytes)
+            size = self._known.leaves[path].size
+            terminator = b"" if node.ending is None else node.ending.terminator
+            # The terminator is shown with the bytes that it ends.
+            yield self._value(
+                node.info,
+                shown,
+                size + len(terminator),
+                lambda data: _decode_bytes(node.info, data[:size]),
+            )
 
     def _block(self, node: tree.Block, shown: str) -> Iterator[WireField]:
         start = self._examined.start + self._offset
@@ -374,6 +383,16 @@ class _Cursor:
             return None
         data = self._data[self._offset : end]
         self._offset = end
+        return data
+
+
+def _decode_bytes(info: tree.FieldInfo, data: bytes) -> Any:
+    """Return the value of bytes, or the bytes if a function of the field cannot decode them."""
+    if info.adapter is None:
+        return data
+    try:
+        return info.adapter.decode(data)
+    except Exception:  # a function of a plugin may raise anything
         return data
 
 

@@ -111,6 +111,8 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
     match node:
         case tree.Number() | tree.Block():
             return SizeFormula(node.size)
+        case tree.Blob() if node.ending is not None:
+            return _format_length(None, shown)
         case tree.Blob() | tree.Opaque():
             return _format_length(node.size, shown)
         case tree.Struct():
@@ -272,8 +274,12 @@ def _describe_type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
             return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
         case tree.Opaque():
             return node.form or node.kind
-    adapter = node.info.adapter
-    return "bytes" if adapter is None else adapter.form
+    form = "bytes" if node.info.adapter is None else node.info.adapter.form
+    if node.ending is not None and not node.ending.mark:
+        return f"{form} to the end of the datagram"
+    if node.ending is not None and node.ending.terminator:
+        return f"{form} up to {str(node.ending.terminator)[1:]}"
+    return form
 
 
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:

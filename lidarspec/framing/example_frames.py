@@ -30,7 +30,7 @@ from lidarspec.frames.build import build
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
-from lidarspec.frames.parts import PartsSize
+from lidarspec.frames.measured_size import MeasuredSize
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_codec import Codec
@@ -88,7 +88,7 @@ def random_frame(
             hardly ever valid if they are random.
     """
     engine = get_codec(sensor.frames[frame])
-    if not engine.is_compiled or engine.schema.parts:
+    if not engine.is_compiled or engine.schema.has_measured_sizes:
         return make_of_values(sensor, frame, source, drawn)
     _, row = random_row(sensor, frame, source, drawn)
     data = frame_coder(engine.frame).encode(row.tobytes())
@@ -158,9 +158,9 @@ def _draw_header(
         try:
             return find_layout(frame.tree, values, frame.room), values
         except UnknownSelectorError as unknown:
-            if isinstance(unknown.leaf, PartsSize):
+            if isinstance(unknown.leaf, MeasuredSize):
                 raise SpecError(
-                    "a header is not enough for an example: the layout depends on the parts",
+                    "a header is not enough for an example: the layout depends on the content",
                     path=unknown.leaf.info.path,
                 ) from None
             own = drawn.get(unknown.leaf.info.path)

@@ -19,7 +19,7 @@ from lidarspec.frames.arrays import broadcast_value, count_up, repeat
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout, LayoutRefusal, Sums, gather_rows
-from lidarspec.frames.layout_tree import frame_layouts
+from lidarspec.frames.layout_tree import Group, frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.plain_frames import PlainCodec
@@ -68,11 +68,13 @@ class CompiledCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        groups = (
+        groups: list[Group] = (
             [(self.layout, count_up(len(offsets)))]
             if self.layout is not None
             else self.tree.classify(buffer, offsets, stops)
         )
+        if self.frame.endless is not None:
+            groups = self._refuse_longer_datagrams(groups, offsets, stops)
         kinds = repeat(kind, len(offsets))
         errors = list[PluginError]()
         if (
@@ -138,6 +140,23 @@ class CompiledCodec(Codec):
             status=status,
             errors=tuple(errors),
         )
+
+    def _refuse_longer_datagrams(
+        self,
+        groups: list[Group],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp] | None,
+    ) -> list[Group]:
+        """Refuse candidates of a frame that extends to the end of a datagram, if they are too long.
+
+        A stream has no such frame.
+        """
+        is_fitting = np.zeros(len(offsets), np.bool_)
+        if stops is not None:
+            is_fitting = stops - offsets <= self.frame.room
+        kept = [(layout, which[is_fitting[which]]) for layout, which in groups]
+        refused = (LayoutRefusal(), np.flatnonzero(~is_fitting))
+        return [group for group in (*kept, refused) if len(group[1])]
 
     def _check_together(
         self,
@@ -254,7 +273,7 @@ class CompiledCodec(Codec):
         known = (
             frames.by_layout()
             if frames.layouts
-            else self.tree.classify(frames.buffer, frames.starts)
+            else self.tree.classify(frames.buffer, frames.starts, self._find_stops(frames))
         )
         groups = []
         for layout, which in known:
@@ -273,6 +292,12 @@ class CompiledCodec(Codec):
                 )
             )
         return CompiledTable(self.schema, groups)
+
+    def _find_stops(self, frames: Frames) -> NDArray[np.intp] | None:
+        """Return the ends of frames, if their layout depends on them."""
+        if self.frame.endless is None:
+            return None
+        return np.asarray(frames.starts + frames.sizes)
 
 
 def _check_incomplete(

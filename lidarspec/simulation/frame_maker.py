@@ -100,6 +100,11 @@ class FrameMaker:
             for axis, paths in formulas.items()
             if paths and paths[0] in self.schema.fields
         }
+        self._decoded = {
+            path: info
+            for path, info in self.schema.fields.items()
+            if info.adapter is not None and info.kind == "bytes"
+        }
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._layout_fields: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
@@ -114,6 +119,8 @@ class FrameMaker:
             SpecError: if a value is given for a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
+        if self._decoded or self.schema.endings:
+            frames = [self._with_texts(values) for values in frames]
         counted = [self._with_counts(values) for values in frames] if self._counts else frames
         if self.schema.parts:
             filled = [self._with_parts(values) for values in counted]
@@ -155,6 +162,29 @@ class FrameMaker:
             frames.append(data)
         return frames
 
+    def _with_texts(self, values: Values) -> Values:
+        """Return the values of a frame, with texts as bytes, and the sizes that their ends give."""
+        result = dict(values)
+        for path, info in self._decoded.items():
+            value = result.get(path)
+            if value is None or isinstance(value, bytes):
+                continue
+            assert info.adapter is not None
+            try:
+                result[path] = info.adapter.encode(value, info.bits // 8)
+            except Exception as error:  # a function of the plugin may raise anything
+                raise SpecError(
+                    f"sweep returns {value!r}, which cannot be encoded:"
+                    f" {type(error).__name__}: {error}",
+                    path=path,
+                    sensor=self._sensor,
+                ) from error
+        for path, ending in self.schema.endings.items():
+            # A missing text is empty, and a missing number is 0, which has one byte.
+            missing = b"\0" if ending.is_content else b""
+            result[ending.size.path] = len(result.get(path, missing))
+        return result
+
     def _with_counts(self, values: Values) -> Values:
         """Return the values of a frame, with the counts of its arrays if they are missing."""
         missing = [
@@ -181,7 +211,7 @@ class FrameMaker:
             around = {ref.path: self._raw(result, ref.path) for ref in node.outer}
             makers = [self._maker(kind, around) for kind in kinds]
             sizes = [
-                maker._layout(maker._with_parts(part)[0]).size
+                maker._layout(maker._with_parts(maker._with_texts(part))[0]).size
                 for maker, part in zip(makers, parts, strict=True)
             ]
             for kind, maker, part, after in zip(
@@ -261,6 +291,7 @@ class FrameMaker:
     ) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)
         totals = {node.total.path for node in self.schema.parts.values()}
+        totals |= {ending.size.path for ending in self.schema.endings.values()}
         for path in dict.fromkeys(
             path for values, _ in frames for path in values if path not in totals
         ):
@@ -289,7 +320,7 @@ class FrameMaker:
     def _raw(self, values: Values, path: str) -> int:
         info = self.schema.fields.get(path)
         if info is None:
-            return int(values[path])  # the total size of parts
+            return int(values[path])  # the size of a text, or the total size of parts
         base, indices = without_indices(path)
         if isinstance(values.get(base), str):
             return int(find_code(info, values[base]))

@@ -44,20 +44,21 @@ class Port(Range):
 
 @dataclass(frozen=True, init=False)
 class Choice(Range):
-    """A number with names, for a field that serves several commands.
+    """One of several numbers with names, for a field that serves several commands.
 
-    An example is ``("number", Choice(cartesian=0, spherical=1))``. A field of one command has
-    construct's `Enum` instead.
+    An example is ``("number", Choice(cartesian=0, spherical=1))``. The argument is a name, or its
+    number. A field of one command has construct's `Enum` instead.
 
     Raises:
-        SpecError: without names, or if a value is not an integer.
+        SpecError: without names, or if the values are not different integers.
     """
 
     names: Mapping[str, int] = field(hash=False)
 
     def __init__(self, **names: int) -> None:
-        if not names or not all(isinstance(value, int) for value in names.values()):
-            raise SpecError("Choice(name=number) requires at least one name, and integers")
+        is_valid = all(type(value) is int for value in names.values())
+        if not names or not is_valid or len(set(names.values())) < len(names):
+            raise SpecError("Choice(name=number) requires names, and a different integer for each")
         object.__setattr__(self, "low", min(names.values()))
         object.__setattr__(self, "high", max(names.values()))
         object.__setattr__(self, "names", names)

@@ -586,17 +586,59 @@ class Number:
         return int(value).to_bytes(self.size, self.order, signed=self.kind == "int")
 
 
+@dataclass(frozen=True)
+class Ending:
+    """The end of bytes of variable size: a terminator, the last byte of a number, or the datagram.
+
+    Attributes:
+        size: the number of bytes before the end as a field, for formulas.
+        mark: the bytes of the mark, which is searched in steps of its size; b"" if the bytes end
+            with the datagram.
+        mask: the bits of each byte that are compared with the mark.
+        is_content: whether the mark belongs to the content, as in a number of variable size.
+    """
+
+    size: FieldInfo
+    mark: bytes
+    mask: bytes
+    is_content: bool = False
+
+    @property
+    def terminator(self) -> bytes:
+        """The bytes after the content; b"" if the mark belongs to the content."""
+        return b"" if self.is_content else self.mark
+
+    def find(self, data: bytes) -> int:
+        """Return the number of bytes of the content at the start of `data`; -1 without an end."""
+        step = len(self.mark)
+        if not step:
+            return len(data)
+        if step == 1 and self.terminator and self.mask == b"\xff":
+            return data.find(self.mark)
+        for start in range(0, len(data) - step + 1, step):
+            unit = data[start : start + step]
+            if bytes(byte & bits for byte, bits in zip(unit, self.mask, strict=True)) == self.mark:
+                return start + step * self.is_content
+        return -1
+
+
 @dataclass(frozen=True, eq=False)
 class Blob:
     """Plain bytes, which may be constant.
 
-    `const` is None if any bytes are allowed. Only constant bytes may have no name.
+    Only constant bytes may have no name.
+
+    Attributes:
+        size: the number of bytes, without the terminator.
+        const: the bytes; None if any bytes are allowed.
+        ending: the mark that ends the bytes; None if a formula gives their number.
     """
 
     name: str
     info: FieldInfo
     size: Formula
     const: bytes | None = None
+    ending: Ending | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -867,8 +909,6 @@ class Opaque:
         size: the size in bytes; None if it depends on the content.
         form: how the value is stored, as text to display.
         in_bits: whether the part is a bit block.
-        terminator: the byte that ends the part, if it has arbitrary bytes up to a terminator; else
-            b"".
     """
 
     name: str
@@ -879,7 +919,6 @@ class Opaque:
     size: Formula | None = None
     form: str = ""
     in_bits: bool = False
-    terminator: bytes = b""
 
 
 Node = (
@@ -951,6 +990,8 @@ def size(node: Node) -> Formula | None:
     Returns None if only construct can determine it.
     """
     match node:
+        case Blob() if node.ending is not None:
+            return combine("+", node.size, len(node.ending.terminator))
         case Number() | Block() | Blob() | Opaque():
             return node.size
         case Repeat():

@@ -280,7 +280,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
     """
     engine = get_codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
-    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
+    if not isinstance(engine, CompiledCodec) or engine.schema.has_measured_sizes:
         return
     counts = [
         path

@@ -149,7 +149,7 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """Return the paths of the fields of a frame that store a checksum."""
     engine = get_codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
-    if layout is None or engine.schema.parts:
+    if layout is None or engine.schema.has_measured_sizes:
         return {
             path
             for node in nodes(sensor.frames[name].tree)

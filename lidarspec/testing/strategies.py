@@ -101,7 +101,7 @@ def frames(sensor: str | Sensor, frame: str, fields: Fields | None = None) -> Se
     if frame not in resolved.frames:
         raise UnknownFrame(frame, resolved.frames, place=resolved.id)
     engine = get_codec(resolved.frames[frame])
-    if engine.is_compiled and not engine.schema.parts:
+    if engine.is_compiled and not engine.schema.has_measured_sizes:
         return _compiled_frames(resolved, frame, dict(fields or {}))
     return _plain_frames(resolved, frame, dict(fields or {}))
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from construct import Const, CString, Struct
+from construct import Const, Int8ul, RepeatUntil, Struct, obj_
 
 from lidarspec.spec import Frame, hookimpl
 from tests.broken.sound import sensor
 
-ACK = Struct("header" / Const(b"\x17\x71\x44\x99"), "name" / CString("ascii"))
+ACK = Struct("header" / Const(b"\x17\x71\x44\x99"), "name" / RepeatUntil(obj_ == 0, Int8ul))
 
 
 @hookimpl

@@ -167,6 +167,59 @@ def test_fields_become_parquet(recording: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(table[name].to_numpy(), packets[name])
 
 
+LOGGER = """
+from construct import Const, CString, Int8ub, PaddedString, Struct, VarInt
+from lidarspec.spec import Frame, Sensor, Serial, Simulation, hookimpl
+
+REPORT = Struct(
+    "head" / Const(b"\\xc5\\x02\\x03"),
+    "unit" / PaddedString(6, "ascii"),
+    "note" / CString("ascii"),
+    "number" / VarInt,
+)
+
+
+def sweep(i):
+    return {"unit": "A1", "note": "x" * (i % 5), "number": 100 * i}
+
+
+LOGGER = Sensor(
+    "acme-logger",
+    vendor="Acme",
+    model="Logger",
+    frames={"report": Frame(REPORT, max_length=60, simulation=Simulation(sweep, rate=10))},
+    links={"data": Serial(9600)},
+    status="manual",
+    source="invented for the tests",
+)
+
+
+@hookimpl
+def lidarspec_sensors():
+    return [LOGGER]
+"""
+
+
+def test_texts_are_values_in_every_verb(tmp_path: Path) -> None:
+    plugin, data, table = (tmp_path / name for name in ("logger.py", "made.bin", "made.csv"))
+    plugin.write_text(LOGGER, encoding="utf-8")
+    ran("sim", plugin, "--to", data, "-t", "0.25s")
+    ran("convert", data, table, "-s", plugin, "-f", "report")
+    assert table.read_text(encoding="utf-8").splitlines() == [
+        "time_ns,unit,note,number",
+        "0,A1,,0",
+        "0,A1,x,100",
+        "0,A1,xx,200",
+    ]
+    lines = ran("read", data, "-s", plugin, "-f", "report", "--json").stdout.splitlines()
+    assert [json.loads(line)["note"] for line in lines] == ["", "x", "xx"]
+    assert " xx " in ran("read", data, "-s", plugin, "-f", "report").stdout.splitlines()[-1]
+    explained = ran("explain", data.read_bytes()[-14:].hex(), "-s", plugin).stdout
+    assert "note    'xx'" in explained
+    assert "number  200" in explained
+    assert "acme-logger: clean" in ran("check", plugin, "--max-examples", "5").stdout
+
+
 TAGS = RECEIVER.with_name("tags.py")
 
 

@@ -69,7 +69,7 @@ class Drawn:
         source: the random generator.
         size: the maximum size.
         levels: the known fields of each enclosing struct, outermost first.
-        interpreted: whether to include parts that only construct can read.
+        interpreted: whether to include texts, of which construct alone can read some.
         adapted: whether to include parts that construct decodes, or reads several fields for.
     """
 
@@ -190,7 +190,11 @@ class Drawn:
 
     def text(self, depth: int) -> str:
         return self.source.choice(
-            ("NullTerminated(GreedyBytes)", "NullTerminated(GreedyBytes, term=b'\\x07')")
+            (
+                "NullTerminated(GreedyBytes)",
+                "NullTerminated(GreedyBytes, term=b'\\x07')",
+                "Array(2, NullTerminated(GreedyBytes))",
+            )
         )
 
     def draw_computed(self, depth: int) -> str:
@@ -317,7 +321,7 @@ def spec(number: int, *, interpreted: bool = False, adapted: bool = False) -> st
     """Return the text of the spec with this number.
 
     Args:
-        interpreted: whether it may contain parts that only construct can read.
+        interpreted: whether it may contain texts, of which construct alone can read some.
         adapted: whether it may contain ProcessXor and FocusedSeq.
     """
     source = Random(f"spec {number} {interpreted}" + " adapted" * adapted)

@@ -165,9 +165,10 @@ def leaf_count(parsed: object) -> int:
 def test_points_are_those_of_the_cloud(name: str) -> None:
     sensor = load_sensor(name)
     frame = sensor.data_frame
-    found = explain_example(name, frame)
-    if not any(row.points for row in found.rows):  # the count of a random frame may be 0
-        found = explain_example(name, frame, seed=1)
+    for seed in range(4):  # the count of a random frame may be 0
+        found = explain_example(name, frame, seed=seed)
+        if any(row.points for row in found.rows):
+            break
     # a point is listed at several rows if its range and its intensity stand in arrays of their own
     points = list({id(point): point for row in found.rows for point in row.points}.values())
     if sensor.frames[frame].after or not points:

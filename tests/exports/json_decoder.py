@@ -81,7 +81,21 @@ class Decoder:
         return value
 
     def read_bytes(self, part: dict[str, Any]) -> bytes:
-        return self.taken(self.value(part["bytes"]))
+        ending = part.get("ending")
+        if ending is None:
+            return self.taken(self.value(part["bytes"]))
+        mark, mask = bytes.fromhex(ending["mark"]), bytes.fromhex(ending["mask"])
+        found = b""
+        if not mark:
+            return self.taken(len(self.data) - self.at)
+        while True:
+            unit = self.taken(len(mark))
+            is_mark = bytes(byte & bits for byte, bits in zip(unit, mask, strict=True)) == mark
+            if not is_mark or ending["is_content"]:
+                found += unit
+            if is_mark:
+                self.known[part["bytes"]["field"]] = len(found)
+                return found
 
     def read_block(self, part: dict[str, Any]) -> Any:
         block = self.taken(part["bytes"])

@@ -104,6 +104,8 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
     value = read
     while hasattr(value, "value"):  # of an array, and then of one of its alternatives
         value = value.value
+    if isinstance(parsed, str):
+        parsed = parsed.encode()
     parsed = number(parsed)
     value = None if parsed is None and value == b"" else value  # a check
     same = parsed == value or (parsed != parsed and value != value)

@@ -44,6 +44,7 @@ _PARTS = "C does not support parts with an offset that depends"
 #: the shapes that C cannot say, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
+    "shape-names": "bytes whose end is found by their content",
     "shape-segments": f"segments: {_PARTS}",
     "shape-tags": f"tags: {_PARTS}",
     "shape-channels": f"channels: {_PARTS}",

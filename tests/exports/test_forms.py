@@ -100,6 +100,8 @@ def same(one: Any, other: Any) -> bool:
         )
     if isinstance(other, list):
         return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(other, str):
+        return one == other.encode()
     other = number(other)
     return one == other or (one != one and other != other)
 

@@ -13,13 +13,16 @@ from construct import (
     Bytes,
     BytesInteger,
     Const,
+    CString,
     Float16b,
     If,
     IfThenElse,
     Int8ul,
     Int16ul,
     Int24sb,
+    RepeatUntil,
     Struct,
+    obj_,
     this,
 )
 
@@ -31,7 +34,6 @@ from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Every, Frame, Polar, Serial
 from tests.exports import kaitai, trees
 from tests.exports.trees import (
-    NULL_TERMINATED,
     distinct_sensors,
     find_recoded,
     list_byte_frames,
@@ -49,7 +51,6 @@ REFUSED = {
 }
 #: the installed sensors that Kaitai cannot say, and why.
 REFUSED_INSTALLED = {
-    **NULL_TERMINATED,
     **dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _CONSTANTS),
 }
 
@@ -90,6 +91,15 @@ ODD = {
         "wide" / BytesInteger(5, swapped=True),
         "many" / Array(2, Int24sb),
         "plain" / Array(2, BytesInteger(3)),
+    ),
+    "parts_up_to_a_value": (
+        "Key" / Int8ul,
+        "parts"
+        / RepeatUntil(
+            (obj_.Last == this._.Key % 2) | (obj_.Last > 99),
+            Struct("Last" / Int8ul, "name" / CString("ascii")),
+        ),
+        "end" / Int8ul,
     ),
     "parts_of_arrays": (
         "flags" / Array(3, Struct("on_" / Int8ul, "more" / If(this.on_ > 100, Bytes(2)))),

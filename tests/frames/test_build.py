@@ -6,11 +6,13 @@ import re
 from typing import Any
 
 import pytest
-from construct import Array, Bytes, Int8ul, Int32ub, Struct, this
+from construct import Array, Bytes, Int8ub, Int8ul, Int32ub, Struct, this
 
 from lidarspec import Sensor, SpecError, UsageError
+from lidarspec.errors import UnknownField
 from lidarspec.spec import Address, Command, Count, Frame, Parts, Text
 from tests.broken import sound
+from tests.engine import against_construct
 
 FIELDS = {
     "key": Bytes(3),
@@ -119,3 +121,20 @@ def test_a_path_replaces_a_field_of_a_nested_struct() -> None:
     assert sensor.build("order", {**parsed, "t": {"u": 0}}, **{"t.w": 1})[7:] == b"\0\0\0\0\1"
     with pytest.raises(UsageError, match=r"t\.nothing"):
         sensor.build("order", parsed, **{"t.nothing": 1})
+
+
+def test_a_path_that_the_frame_does_not_have_is_refused() -> None:
+    ours = against_construct.sensor(
+        Struct(
+            "flags" / Struct("n" / Int8ub, "v" / Int8ub),
+            "numbers" / Array(2, Int8ub),
+            "rows" / Array(2, Struct("x" / Int8ub)),
+        )
+    )
+    value = {"flags": {"n": 1, "v": 2}, "numbers": [3, 4], "rows": [{"x": 5}, {"x": 6}]}
+    assert ours.build("data", value, **{"rows[1].x": 9}) == bytes([1, 2, 3, 4, 5, 9])
+    for path in ("flags.n.q", "numbers.q", "flags v", "flags..n", ""):
+        with pytest.raises(UnknownField):
+            ours.build("data", value, **{path: 7})
+    with pytest.raises(UsageError, match=r"rows\.x does not lead"):
+        ours.build("data", value, **{"rows.x": 7})

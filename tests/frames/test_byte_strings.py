@@ -73,6 +73,7 @@ COUNTED = [
 
 COMPILED: dict[str, Any] = {
     "counted": Array(this.k, Bytes(3)),
+    "terminated": TEXT,
     "fixed": Array(2, Bytes(2)),
     "nested": Array(2, Array(this.k, Bytes(2))),
     "of a length": Array(2, Bytes(this.k)),
@@ -95,7 +96,6 @@ COMPILED: dict[str, Any] = {
 }
 INTERPRETED: dict[str, Any] = {
     "of what is not there": If(lambda found: found.y is None, Int8ub),
-    "terminated": TEXT,
     "terminated ones": Array(this.k, TEXT),
     "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),
     "parts where another case has an array": Switch(
@@ -479,7 +479,7 @@ def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str)
     [
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
         (Transformed(Int16ub, invert, 2, invert, 2), "in `points`"),
-        (FixedSized(8, CString("ascii")), "use Bytes(n)"),
+        (Array(2, CString("ascii")), "use an array of structs"),
         (Computed(lambda found: int(found.k) * 2), "use an expression with this"),
         (
             Array(2, Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub)))),

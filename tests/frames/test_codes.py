@@ -49,7 +49,11 @@ HEAD = (
 FRAMES = {
     "report": Frame(Struct(*HEAD)),
     "text": Frame(
-        Struct("sync" / Const(b"\x5a"), "mode" / MODE, "text" / NullTerminated(GreedyBytes)),
+        Struct(
+            "sync" / Const(b"\x5a"),
+            "mode" / MODE,
+            "text" / Array(1, NullTerminated(GreedyBytes)),
+        ),
         max_length=20,
     ),
     "set": Frame(Struct("sync" / Const(b"\xc3"), "mode" / MODE), direction="out"),
@@ -176,16 +180,21 @@ def test_a_command_has_names_of_its_own_for_a_shared_field() -> None:
     assert sensor.command("set_returns", returns="dual") == b"\xd2\6"
     with pytest.raises(UsageError, match="must be off or on"):
         sensor.command("set_fan", fan="dual")
-    with pytest.raises(UsageError, match=r"7 is outside 4 \.\. 6"):
-        sensor.command("set_returns", returns=7)
+    for wrong in (5, 7, 4.5):
+        with pytest.raises(UsageError, match=r"one of first \(4\), dual \(6\)"):
+            sensor.command("set_returns", returns=wrong)
     assert describe_argument(sensor, "set_fan", "fan") == "off|on"
-    assert describe_argument(sensor, "set_returns", "returns") == "first|dual|4..6"
+    assert describe_argument(sensor, "set_returns", "returns") == "first|dual"
     assert parse_arguments(sensor, "set_fan", ["fan=on"]) == {"fan": "on"}
     exported = json.loads(export(sensor, "json"))["commands"]["set_fan"]["args"]["fan"]
     assert exported["names"] == {"off": 0, "on": 1}
-    for wrong in ({}, {"on": 1.5}):
+    for wrong in ({}, {"on": 1.5}, {"on": True}, {"off": 0, "on": 0}):
         with pytest.raises(SpecError):
             Choice(**wrong)
+    wide = Command("set", args={"fan": ("number", Choice(off=-1, on=300))})
+    beyond = dataclasses.replace(sensor, commands={"set_fan": wide})
+    with pytest.raises(SpecError, match="holds each of its numbers"):
+        beyond.command("set_fan", fan="on")
 
 
 def test_a_reply_must_have_the_code_that_is_named() -> None:

@@ -40,6 +40,7 @@ from construct import (
     Int8ub,
     Int16sb,
     Int16ub,
+    Int64ub,
     Lazy,
     LazyArray,
     LazyBound,
@@ -148,6 +149,29 @@ def case(*members: Construct, frames: str, reason: str = "", is_rest: bool = Fal
 
 
 COMPILED: dict[str, Case] = {
+    "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102"),
+    "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102"),
+    "GreedyBytes": case("n" / Int8ub, "a" / GreedyBytes, frames="616263 61", is_rest=True),
+    "GreedyString": case("a" / GreedyString("utf8"), frames="6162 c3a9", is_rest=True),
+    "CString": case("a" / CString("utf8"), frames="616200 00 c3a900"),
+    "CString of two bytes": case("a" / CString("utf_16_le"), frames="610062000000 0000"),
+    "NullTerminated": case("a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001 0002"),
+    "NullTerminated by two bytes": case(
+        "a" / NullTerminated(GreedyBytes, term=b"\r\n"), "b" / Int8ub, frames="61620d0a01 0d0a02"
+    ),
+    "texts with an end in elements": case(
+        "k" / Int8ub,
+        "r" / Array(this.k, Struct("a" / CString("ascii"), "n" / VarInt)),
+        frames="02620005008202 00",
+    ),
+    "texts one after another": case(
+        "k" / Int8ub,
+        "a" / CString("ascii"),
+        "n" / VarInt,
+        "v" / If(this.k, CString("ascii")),
+        "b" / Int8ub,
+        frames="0162008202630003 0061000501",
+    ),
     "ExprAdapter": case("a" / ExprAdapter(Int8ub, obj_ + 1, obj_ - 1), frames="01 ff"),
     "ExprAdapter to fractions": case(
         "a" / ExprAdapter(Int16ub, lambda raw, _: raw / 10, lambda value, _: round(value * 10)),
@@ -454,13 +478,17 @@ PLAIN: dict[str, Case] = {
         frames="4b014b02",
         reason="a PrefixedArray or FocusedSeq must be a named",
     ),
-    "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
-    "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
-    "CString": case(
-        "a" / CString("utf8"), frames="616200 00 c3a900", reason="a text is not a number"
+    "VarInt in an array": case(
+        "a" / Array(2, VarInt), "b" / Int8ub, frames="8101020c 01020c", reason="by their content"
     ),
-    "NullTerminated": case(
-        "a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001", reason="terminator"
+    "CString in an array": case(
+        "a" / Array(2, CString("utf8")), frames="61620000 00c3a900", reason="by their content"
+    ),
+    "NullTerminated that keeps its end": case(
+        "a" / NullTerminated(GreedyBytes, require=False),
+        "b" / Int8ub,
+        frames="61620001",
+        reason="terminator",
     ),
     "ProcessXor of a text": case(
         "a" / Prefixed(Int8ub, ProcessXor(0x55, GreedyString("ascii"))),
@@ -491,10 +519,6 @@ PLAIN: dict[str, Case] = {
         reason="declare it as Parts(struct, count)",
     ),
     "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
-    "GreedyBytes": case("a" / GreedyBytes, frames="616263 61", reason="rest", is_rest=True),
-    "GreedyString": case(
-        "a" / GreedyString("utf8"), frames="6162 c3a9", reason="text", is_rest=True
-    ),
     "GreedyRange": case(
         "a" / GreedyRange(Int16ub), frames="01020304 0102", reason="rest", is_rest=True
     ),
@@ -618,12 +642,12 @@ def test_build_ignores_derived_values_and_takes_edits() -> None:
 
 
 def test_frames_that_construct_reads_take_edits_of_a_raw_copy() -> None:
-    ours = sensor(Struct("r" / RawCopy(BODY), "text" / CString("ascii")))
+    ours = sensor(Struct("r" / RawCopy(BODY), "text" / Array(1, CString("ascii"))))
     assert not is_compiled(ours.frames["data"])
     found = ours.parse(b"\1\2\3x\0")
     found.r.value.a = 9
     assert ours.build("data", found) == b"\x09\2\3x\0"
-    assert ours.build("data", r=dict(data=b"\7\7\7"), text="x") == b"\7\7\7x\0"
+    assert ours.build("data", r=dict(data=b"\7\7\7"), text=["x"]) == b"\7\7\7x\0"
 
 
 def test_branches_with_different_lengths_of_one_name_are_built_as_parsed() -> None:
@@ -732,3 +756,26 @@ def test_what_is_refused_says_what_to_write(name: str) -> None:
     make, reason = REFUSED[name]
     with pytest.raises(SpecError, match=reason):
         sensor(Struct("a" / make()))
+
+
+def test_the_count_of_an_array_in_a_focused_sequence_may_be_a_part_of_a_number() -> None:
+    count = "n" / Rebuild(Int8ub, len_(this.v))
+    for length, data in ((this.n & 0x7F, b"\x82\1\2"), (lambda c: min(c.n, 5), b"\6\1\2\3\4\5")):
+        ours = sensor(Struct("a" / FocusedSeq("v", count, "v" / Array(length, Int8ub))))
+        assert ours.parse(data).a == list(data[1:])
+
+
+@pytest.mark.parametrize("limit", [5, 2**63, 2**64 - 1])
+def test_the_end_of_an_array_may_be_a_wide_number(limit: int) -> None:
+    element = Struct("id" / Int64ub, "size" / Int8ub, "rest" / Bytes(this.size))
+    ours = sensor(Struct("a" / RepeatUntil(obj_.id >= limit, element)))
+    data = bytes(9) + limit.to_bytes(8, "big") + b"\1x"
+    assert [part.id for part in ours.parse(data).a] == [0, limit]
+    assert len(ours.decode([data])) == 1
+
+
+def test_an_end_that_fails_is_an_error_of_the_plugin() -> None:
+    element = Struct("x" / Int8ub, "y" / Int8ub, "z" / If(this.x, Int8ub))
+    ours = sensor(Struct("a" / RepeatUntil(lambda e, found, c: e.x // e.y == 2, element)))
+    assert len(ours.parse(b"\0\1\4\2\7").a) == 2
+    assert ours.decode([b"\1\0\1"]).stats.plugin_errors == 1

@@ -31,7 +31,7 @@ def layouts() -> list[tuple[str, Layout]]:
     for sensor in SHAPES.values():
         for name, frame in sensor.frames.items():
             engine = get_codec(frame)
-            if isinstance(engine, CompiledCodec) and not engine.schema.parts:
+            if isinstance(engine, CompiledCodec) and not engine.schema.has_measured_sizes:
                 layout, _ = make_random_header(engine, random.Random(f"{sensor.id} {name}"))
                 found.append((f"{sensor.id} {name}", layout))
     return found

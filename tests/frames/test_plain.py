@@ -41,7 +41,7 @@ MARK = 0x5A
 def plain_sensor(*members: Construct, max_length: int = 64) -> Sensor:
     """Return a sensor with these members between a constant and a text."""
     mark = "mark" / Const(MARK, Int8ub)
-    text = "text" / NullTerminated(GreedyBytes)
+    text = "text" / NullTerminated(GreedyBytes, require=False)
     made = sensor(Struct(mark, *members, text), max_length=max_length)
     assert not is_compiled(made.frames["data"])
     return made

@@ -33,6 +33,7 @@ from tests.shapes import (
     middle,
     mirror,
     modes,
+    names,
     nested,
     nibbles,
     numbers,
@@ -99,6 +100,7 @@ _MODULES = (
     paced,
     synced,
     pairs,
+    names,
 )
 
 SHAPES: dict[str, Sensor] = {

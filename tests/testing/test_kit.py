@@ -557,7 +557,8 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
         Struct("mark" / Const(b"RPLY"), "size" / Int8ul, "text" / Bytes(this.size)), max_length=64
     )
     ended = Frame(
-        Struct("mark" / Const(b"RPLY"), "text" / NullTerminated(GreedyBytes)), max_length=64
+        Struct("mark" / Const(b"RPLY"), "text" / Array(1, NullTerminated(GreedyBytes))),
+        max_length=64,
     )
     learning = Command(
         "order", {"code": 9}, reply="page", learns=lambda reply: {"serial": int(reply.text)}

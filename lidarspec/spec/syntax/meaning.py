@@ -38,6 +38,7 @@ from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.syntax.adapters import (
     int_adapter,
+    number_adapter,
     part_adapter,
     text_adapter,
     without_int_adapters,
@@ -652,12 +653,14 @@ class _Builder:
         """
         info = place.info
         is_struct = isinstance(element, tree.Struct | tree.Sealed)
+        if until is not None and not callable(until):
+            return None  # construct reads one element, or elements without an end
         rules = [rule for rule in (count, within, until) if rule is not None]
         if not is_struct or not place.name or info.axes or place.scope is None or len(rules) != 1:
             return None
         try:
             root, rule = self._make_part_frame(
-                con, until and functools.partial(_ask_predicate, until), place
+                con, None if until is None else functools.partial(_ask_predicate, until), place
             )
         except SpecError:  # a length of a part outside of the element
             return None
@@ -800,10 +803,9 @@ class _Builder:
                 name,
                 info,
                 kind,
-                _OPAQUE_REASONS.get(kind, f"{kind} has no fixed offset"),
+                _find_opaque_reason(con),
                 size=size,
                 form=_describe_form(con),
-                terminator=_find_terminator(con),
             )
         if not name and info.const is not None and not isinstance(node, tree.Opaque):
             return tree.Blob("", info, con.length, con.build(info.const))
@@ -817,19 +819,23 @@ class _Builder:
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
             return None
+        ending = _find_ending(con, info, is_bounded=place.room is not None)
         adapter: tree.Adapter | None
-        if isinstance(con, construct.StringEncoded):
+        if ending is not None:
+            size: tree.Formula | None = tree.Ref(ending.size.path, ending.size)
+            adapter = _ended_adapter(con)
+        elif isinstance(con, construct.StringEncoded):
             size = self._text_size(con, place)
             adapter = text_adapter(con)
         else:
-            adapter = part_adapter(con, fills=place.room is not None)
             size = fixed_size(con) or place.room
-        if adapter is None or size is None:
+            adapter = None if size is None else part_adapter(con)
+        if size is None or (adapter is None and ending is None):
             return None
         axes = (*info.axes, axis_path(info))
         bits = 8 * size if isinstance(size, int) else 0
         known = replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=axes)
-        return tree.Blob(place.name, replace(known, adapter=adapter), size)
+        return tree.Blob(place.name, replace(known, adapter=adapter), size, ending=ending)
 
     def _text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
         """Return the size of a text in bytes.
@@ -911,6 +917,7 @@ def _differ_in_layout(element: tree.Node, axis: str) -> bool:
     """Return whether the elements of an array have checksums, or different layouts."""
     return any(
         isinstance(node, tree.Sealed)
+        or (isinstance(node, tree.Blob) and node.ending is not None)
         or any(
             axis in ref.info.axes for formula in tree.formulas(node) for ref in tree.refs(formula)
         )
@@ -936,9 +943,7 @@ def _ask_predicate(predicate: Any, scope: tree.Scope) -> Any:
     """
     if isinstance(predicate, ExprMixin):
         return _trace(predicate, scope)
-    if callable(predicate):
-        return predicate(scope, None, scope.parent)
-    return predicate
+    return predicate(scope, None, scope.parent)
 
 
 def _return_no_offset() -> None:
@@ -1088,15 +1093,12 @@ _OPAQUE_REASONS = {
         " size"
     ),
     "FocusedSeq": (
-        "a PrefixedArray or FocusedSeq must be a named member of a Struct, and must not use"
-        " other fields: Struct('points' / PrefixedArray(...))"
+        "a PrefixedArray or FocusedSeq must be a named member of a Struct, and its parts other than"
+        " the value must have a fixed size and use no fields, except for the count of an array:"
+        " Struct('points' / PrefixedArray(...))"
     ),
     "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",
-    "GreedyBytes": (
-        "GreedyBytes reads the rest of a datagram: declare a length field, and then Bytes with"
-        " this length"
-    ),
     "GreedyRange": (
         "GreedyRange reads the rest of a datagram: use PrefixedArray, or Prefixed with GreedyRange"
     ),
@@ -1184,6 +1186,15 @@ def _is_text(con: Construct) -> bool:
     return con is construct.GreedyBytes
 
 
+def _find_opaque_reason(con: Construct) -> str:
+    """Return the reason why only construct can read a part, or the first reason inside it."""
+    below = con
+    while author_class(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
+        below = below.subcon
+    kind = author_class(below)
+    return _OPAQUE_REASONS.get(kind, f"{author_class(con)} has no fixed offset")
+
+
 def _describe_form(con: Construct) -> str:
     """Return how a field of variable size is stored, as text to display."""
     below = con
@@ -1194,16 +1205,41 @@ def _describe_form(con: Construct) -> str:
     return type(con).__name__
 
 
-def _find_terminator(con: Construct) -> bytes:
-    """Return the terminator after a field of arbitrary bytes; b"" for other fields."""
-    is_ended = (
+def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> tree.Ending | None:
+    """Return the end of a field of variable size; None if its size is known from elsewhere.
+
+    Args:
+        is_bounded: whether the field is in a part of known size.
+    """
+    size = _describe_integer(
+        tree.FieldInfo(f"{info.path}.size", info.axes, docs="bytes before the end of the content")
+    )
+    if con in (construct.VarInt, construct.ZigZag):
+        # The high bit of a byte says that another byte follows.
+        return tree.Ending(size, mark=b"\x00", mask=b"\x80", is_content=True)
+    if isinstance(con, construct.StringEncoded):
+        con = con.subcon
+    if con is construct.GreedyBytes and not is_bounded:
+        return tree.Ending(size, mark=b"", mask=b"")
+    is_plain = (
         isinstance(con, construct.NullTerminated)
         and con.subcon is construct.GreedyBytes
-        and len(con.term) == 1
         and con.consume
         and con.require
+        and not con.include
     )
-    return con.term if is_ended else b""
+    if not is_plain:
+        return None
+    return tree.Ending(size, mark=con.term, mask=b"\xff" * len(con.term))
+
+
+def _ended_adapter(con: Construct) -> tree.Adapter | None:
+    """Return the functions that decode a field that a mark ends; None for plain bytes."""
+    if isinstance(con, construct.StringEncoded):
+        return text_adapter(con)
+    if con in (construct.VarInt, construct.ZigZag):
+        return number_adapter(con)
+    return None
 
 
 def _find_constant(con: Const) -> Any:

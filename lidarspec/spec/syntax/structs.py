@@ -247,8 +247,9 @@ def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | Non
 def _expand_macro(con: Construct) -> list[Construct]:
     """Return the members that replace a prefixed, padded or aligned member.
 
-    They are the member itself, and a field for the length, count or padding that construct hides.
-    All other members are returned unchanged.
+    They are the member itself, and a field for the length, count or padding that construct hides. A
+    ProcessXor of a struct in a part of known size becomes one of each member. All other members are
+    returned unchanged.
     """
     inner = _strip_name(con)
     if not con.name:
@@ -261,8 +262,11 @@ def _expand_macro(con: Construct) -> list[Construct]:
         prefixed = construct.Prefixed(length.lengthfield, text, length.includelength)
         return _expand_prefixed(con, prefixed)
     if isinstance(inner, construct.FixedSized | construct.Prefixed):
-        inner = copy.copy(inner)
-        inner.subcon = _distribute_xor(inner.subcon)
+        distributed = _distribute_xor(inner.subcon)
+        if distributed is not inner.subcon:
+            inner = copy.copy(inner)
+            inner.subcon = distributed
+            con = construct.Renamed(inner, newname=con.name, newdocs=con.docs)
     if isinstance(inner, construct.Prefixed):
         return _expand_prefixed(con, inner)
     if isinstance(inner, construct.FocusedSeq):
@@ -279,7 +283,7 @@ def _expand_macro(con: Construct) -> list[Construct]:
         pattern = inner.pattern if is_padded else b"\0"
         filler = PaddingField(span, to=inner.length, pattern=pattern)
         return [*members, _name_field(con, "_padding", filler, "padding of")]
-    return [construct.Renamed(inner, newname=con.name, newdocs=con.docs)]
+    return [con]
 
 
 def _is_pascal_string(con: Construct) -> bool:
@@ -293,8 +297,8 @@ def _is_pascal_string(con: Construct) -> bool:
 def _distribute_xor(con: Construct) -> Construct:
     """Return a ProcessXor of a struct as a struct with a ProcessXor of each member.
 
-    Any other construct, or a struct with members of unknown size before the last, is returned
-    unchanged.
+    Any other construct, or a struct with members that need other fields or have no fixed size
+    before the last, is returned unchanged.
     """
     if not isinstance(con, construct.ProcessXor) or not isinstance(con.subcon, Struct):
         return con
@@ -390,6 +394,10 @@ def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Constru
     return members
 
 
+#: Numbers of elements for which a count is tried. A mask or a limit changes at least one of them.
+COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
+
+
 def _is_fixed(con: Construct) -> bool:
     """Return whether a part of fixed size depends only on its own bytes."""
     return is_independent(con, _DESCRIBED_KINDS) and fixed_size(con) > 0
@@ -407,10 +415,10 @@ def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: 
     for name, part in parts.items():
         # The functions of a plugin may raise anything.
         with contextlib.suppress(Exception):
-            if (
-                isinstance(part, construct.Rebuild)
-                and part.func(Container({focus: [0] * 3})) == 3
-                and array.count(Container({name: 5})) == 5
+            if isinstance(part, construct.Rebuild) and all(
+                part.func(Container({focus: [0] * length})) == length
+                and array.count(Container({name: length})) == length
+                for length in COUNT_TRIALS
             ):
                 return name
     return None
@@ -566,7 +574,7 @@ def fixed_size(con: Construct) -> int:
 
 
 #: Constructs that depend only on their own bytes.
-INDEPENDENT_KINDS = (
+_INDEPENDENT_KINDS = (
     FormatField,
     BytesInteger,
     Bytes,
@@ -582,9 +590,9 @@ INDEPENDENT_KINDS = (
     type(construct.GreedyBytes),
 )
 
-#: Constructs that depend only on their own bytes, and have an own meaning in a frame tree.
+#: The same, and constructs that a frame tree describes itself, which no function has to decode.
 _DESCRIBED_KINDS = (
-    *INDEPENDENT_KINDS,
+    *_INDEPENDENT_KINDS,
     DescribedField,
     construct.Padded,
     construct.Default,
@@ -596,7 +604,7 @@ _DESCRIBED_KINDS = (
 )
 
 
-def is_independent(con: Construct, kinds: tuple[type, ...] = INDEPENDENT_KINDS) -> bool:
+def is_independent(con: Construct, kinds: tuple[type, ...] = _INDEPENDENT_KINDS) -> bool:
     """Return whether a part depends only on its own bytes.
 
     Args:

@@ -104,7 +104,11 @@ def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
         *(make_line(*item) for item in lines.items()),
         "end" / Const(b"\n"),
     )
-    return Frame(struct, max_length=1000)
+    return Frame(
+        struct,
+        max_length=1000,
+        acknowledged={"LS310": "the check character has only the low six bits of the sum"},
+    )
 
 
 def make_value_lines(name: str, values: Mapping[str, str]) -> bytes:

@@ -1,0 +1,155 @@
+"""Sizes that are not in the header of a frame: they are found by reading the content.
+
+The layout of a frame depends on header fields and on these sizes, so they have the methods of a
+field. The sizes of sequences of parts are in `parts`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.layout import Bytes2D, view_span
+from lidarspec.spec import tree
+
+Offsets = NDArray[np.intp]
+
+#: The status of a frame if its content was found.
+FOUND = 0
+#: The status of a frame if its bytes end before the end of the content.
+CUT_OFF = 1
+#: The status of a frame if the content has an invalid length.
+LENGTH = 2
+
+#: The number of marks for which each frame is searched in the first step. Most texts are shorter.
+#: Each further step searches `WINDOW_GROWTH` times as many.
+FIRST_WINDOW_MARKS = 32
+WINDOW_GROWTH = 8
+#: The maximum number of bytes that are searched in one step, of all frames together.
+MAX_WINDOW_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSize(ABC):
+    """A size that is found by reading the content, with the methods of a header field.
+
+    Attributes:
+        info: the size as a field.
+    """
+
+    info: tree.FieldInfo
+
+    @property
+    def known(self) -> int | None:
+        """The size if the layout already determines it; else None."""
+        return None
+
+    @abstractmethod
+    def read(
+        self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
+    ) -> tuple[Offsets | None, NDArray[Any]]:
+        """Return sizes as `Leaf.read` does.
+
+        If the content cannot be valid, the size is the negative status.
+        """
+
+    @abstractmethod
+    def load(self, rows: Bytes2D) -> NDArray[Any]:
+        """Return sizes as `Leaf.load` does.
+
+        If the content is incomplete or invalid, the size is the negative status.
+        """
+
+    def read_first(self, frame: bytes | memoryview) -> int | None:
+        """Return the size as `Leaf.read_first` does."""
+        values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
+        if len(values):
+            return int(values[0])
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class TextSize(MeasuredSize):
+    """The size of bytes that a mark or the end of the datagram ends.
+
+    Attributes:
+        ending: the mark.
+        start: the offset of the bytes in a frame.
+        limit: the maximum size of a frame, in bytes.
+    """
+
+    ending: tree.Ending
+    start: int
+    limit: int
+
+    def read(
+        self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
+    ) -> tuple[Offsets | None, NDArray[Any]]:
+        if stops is None and not self.ending.mark:
+            return None, np.full(len(offsets), -LENGTH)  # a stream has no end of a datagram
+        if stops is None:
+            stops = np.full(len(offsets), len(buffer))
+        ends = np.minimum(stops, offsets + self.limit)
+        values = self._find(buffer, offsets + self.start, ends)
+        is_missing = values < 0
+        if not np.count_nonzero(is_missing):
+            return None, values
+        is_full = is_missing & (stops - offsets >= self.limit)
+        values[is_full] = -LENGTH
+        there = np.flatnonzero(~is_missing | is_full)
+        return there, values[there]
+
+    def read_first(self, frame: bytes | memoryview) -> int | None:
+        if len(frame) < max(self.start, 1):
+            return None
+        size = self.ending.find(bytes(frame[self.start : self.limit]))
+        if size >= 0:
+            return size
+        return -LENGTH if len(frame) >= self.limit else None
+
+    def load(self, rows: Bytes2D) -> NDArray[Any]:
+        offsets = np.arange(len(rows)) * rows.strides[0]
+        values = self._find(view_span(rows), offsets + self.start, offsets + rows.shape[1])
+        values[values < 0] = -CUT_OFF
+        return values
+
+    def _find(self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets) -> NDArray[np.int64]:
+        """Return the number of bytes up to the mark, (n,); -1 without a mark before the end."""
+        step = len(self.ending.mark)
+        if not step:
+            return np.asarray(np.maximum(ends - starts, -1), np.int64)
+        most = MAX_WINDOW_BYTES // (step * FIRST_WINDOW_MARKS)
+        blocks = [slice(first, first + most) for first in range(0, len(starts), most)]
+        found = [self._find_few(buffer, starts[block], ends[block]) for block in blocks]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+    def _find_few(
+        self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
+    ) -> NDArray[np.int64]:
+        """Return the result of `_find` for a few frames, in steps of growing size."""
+        step = len(self.ending.mark)
+        mark = np.frombuffer(self.ending.mark, np.uint8)
+        mask = np.frombuffer(self.ending.mask, np.uint8)
+        sizes = np.full(len(starts), -1, np.int64)
+        active = np.flatnonzero(starts + step <= ends)
+        position = 0
+        marks = FIRST_WINDOW_MARKS
+        while len(active):
+            reach = np.arange(marks * step)
+            offsets = (starts[active] + position)[:, None] + reach
+            units = buffer[np.minimum(offsets, len(buffer) - 1)].reshape(-1, marks, step)
+            last = offsets.reshape(units.shape)[:, :, -1]
+            is_mark = ((units & mask) == mark).all(axis=2) & (last < ends[active][:, None])
+            has_mark = is_mark.any(axis=1)
+            content = is_mark.argmax(axis=1) + self.ending.is_content
+            sizes[active[has_mark]] = position + step * content[has_mark]
+            position += len(reach)
+            active = active[~has_mark]
+            active = active[starts[active] + position + step <= ends[active]]
+            most = MAX_WINDOW_BYTES // (step * max(len(active), 1))
+            marks = max(min(marks * WINDOW_GROWTH, most), FIRST_WINDOW_MARKS)
+        return sizes
