@@ -15,7 +15,7 @@ from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
-from lidarspec.spec.arguments import Address, Range, Text
+from lidarspec.spec.arguments import Address, Choice, Range, Text
 from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.findings import ViolationError, require
@@ -42,6 +42,9 @@ def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
     slot = argument_slot(sensor, name, key)
     kind = sensor.commands[name].arguments[key].kind
     match kind:
+        case Choice(names=names):
+            numbers = sorted(names.values())
+            return numbers[round(share * (len(numbers) - 1))]
         case Range(low, high):
             return low + share * (high - low)
         case Text(size):

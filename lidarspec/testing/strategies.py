@@ -43,7 +43,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.scenes import Box, Room
 from lidarspec.simulation.simulator import make_opening_frame, simulate
-from lidarspec.spec.arguments import Address, Range, Taken, Text
+from lidarspec.spec.arguments import Address, Choice, Range, Taken, Text
 from lidarspec.spec.syntax import check_bound
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.value_ranges import (
@@ -169,6 +169,8 @@ def _command(sensor: Sensor, name: str) -> SearchStrategy[Command]:
 def _argument_values(slot: ArgumentSlot, kind: Taken) -> SearchStrategy[Any]:
     """Return a strategy for an argument of a command."""
     match kind:
+        case Choice(names=names):
+            return st.sampled_from(sorted(names.values()))
         case Range(low, high) if slot.info.kind == "float":
             return st.floats(low, high)
         case Range(low, high):

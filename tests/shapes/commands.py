@@ -8,6 +8,7 @@ from construct import Array, Const, Int8ul, Int16ul, Struct
 from lidarspec import Sensor
 from lidarspec.spec import (
     Checksummed,
+    Choice,
     Command,
     Fields,
     Frame,
@@ -84,6 +85,11 @@ SENSOR = Sensor(
             args={"rate": ("motor.speed", 5.0, 20.0), "trim": ("motor.trim", -10.0, 10.0)},
             reply="ack",
             matches={"code": 3, "result": 0},
+        ),
+        "mode": Command(
+            "order",
+            values={"motor.speed": 0, "motor.trim": 0},
+            args={"mode": ("code", Choice(eco=4, boost=9))},
         ),
         "spin": Command(lines={"dtr": True}),
     },

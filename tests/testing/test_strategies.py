@@ -216,6 +216,11 @@ def test_a_command_can_be_named() -> None:
     assert (found, set(arguments)) == (name, set(sensor.commands[name].args))
 
 
+def test_a_choice_is_one_of_its_numbers() -> None:
+    drawn = draw_examples(commands(commands_shape.SENSOR, "mode"), 20)
+    assert {given["mode"] for _, given in drawn} == {4, 9}
+
+
 def test_the_simplest_scan_is_an_empty_room() -> None:
     sensor = load_sensor("ldrobot-stl27l")
     scan = draw_examples(scans(sensor), 1)[0]  # the first example is the simplest one
