@@ -10,14 +10,14 @@ Modules in reading order:
 * `cloud`: point clouds.
 * `firings`: the returns of each firing, and the choice of one.
 * `mount`: the position of a sensor on its carrier.
-* `colours`: the scale of colours for values, on a dark and on a light ground.
+* `colours`: the scale of colours for values, on a dark and on a light background.
 * `appearance`: the extent and the colours of a drawn cloud.
 * `reference_evaluator`: evaluates `points` with ordinary NumPy; other evaluators must agree.
-* `lookup_tables`: fields of one or two bytes, and tables of all their values.
-* `plan`: `points` traced once for a layout, as expressions of the columns.
+* `lookup_tables`: the value of an expression for every value of a field of one or two bytes.
+* `plan`: traces `points` once for a layout, and plans each column as an expression.
 * `layout_groups`: the packets of one layout in a batch, with their plan.
 * `batch_columns`: the columns of planned points, computed when they are first read.
-* `evaluate`: the points of a batch, by plans if `points` can be traced.
+* `evaluate`: evaluates the points of a batch, by plans if `points` can be traced.
 * `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, names)`.
 * `backends`: chooses between the back ends.
 """

@@ -20,20 +20,21 @@ from lidarspec.points.cloud import PointCloud
 #: `FAR_BEYOND_FACTOR` times as far.
 REACH_PERCENTILE = 99.0
 FAR_BEYOND_FACTOR = 1.5
-#: The maximum number of rings between the middle and an edge.
+#: The maximum number of range rings between the middle and an edge of a picture.
 MAX_RINGS = 4
 #: A cloud is flat if all elevations are below this angle, radians.
 MAX_FLAT_RAD = 1e-3
-#: A reach is rounded up to these numbers, so that most scans are drawn at the same scale.
+#: A reach is rounded up to one of these numbers times a power of ten, so that most scans are drawn
+#: at the same scale.
 ROUND_NUMBERS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-#: This percentile of the intensities has the last colour.
+#: The intensity at this percentile has the last colour.
 RAMP_PERCENTILE = 98.0
 #: The number of colours. It is small, so that noise changes few colours from scan to scan.
 RAMP_STEPS = 20
 #: The share of the points that are inside a fitted picture.
 CENTRAL_SHARE = 0.98
 #: The share of the values at each end of an axis that is ignored to find the extent of most points.
-#: Distant points are then found by their distance in units of this extent.
+#: A point is distant if it is many times this extent away.
 TAIL_SHARE = 0.05
 #: A fitted picture is larger than the extent of its points by this factor.
 MARGIN_FACTOR = 1.08
@@ -220,5 +221,5 @@ def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
 
 
 def _read_column(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
-    """Return the column that colours show, (n,)."""
+    """Return the column that the colours show, (n,)."""
     return np.asarray(cloud.intensity if ramp == "intensity" else cloud.extra[ramp], np.float64)

@@ -11,10 +11,11 @@ from weakref import WeakKeyDictionary
 from lidarspec.points import numpy_plan
 from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction
 
-#: A cached kernel, or a kernel that has to be compiled, saves time from this number of points on.
+#: The number of points from which a kernel saves time: a cached kernel (warm), or a kernel that has
+#: to be compiled first (cold).
 MIN_WARM_KERNEL_POINTS = 1 << 26
 MIN_COLD_KERNEL_POINTS = 1 << 28
-#: A count of points that never reaches these limits, so that kernels are not tried again.
+#: A count of points that never reaches these limits. It is set if no kernel works.
 _NEVER = -(1 << 62)
 
 #: The numbers of points computed so far, by the names of the computed columns.
@@ -43,7 +44,7 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Count the points of these frames, and return a kernel if it saves time.
+    """Add frames to the count of points, and return a kernel if it saves time.
 
     Returns None if a kernel saves no time, or if Numba is missing or fails.
     """

@@ -162,7 +162,7 @@ class BatchColumns(ColumnSource):
         return columns
 
     def _compute_single(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Compute one column; return no column if the sensor does not have it."""
+        """Return one column by its name; an empty dict if the sensor does not have it."""
         if name == "z":  # of a level source; otherwise it is one of the main columns
             return {}
         if name == "time":
@@ -199,7 +199,7 @@ class BatchColumns(ColumnSource):
         return convert_numbers(column, TYPES[name])
 
     def _fill(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return columns that a program or a kernel computes."""
+        """Return columns computed by a program or a kernel."""
         first, last = self._packet_range(start, stop)
         filled = []
         for share in self._shares:
@@ -212,9 +212,10 @@ class BatchColumns(ColumnSource):
         }
 
     def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
-        """Return the first packet with some points, and the packet after the last one.
+        """Return the range of packets that contain the points from `start` to `stop`.
 
-        If the layouts of packets differ, the range is (0, None), which means all packets.
+        The range is the first packet and the packet after the last one. If the batch has several
+        layouts, it is (0, None), which means all packets.
         """
         if not self._is_regular:
             return 0, None
@@ -297,7 +298,9 @@ def scatter_points(
 def _turn_coordinates(
     columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
 ) -> dict[str, NDArray[Any]]:
-    """Return x, y and z in the vendor's axes, which are REP-103 axes or their opposites.
+    """Return x, y and z in the vendor's axes.
+
+    Each of these axes is a REP-103 axis or its opposite.
 
     Args:
         turn: the (3, 3) matrix from REP-103 to the vendor's axes, with entries 0, 1 and -1.

@@ -186,10 +186,10 @@ class PointCloud:
         return self.xyz.astype(dtype, copy=False)
 
     def __getitem__(self, which: Any) -> PointCloud:
-        """Return the points at a mask, indices or a slice.
+        """Return the points selected by a mask, indices or a slice.
 
-        The result is organised only if a slice selects whole columns. An integer gives one point
-        with scalar columns.
+        The result is organised only if a slice selects whole columns. An integer selects one point;
+        its columns are scalars.
         """
         picked = {f.name: _select(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
@@ -202,13 +202,13 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organise(self, columns: int) -> PointCloud:
-        """Return the points sorted into an image with `columns` columns, by `column`.
+        """Return the points sorted into an image by their column numbers.
 
         A missing column is filled with invalid points.
 
         Args:
-            columns: the number of columns of a revolution. The points must not be of more than one
-                revolution.
+            columns: the number of columns of a revolution, and of the image. All points must be
+                from one revolution.
 
         Raises:
             UsageError: if the points have no `column` or are not organised, or if a column number
@@ -265,9 +265,9 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at some indices, as whole columns.
+        """Return the points at some indices, which together are whole columns.
 
-        An index of -1 becomes an invalid point.
+        The point at an index of -1 is invalid.
         """
         indices = indices.reshape(-1)
         column_size = grid_of(self).column
@@ -303,8 +303,8 @@ class PointCloud:
         Columns are not copied, except bools. The metadata of each field has its unit.
 
         Args:
-            facts: further metadata of the schema, added to `units` as JSON, `calibration`
-                ("nominal" or "own") and `stamp_ns`.
+            facts: further metadata of the schema. The schema always contains `units` (as JSON),
+                `calibration` ("nominal" or "own") and `stamp_ns`.
 
         Raises:
             UsageError: if pyarrow is not installed.

@@ -24,8 +24,8 @@ class ColumnSource:
     Attributes:
         size: the number of points.
         base: the time that the column "time" counts from, int64 ns.
-        grid: the organisation of all points together.
-        grids: the organisation of the points of each packet, if packets have several shapes.
+        grid: how all points together are organised; see `Grid`.
+        grids: how the points of each packet are organised, if packets have different shapes.
         nominal: whether a default calibration is used instead of the sensor's own.
         extra: the types and units of the columns in `PointCloud.extra`, by name.
         is_level: whether all points are in the horizontal plane through the sensor.
@@ -52,7 +52,7 @@ class ColumnSource:
         raise NotImplementedError
 
     def grid_between(self, start: int, stop: int) -> Grid:
-        """Return the organisation of the points from `start` to `stop`."""
+        """Return how the points from `start` to `stop` are organised."""
         if self.grids:
             return self.grids.between(start, stop)
         return whole_columns(self.grid, start, stop - start)

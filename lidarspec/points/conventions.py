@@ -45,7 +45,7 @@ _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 #: The largest coordinate that float32 can represent, metres.
 MAX_COORDINATE_M = float(np.finfo(np.float32).max)
 
-#: Subtracting whole turns from angles larger than this loses precision, radians.
+#: The largest angle, radians, from which whole turns can be subtracted without losing precision.
 _MAX_SUBTRACTED_RAD = 1e6
 
 
@@ -238,7 +238,7 @@ class ExtraType(NamedTuple):
 
     @classmethod
     def of(cls, extra: Extra, values: Any) -> ExtraType:
-        """Return the declared type and unit; by default those of the field in the column."""
+        """Return the declared type and unit of a column; by default, those of its field."""
         is_own = isinstance(values, Column) and not values.frame
         if is_own:
             info = values.batch.table.schema.fields.get(values.source)

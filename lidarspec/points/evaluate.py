@@ -47,8 +47,8 @@ def evaluate(
 
     Args:
         carry: the state left by the previous batch.
-        final: whether no packets follow. Values that depend on following packets (`following`) are
-            then nan, and no packet waits.
+        final: whether no packets follow. If True, values that depend on following packets
+            (`following`) are nan, and the points of all packets are returned.
         epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
@@ -64,7 +64,10 @@ def evaluate(
 def _evaluate_by_plans(
     packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
 ) -> EvaluatedPoints | None:
-    """Return the points of a batch, evaluated by plans; None without a valid plan."""
+    """Return the points of a batch, evaluated by plans.
+
+    Returns None if a layout has no plan, or if its plan is not valid for the batch.
+    """
     table = packets.table
     if not isinstance(table, CompiledTable) or not table.groups:
         return None
@@ -214,7 +217,7 @@ def evaluate_guarded(
 
     Args:
         carry: the state left by the previous batch.
-        final: whether no packets follow, so that no packet waits.
+        final: whether no packets follow. If True, the points of all packets are returned.
         epoch: the stamp of the cloud, int64 ns.
     """
     try:

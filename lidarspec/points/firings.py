@@ -25,8 +25,7 @@ Returns = Literal["first", "last", "strongest", "all"]
 RETURNS: tuple[Returns, ...] = ("first", "last", "strongest", "all")
 #: The index of a return that is missing.
 MISSING = -1
-#: The return with the lowest rank is chosen. These are the ranks of returns that are not valid, and
-#: of returns that are missing.
+#: The ranks of invalid and of missing returns. The return with the lowest rank is chosen.
 _INVALID_RANK = 1e30
 _MISSING_RANK = 1e31
 
@@ -115,7 +114,7 @@ def choose_returns(
 
 
 def take_returns(cloud: PointCloud, indices: NDArray[np.intp]) -> PointCloud:
-    """Return the points at the indices of one return of each firing.
+    """Return the points at `indices`, which select one return of each firing.
 
     The result is organised if the cloud is, and if the rings still repeat in every column.
     """

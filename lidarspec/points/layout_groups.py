@@ -136,8 +136,8 @@ class GroupPoints:
         """Return a part of the result of `points`, computed by the reference evaluator.
 
         The shape is (stop - first, *plan.shape); a `stop` of None means all packets. A column in
-        `extra` that is a field as it was sent has the type of the field. All other parts are
-        float64.
+        `extra` that contains the raw integers of a field has the type of this field. All other
+        parts are float64.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]

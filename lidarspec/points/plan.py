@@ -14,9 +14,9 @@ values of floating-point fields.
 The columns of a `Polar` result are computed in another order and partly in float32. The plan is
 valid only if the floating-point fields of a batch are within `MODERATE_SIZES`.
 
-Columns in `extra` are compiled if they are float32, which are exact as well, or if they are
-integers of a field as they were sent. All other columns in `extra` are evaluated by the reference
-evaluator and converted to their type.
+A column in `extra` is compiled if it is float32, or if it contains the raw integers of a field.
+Compiled float32 columns are exact as well. The reference evaluator computes all other columns in
+`extra`, and converts them to their type.
 
 A value is called full if it has one value for each point. All other values have one value for each
 packet or block.
@@ -99,7 +99,8 @@ class Plan:
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
-        sent: the fields of columns in `extra` that are integers as they were sent, by name.
+        sent: the columns in `extra` that contain the raw integers of a field: the field by the name
+            of the column.
         exact: whether coordinates and range are computed in float64 in the order in which they are
             written. All other columns are always computed in this way.
         positive: nodes whose values have to be positive numbers for the plan to be valid.

@@ -190,5 +190,5 @@ def _write(path: Path, data: bytes) -> None:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Warn of a text once in a run of the program."""
+    """Issue a warning with a text, once per text in a run of the program."""
     warnings.warn(text, stacklevel=2)

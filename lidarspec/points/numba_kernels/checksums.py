@@ -27,9 +27,9 @@ from lidarspec.spec.checksums import Crc, WordXor, Xor
 #: The tables of a layout are made from this number of frames on; smaller batches are left to NumPy.
 MIN_FRAMES_SEEN = 4096
 MIN_BATCH_FRAMES = 64
-#: The tables of more covered bytes than this do not fit in the fastest caches.
+#: The largest number of covered bytes whose tables fit in the fastest caches.
 MAX_TABLE_BYTES = 128
-#: The size of a batch in bytes, from which "slicing by eight" is faster.
+#: The size of a batch in bytes from which "slicing by eight" is faster than NumPy.
 MIN_ROW_BATCH_BYTES = 1 << 14
 
 _SHARES_SOURCE = (
@@ -72,10 +72,10 @@ _REGISTERS = "abcd"
 
 
 def _write_slice(name: str) -> str:
-    """Return the source text of the CRC register after eight more bytes.
+    """Return the source of an expression: the CRC register after eight more bytes.
 
     Args:
-        name: the name of the register, which was already XORed with the bytes.
+        name: the name of the register. Its value has already been XORed with the bytes.
     """
     return " ^ ".join(
         f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
@@ -83,7 +83,7 @@ def _write_slice(name: str) -> str:
 
 
 def _write_single(name: str) -> str:
-    """Return the source text of the CRC register after one more byte."""
+    """Return the source of an expression: the CRC register after one more byte."""
     return (
         f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
         f" {(1 << 56) - 1})"
@@ -135,17 +135,16 @@ class _ByteShares:
 
     Attributes:
         seen: the number of frames so far.
-        is_suited: whether the checksum can be computed by shares.
+        is_suited: whether the checksum can be computed from shares.
         start: the checksum of a frame of zeros.
         words: the offsets at which words of eight bytes are loaded.
         tables: the share of each byte of these words, by its value. It is 0 for bytes that the
             checksum does not cover, and for bytes that an earlier word contains.
         is_plain: whether each share is the byte itself, in the low or the high byte of the
             checksum.
-        lows: a mask for each word of the bytes that are XORed into the low byte of the checksum, if
-            `is_plain`.
-        highs: a mask for each word of the bytes that are XORed into the high byte of the checksum,
-            if `is_plain`.
+        lows: if `is_plain`, a mask for each word. It selects the bytes that are XORed into the low
+            byte of the checksum.
+        highs: the same for the high byte of the checksum.
     """
 
     def __init__(self, seal: Seal) -> None:
@@ -207,7 +206,10 @@ _SHARES_BY_SEAL: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
-    """Return the checksums of frames, (n,); None if NumPy is faster or required."""
+    """Return the checksums of frames, (n,).
+
+    Returns None if NumPy is faster, or if only NumPy can compute the checksums.
+    """
     shares = _SHARES_BY_SEAL.get(seal)
     if shares is None and not seal.spans:
         return None  # over no bytes there is nothing to compute

@@ -96,7 +96,8 @@ class Kernel(ColumnMaker):
 
         Args:
             count: the number of frames.
-            run: calls the kernel for a number of frames from a first frame on.
+            run: a function with two arguments, the first frame and the number of frames. It calls
+                the kernel for these frames.
         """
         number = min(count_threads(), max(count * self._width // MIN_THREAD_POINTS, 1), count)
         if number < 2:

@@ -141,7 +141,7 @@ class Expressions(KernelWriter):
     """Writes traced expressions into the loops."""
 
     def double(self, value: Any, depth: int = 0) -> KernelValue:
-        """Return an expression in float64, or a condition."""
+        """Write an expression in float64, or a condition, and return its value."""
         if not isinstance(value, Node):
             return self.constant(value, depth)
         return self.get_or_make(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
@@ -491,7 +491,7 @@ class Expressions(KernelWriter):
 
 
 def _split_halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return numbers as two float32 arrays; their sum has more precision than one."""
+    """Return numbers as two float32 arrays, whose sum is more precise than float32."""
     high = values.astype(np.float32)
     return high, (values - high).astype(np.float32)
 
@@ -587,7 +587,7 @@ class KernelAssembly:
 
 
 def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText:
-    """Return the kernel of some columns of a plan.
+    """Return the text of a kernel that computes some columns of a plan.
 
     Args:
         varying: the arrays whose lengths the kernel accepts as arguments; empty for a kernel of one

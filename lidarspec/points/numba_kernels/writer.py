@@ -285,7 +285,8 @@ class KernelWriter:
     Args:
         layout: the layout of the frames.
         shape: the shape of the points of a packet.
-        tables: known lookup tables by their contents; new tables are added.
+        tables: the lookup tables made so far, by a key that describes their contents. New tables
+            are added.
         varying: the arrays whose lengths differ from frame to frame.
     """
 
@@ -310,7 +311,7 @@ class KernelWriter:
         self._made = 0
 
     def number(self, value: int) -> str:
-        """Return the text of a length or offset; it is an argument if it may vary."""
+        """Return the text of a length or offset: a number, or an argument if it varies."""
         if not self.varying or value in (0, 1):
             return str(value)
         self.wanted.numbers.append(value)
@@ -323,7 +324,7 @@ class KernelWriter:
         return self._known[name]
 
     def let(self, level: int, text: str) -> KernelValue:
-        """Add a line that assigns a variable to a loop, and return the variable."""
+        """Assign a text to a new variable in a loop, and return the variable."""
         self._made += 1
         self.lines[level].append(f"v{self._made} = {text}")
         return KernelValue(f"v{self._made}", level)
@@ -424,7 +425,10 @@ class KernelWriter:
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def byte(self, leaf: Leaf, offset: int) -> KernelValue:
-        """Return the text of a byte at an offset in an array element, or in the frame."""
+        """Return the text that reads a byte.
+
+        The offset counts from the start of the array element, or of the frame.
+        """
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:

@@ -46,7 +46,7 @@ class Compiler:
 
     Attributes:
         program: the program, with an output for each column that was added.
-        low: the nodes that are not full and that the program reads.
+        low: the nodes that the program reads and that are not full.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -173,7 +173,7 @@ class Compiler:
         return self.program.step(f"{function.__name__} by addition", "single", run)
 
     def _compile_full_angle(self, value: Node) -> int:
-        """Compile an angle to float32, after reducing it to at most half a turn."""
+        """Compile an angle to float32, wrapped to -pi to pi."""
         angle = RegisterRead(self._compile_double(value))
         scratch = RegisterRead(self.program.register("double"))
 
@@ -185,7 +185,7 @@ class Compiler:
             np.multiply(turns, TURN_RAD, out=turns)
             np.subtract(radians, turns, out=out, casting="same_kind")
 
-        return self.program.step("reduce to half a turn", "single", run, angle, scratch)
+        return self.program.step("wrap the angle to [-pi, pi]", "single", run, angle, scratch)
 
     def _compile_double(self, value: Any) -> int:
         """Compile an expression to float64, or a condition to flags."""
