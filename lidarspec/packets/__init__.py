@@ -10,7 +10,7 @@ that the packets need are kept with them. Modules in reading order:
 * `returns`: finds the returns of the same firings in consecutive packets.
 * `counter_order`: finds lost, duplicate and late packets by their counter.
 * `clock_order`: finds them by the clock, for datagrams without a counter.
-* `arrival_order`: counts lost packets that have no counter and always arrive in order.
+* `arrival_order`: counts losses among packets that have no counter and always arrive in order.
 * `masked_sector`: finds sectors in which a rotating sensor sends nothing on purpose.
 * `reorder`: sorts packets and drops duplicates.
 * `imu`: the samples of an IMU.
@@ -18,7 +18,7 @@ that the packets need are kept with them. Modules in reading order:
 * `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
 * `clock_estimate`: offset and drift between the sensor's clock and the host's.
-* `clock_findings`: the faults of a clock as codes, and their words.
-* `clock_monitor`: what a clock counts, how it runs, and its faults.
+* `clock_findings`: the faults of a clock: a code for each, its text and the next step.
+* `clock_monitor`: finds the epoch, offset, drift and faults of a clock.
 * `utc_times`: the times of packets in UTC.
 """

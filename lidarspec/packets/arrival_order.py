@@ -1,12 +1,12 @@
 """Count losses among packets that always arrive in order.
 
-They are packets of byte streams, and datagrams with neither a counter nor a clock.
+Such packets come from byte streams, or are datagrams with neither a counter nor a clock.
 
 `ArrivalOrder` numbers the packets as they arrive, and leaves out a number for each missing packet.
 It estimates the missing packets in two ways. Skipped bytes are divided by the size of the largest
-packet so far. If the sensor has a clock with a declared pace, the time that has passed is divided
-by the pace. The clock decides if its resolution is at least half a packet. Otherwise the larger of
-the two estimates is used.
+packet so far. If the sensor has a clock with a declared pace, the time since the previous packet is
+divided by the pace. If the resolution of the clock is at most half the pace, the estimate by the
+clock is used. Otherwise the larger of the two estimates is used.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class ArrivalOrder:
     ) -> tuple[Index, NDArray[np.bool_]]:
         """Return the index of each packet in the stream, (n,), and the breaks before packets, (n,).
 
-        The index also counts lost packets. The breaks are those of `batch`, which follow skipped
-        bytes, and those that follow lost packets.
+        The index also counts lost packets. There is a break before a packet if packets are lost
+        before it, or if `batch` has a break there because of skipped bytes.
 
         Args:
             batch: the packets.
@@ -75,7 +75,7 @@ class ArrivalOrder:
         return partial(_make_index_with_gaps, first, count, rows, missing), batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clock of the next packet with the last one, after lost input."""
+        """Do not compare the clock of the next packet with the last one: input was lost."""
         self._time = None
 
     def _count_skipped(

@@ -1,18 +1,22 @@
 """Conversion of a sensor's clock to the clock of the host, by the arrival times of packets.
 
 The sensor's time has an arbitrary start, runs fast or slow by some millionths, and may restart. The
-host's time of arrival has the correct rate, but is late by some milliseconds, which vary from
-packet to packet with the line and the operating system. A packet is never early. So the delays,
-arrival minus sensor's time, lie above a line, and many lie close to it. The line is that of packets
-without delay: its height is the offset between the clocks, its slope the drift.
+arrival time, by the host's clock, has the correct rate, but is late by some milliseconds. This
+varies from packet to packet with the line and the operating system. A packet is never early.
+
+In this module, the delay of a packet is its arrival time minus its sensor's time. Over the sensor's
+time, all delays lie above a line, and many lie close to it. This is the line of packets that arrive
+at once. Its height is the offset between the clocks, and its slope is the drift.
 
 The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
 computes their lower convex hull. The line continues the edge of the hull at the middle of the
-samples; of all lines below the samples, it is the highest there. If the previous slope lies between
-the slopes of the hull shortly before and after the middle, the previous slope is kept, because the
-delays do not determine a better one. Stamps approach the line smoothly. The clock was set if
-several consecutive packets are too early, or if for a second all packets are late, by much more
-than their delays differ from each other.
+samples. At the middle, it is the highest of all lines below the samples. If the previous slope lies
+between the slopes of the hull shortly before and after the middle, the previous slope is kept,
+because the delays do not determine a better one. If the line changes, the delays of stamps approach
+it smoothly.
+
+The clock was set in two cases: several consecutive samples are far below the line, or all samples
+of a second are far above it, by much more than their delays differ from each other.
 
 Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
 measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
@@ -64,12 +68,12 @@ class ClockSample(NamedTuple):
 
 
 class ClockLine(NamedTuple):
-    """The line of packets without delay: a point on it, and its slope.
+    """The line of packets that arrive at once: a point on it, and its slope.
 
     Attributes:
         device: a time of the sensor, ns.
-        delay: arrival minus sensor's time there, ns.
-        slope: change of the delay per time of the sensor.
+        delay: the delay of the line at this time, ns.
+        slope: the change of the delay divided by the change of the sensor's time.
     """
 
     device: int
@@ -82,7 +86,7 @@ class ClockLine(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A change of the sensor's clock, as when it is set or restarts.
+    """A jump of the sensor's clock, for example because it was set or restarted.
 
     Attributes:
         change_ns: the sensor's time after the change minus the time that it would have had.
@@ -100,8 +104,8 @@ class DeviceClock:
     time that a packet needs in the sensor and on the line to the host.
 
     Args:
-        parts: the number of parts, of a quarter of a second each, that determine the line. More
-            parts determine the drift better, fewer parts follow its changes sooner.
+        parts: the number of quarters of a second that determine the line. With more parts the drift
+            is more precise; with fewer parts it follows changes sooner.
 
     Attributes:
         jumps: how often the sensor's clock was set.
@@ -127,7 +131,7 @@ class DeviceClock:
 
     @property
     def drift_ppm(self) -> float:
-        """The share by which the sensor's clock is fast, in millionths."""
+        """How much faster the sensor's clock runs than the host's, in millionths."""
         return (1 / (1 + self._line.slope) - 1) * 1e6
 
     @property
@@ -141,7 +145,7 @@ class DeviceClock:
         return len(self._min_delays) >= SETTLED_PARTS
 
     def delays_above_line(self, device: Times, host: Times) -> NDArray[np.float64]:
-        """Return by how much packets are later than a packet without delay, ns, (n,).
+        """Return how much later packets arrive than the fastest ones, (n,) ns.
 
         Args:
             device, host: as for `observe`.
@@ -154,8 +158,8 @@ class DeviceClock:
         """Update the conversion with packets, and return the changes of the clock among them.
 
         Args:
-            device_ns, host_ns: when the packets were sent by the sensor's clock, and when they
-                arrived; int64 ns, shape (n,) or a number each.
+            device_ns, host_ns: the times of the packets by the sensor's clock, and their arrival
+                times; int64 ns, shape (n,) or one number each.
         """
         jumps = []
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
@@ -171,13 +175,13 @@ class DeviceClock:
         return jumps
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
-        """Return the host's time of a scan, later than all stamps before.
+        """Return the time of a scan by the host's clock, later than all earlier stamps.
 
-        Also updates the conversion with the scan.
+        This also updates the conversion.
 
         Args:
             device_ns: the time of the first point of the next scan.
-            host_ns: when its packet arrived, ns.
+            host_ns: the arrival time of the packet with this point, ns.
         """
         self.observe(device_ns, host_ns)
         offset = host_ns - device_ns
@@ -189,10 +193,11 @@ class DeviceClock:
         return self._stamp
 
     def stamp_packets(self, device: Times, host: Times) -> Times:
-        """Return the host's times of packets, each later than all stamps before, (n,) ns.
+        """Return the times of packets by the host's clock, (n,) ns.
 
-        Also updates the conversion with the packets. While the clock runs evenly, the line is
-        updated once for each part, otherwise with each packet, as by `stamp`.
+        Each time is later than all earlier stamps. This also updates the conversion: while the
+        clock runs evenly, once for each quarter of a second, and otherwise with each packet, as in
+        `stamp`.
 
         Args:
             device, host: as for `observe`.
@@ -219,9 +224,9 @@ class DeviceClock:
         return bool(-EARLY_LIMIT_NS < lowest < LATE_LIMIT_NS)
 
     def _stamp_part(self, device: Times, host: Times) -> Times:
-        """Return the host's times of the packets of a part, (n,) ns.
+        """Return the times of the packets of a part by the host's clock, (n,) ns.
 
-        From the packet before, the delay changes evenly to the one of the last packet.
+        The delay changes evenly from that of the previous packet to that of the last packet.
         """
         before = self._last_stamped
         assert before is not None
@@ -240,7 +245,7 @@ class DeviceClock:
         return stamps
 
     def _slewed_delay(self, device: int) -> int:
-        """Return the delay at a time of the sensor, on the way to the line."""
+        """Return the delay of a stamp at a time of the sensor, ns; it approaches the line."""
         if self._last_stamped is None:
             return self._line.delay_at(device)
         step = device - self._last_stamped.device
@@ -250,9 +255,9 @@ class DeviceClock:
         return unchanged + round(min(max(correction, -limit), limit))
 
     def _add_sample(self, sample: ClockSample) -> ClockJump | None:
-        """Update the line, or count an outlier, with the sample of smallest delay.
+        """Update the line with the sample of smallest delay, or store it as an outlier.
 
-        Returns the change of the clock if this sample shows it.
+        Returns a jump of the clock if the outliers show one.
         """
         deviation = self._deviation(sample)
         has_paused = (
@@ -290,7 +295,7 @@ class DeviceClock:
     def _was_set(self, lasting: int) -> bool:
         """Return whether the outliers show that the clock was set.
 
-        `lasting` is the time since the first outlier, ns.
+        Args: lasting: the time since the first outlier, ns.
         """
         newest = self._min_delays[-1].device
         outliers = list(self._outliers)
@@ -309,9 +314,9 @@ class DeviceClock:
         )
 
     def _restart_at_outliers(self) -> ClockJump:
-        """Restart with the newest outliers, because the clock was set; the drift remains.
+        """Restart with the newest outliers, because the clock was set; keep the drift.
 
-        Returns the change of the clock.
+        Returns the jump of the clock.
         """
         outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
         self.jumps += 1
@@ -326,7 +331,7 @@ class DeviceClock:
         return jump
 
     def _update_line(self, sample: ClockSample) -> None:
-        """Keep a sample if it is the smallest of its part, and fit the line again."""
+        """Store a sample if it is the lowest of its part, and fit the line again."""
         slope = self._line.slope
         if self._min_delays and sample.device // PART_NS <= self._min_delays[-1].device // PART_NS:
             last = self._min_delays[-1]
@@ -344,11 +349,14 @@ class DeviceClock:
 
 
 def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
-    """Return the highest line below the samples, with a slope that they determine.
+    """Fit a line below the samples, and return it.
+
+    The slope is `slope_before`, limited to the slopes of the hull shortly before and after the
+    middle of the samples. The line is as high as possible with this slope.
 
     Args:
         samples: one or more samples in order.
-        slope_before: the previous slope; the result is the nearest slope that the samples allow.
+        slope_before: the previous slope.
     """
     hull = lower_hull(samples)
     last = samples[-1]

@@ -1,7 +1,7 @@
-"""Findings about a sensor's clock: codes, their words, and the next step.
+"""Findings about a sensor's clock: the code, the text and the next step of each.
 
 A `ClockFinding` is either a state, such as a clock that runs on TAI, or an event with a time, such
-as a clock that was set. Programs compare codes; only people read the words.
+as a clock that was set. Programs compare codes; the texts are for people.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from lidarspec.spec.timing import DAY_S
 
 
 class FindingType(NamedTuple):
-    """The words of a code, with the fields of `ClockFinding` in braces.
+    """The texts of a code, with attributes of `ClockFinding` in braces.
 
     Attributes:
         text: what was found.
@@ -28,7 +28,7 @@ class FindingType(NamedTuple):
 
 
 CHECK_MASTER = "check the antenna and the cable of the time source, or its PTP domain and profile"
-#: The codes, the most serious first: states at fault, events that were faults, and the others.
+#: The codes, the most serious first: states that are faults, events that were faults, all others.
 FINDING_TYPES = MappingProxyType(
     {
         "not_locked": FindingType("not locked: {state}", CHECK_MASTER),
@@ -107,8 +107,8 @@ class ClockFinding:
     Attributes:
         code: a key of `FINDING_TYPES`.
         host_ns: the arrival time of the first packet after an event, ns since 1970; 0 for a state.
-        value: seconds, or ppm of a drift; 0 if the code has no value.
-        state: the meaning of the clock's status, in the sensor's words; "" without one.
+        value: the drift in ppm, or the offset or step in seconds; 0 if the code has no value.
+        state: the meaning of the clock's status, as the sensor declares it; "" if unknown.
         epoch: the declared epoch, a key of `spec.timing.EPOCHS`.
     """
 
@@ -120,7 +120,7 @@ class ClockFinding:
 
     @property
     def text(self) -> str:
-        """A few words on what was found, to be put after the name of the sensor."""
+        """The finding as a short text, to be printed after the name of the sensor."""
         return FINDING_TYPES[self.code].text.format(
             value=self.value,
             behind=-self.value,
@@ -141,7 +141,7 @@ class ClockFinding:
 
     @property
     def severity(self) -> int:
-        """A number to sort by; the most serious finding has the lowest."""
+        """A number to sort by; the most serious finding has the lowest number."""
         return _SEVERITY[self.code]
 
     def to_dict(self) -> dict[str, Any]:

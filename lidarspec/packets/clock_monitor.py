@@ -1,9 +1,10 @@
-"""Watch a sensor's clock: what it counts, whether it is locked, how it runs, and its faults.
+"""Watch a sensor's clock: its epoch, lock, offset, drift and faults.
 
 A `ClockMonitor` reads the packets of one sensor in turn. Their arrival times show the offset and
-the drift of the clock (`clock_estimate`); a change of the offset is an event. The status that the
-sensor sends (`clock_status`) gives further events. The offset is compared with the one that follows
-from the declared epoch, and with those of other time scales: they differ by leap seconds.
+the drift of the clock (`clock_estimate`); a change of the offset is an event. A change of the
+status that the sensor sends (`clock_status`) is an event as well. The measured offset is compared
+with the offset of the declared epoch, and with the offsets of other time scales, which differ by
+leap seconds.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, HOUR_S, Clock, ClockStat
 Integers = NDArray[np.int64]
 
 DRIFT_LIMIT_PPM = 100.0  # crystals are within 50 ppm
-#: Offset below which a clock is in order, s: packets arrive late, a host is set by NTP, and a clock
-#: that is not locked drifts by 0.2 s in an hour.
+#: A clock is in order if its offset is below this, s. The limit allows for late packets, a host
+#: that is set by NTP, and a drift of 0.2 s per hour without a lock.
 OFFSET_LIMIT_S = 0.5
 SCALE_TOLERANCE_S = 0.25  # of the offset from another time scale
 STEP_TOLERANCE_S = 0.05  # of a step by a second
@@ -43,9 +44,9 @@ PIECE_NS = 250_000_000  # packets are judged in pieces of this duration
 ESTIMATE_PARTS = 360  # 90 s, for a drift within 1 ppm of a clock that counts milliseconds
 MIN_PIECES = 4  # after which a clock can be in order
 WRONG_DATE_S = DAY_S  # difference from the host from which on the date is wrong
-#: the time that a clock shows at most when the first packets after its restart arrive, s
+#: The largest time that a clock can show in the first packets after its restart, s.
 RESTART_LIMIT_S = 1.0
-#: how near to the end of a month a second is a leap second, s
+#: A step by one second is a leap second if it is nearer than this to the end of a month, s.
 LEAP_LIMIT_S = 10.0
 KEPT_DELAYS = 4096
 KEPT_EVENTS = 1000
@@ -61,7 +62,7 @@ class OffsetSample:
     Attributes:
         host_ns: arrival time, ns since 1970.
         offset_s: the sensor's time minus the host's, s.
-        jitter_ms: the 95th percentile of the packets' delays, ms.
+        jitter_ms: the 95th percentile of the packets' delays, as in `ClockReport`, ms.
     """
 
     host_ns: int
@@ -74,18 +75,19 @@ class ClockReport:
     """The findings about a clock, and its measured offset, drift and jitter.
 
     Attributes:
-        epoch: what the clock counts, a key of `spec.timing.EPOCHS`; "" if unknown.
-        state: the meaning of its status; "" if the sensor has not sent it.
-        locked: whether it is locked; None if unknown.
-        offset_s: the sensor's time minus the host's, s; nan if unknown. A constant delay of all
-            packets makes it smaller.
-        error_s: the offset without the difference of the time scales, s; nan if the clock has no
-            date.
-        drift_ppm: the share by which the clock is fast, in millionths; nan if unknown.
-        jitter_ms: the 95th percentile of the delays of packets after the fastest, ms.
+        epoch: the declared epoch of the clock, a key of `spec.timing.EPOCHS`; "" if unknown.
+        state: the meaning of the clock's status; "" if the sensor has not sent the status.
+        locked: whether the clock is locked; None if unknown.
+        offset_s: the sensor's time minus the host's, s; nan if unknown. It is too low by the
+            shortest delay of a packet.
+        error_s: the offset minus the difference between the time scales of sensor and host, s; nan
+            if the clock has no date.
+        drift_ppm: how much faster the sensor's clock runs than the host's, in millionths; nan if
+            unknown.
+        jitter_ms: the 95th percentile of how much later packets arrive than the fastest ones, ms.
         packets: number of packets.
-        late: number of packets that came more than 50 ms later than the fastest.
-        jumps: how often the clock was set, or restarted.
+        late: the number of packets that arrived more than 50 ms later than the fastest ones.
+        jumps: how often the clock was set or restarted.
         findings: the findings, the most serious first; at least one.
         events: the events in order of time.
     """
@@ -120,14 +122,14 @@ class ClockReport:
 
 
 class ClockMonitor:
-    """The clock of one sensor, watched through its packets.
+    """Watches the clock of one sensor by its packets.
 
     Args:
         sensor: the sensor.
         drift_limit_ppm: the drift above which the clock is at fault.
 
     Attributes:
-        samples: the offset over time, one sample a second, the newest ten minutes.
+        samples: the offset of the last ten minutes, one sample a second.
     """
 
     def __init__(
@@ -155,7 +157,7 @@ class ClockMonitor:
         """Update the clock with packets, and return the events among them.
 
         Args:
-            packets: the next packets; those of frame types with another clock are only counted.
+            packets: the next packets. Packets of a frame type with another clock are only counted.
         """
         clock = self._clock
         self._packets += len(packets)
@@ -222,7 +224,7 @@ class ClockMonitor:
 
     @property
     def _epoch(self) -> str:
-        """The epoch that the sensor declares for the present state of the clock."""
+        """The epoch that the sensor declares for the current state of the clock."""
         if self._clock is None:
             return ""
         return self._clock.epoch_at(self._device_ns, self._state)
@@ -232,7 +234,7 @@ class ClockMonitor:
         return self._device_ns >= FIRST_DATE_NS
 
     def _read_status(self, packets: Packets) -> list[ClockFinding]:
-        """Return the changes of the clock's status, and remember the last one."""
+        """Return the changes of the clock's status as events, and store the last status."""
         clock = self._clock
         assert clock is not None
         if clock.status is None:
@@ -255,7 +257,7 @@ class ClockMonitor:
         return events
 
     def _observe(self, device: Integers, host: Integers, readings: Integers) -> list[ClockJump]:
-        """Update the estimate with one piece, and return the jumps that it shows."""
+        """Update the estimate with the packets of one piece, and return the clock's jumps."""
         jumps = self._estimate.observe(device, host)
         if jumps:
             self._delays = self._delays[:0]
@@ -289,7 +291,10 @@ class ClockMonitor:
         return event
 
     def _has_restarted(self, jump: ClockJump) -> bool:
-        """Return whether the clock went back by more than a day, or to 0 without a wrap."""
+        """Return whether a jump shows a restart of the sensor.
+
+        It does if the clock went back by more than a day, or to about 0 without a wrap.
+        """
         if jump.change_ns < -DAY_S * 1e9:
             return True
         around = [
@@ -306,7 +311,7 @@ class ClockMonitor:
     def _find_error_s(self) -> float:
         """Return the error of the clock, s; nan if the clock has no date.
 
-        It is the offset from the host's clock minus the difference of their time scales.
+        The error is the offset minus the difference between the time scales of sensor and host.
         """
         epoch = self._epoch
         if epoch == "hour":
@@ -317,11 +322,11 @@ class ClockMonitor:
 
     @property
     def _scale_offsets(self) -> dict[str, int]:
-        """Seconds by which each time scale is ahead of UTC now."""
+        """The seconds by which each time scale is currently ahead of UTC."""
         return read_leap_seconds().scale_offsets(self._host_ns / 1e9)
 
     def _judge(self) -> Iterator[ClockFinding]:
-        """Yield one or more findings about the present state of the clock."""
+        """Yield one or more findings about the current state of the clock."""
         if self._clock is None:
             yield ClockFinding("no_clock")
             return
@@ -347,7 +352,10 @@ class ClockMonitor:
             yield ClockFinding("ok")
 
     def _judge_offset(self, epoch: str) -> ClockFinding | None:
-        """Return the finding about the offset; None if it fits, or there is nothing to compare."""
+        """Return the finding about the offset.
+
+        Returns None if the offset is correct, or if it cannot be compared.
+        """
         error_s = self._find_error_s()
         if math.isnan(error_s) or abs(error_s) < OFFSET_LIMIT_S:
             return None
@@ -368,7 +376,7 @@ class ClockMonitor:
 
 
 def _split(host: Integers) -> list[slice]:
-    """Return slices of packets that arrived within one piece of time."""
+    """Return slices of packets, one for each piece of time in which packets arrived."""
     edges = np.flatnonzero(np.diff(host // PIECE_NS)) + 1
     starts = [0, *edges.tolist()]
     ends = [*edges.tolist(), len(host)]
@@ -376,7 +384,7 @@ def _split(host: Integers) -> list[slice]:
 
 
 def _find_main_clock(sensor: SensorDescription) -> Clock | None:
-    """Return the clock of the sensor; without one, that of its first frame type with a clock."""
+    """Return the sensor's clock, or else that of the first frame type with a clock."""
     if sensor.clock is not None:
         return sensor.clock
     clocks = (sensor.frames[name].clock for name in sensor.main_frames)
@@ -384,7 +392,7 @@ def _find_main_clock(sensor: SensorDescription) -> Clock | None:
 
 
 def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
-    """Return the rows with a known value that differs from the known value before it."""
+    """Return the rows whose value differs from the previous value; nan is ignored."""
     known = np.flatnonzero(~np.isnan(values))
     previous = np.concatenate([[before], values[known][:-1]])
     rows: list[int] = known[values[known] != previous].tolist()

@@ -1,11 +1,11 @@
-"""Order of datagrams that have a clock but no counter.
+"""Find lost, late and duplicate datagrams by their clock, if they have no counter.
 
 `ClockOrder` compares each datagram with the newest packets, which it stores in the order of their
 times. The datagram directly follows the newest packet, or follows it after a gap, or is late, or is
-a duplicate, or shows that the clock was set. A packet with the time and the bytes of a stored
-packet is a duplicate; bytes are compared by their CRC-32. A late packet is inserted between its
-neighbours, and the number of packets missing there is corrected. The counters are finally the same
-as if the packets had arrived in order.
+a duplicate, or shows that the clock was set. It is a duplicate if a stored packet has the same time
+and the same bytes; bytes are compared by their CRC-32. A late packet is inserted between its
+neighbours, and the number of packets missing between them is corrected. In the end, the counters
+are the same as if the packets had arrived in order.
 
 Each packet gets an index, a sequence number that leaves out a number for each missing packet, and
 an order, which is its sort key. The order is the time of the packet since the first packet, in
@@ -35,13 +35,13 @@ from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import MAX_STEP_NS, Paces, read_paces, shortest_pace
 from lidarspec.spec.timing import Clock
 
-#: The number of places by which a packet can be late. If the clock goes back further, it was set or
-#: the sensor restarted.
+#: The maximum number of places by which a packet can be late. If the clock goes back further, the
+#: clock was set or the sensor restarted.
 MAX_PLACES_LATE = 64
-#: The time by which a packet can be late if the pace is unknown.
+#: The maximum time by which a packet can be late if the pace is unknown, ns.
 MAX_LATE_NS = 10**9
-#: The number of newest packets with a stored checksum. A packet with the time of an older packet
-#: counts as a duplicate; their bytes are not compared.
+#: The checksums of this number of newest packets are stored. A packet with the time of an older
+#: packet counts as a duplicate, without a comparison of bytes.
 REMEMBERED_CHECKSUMS = 16
 
 _time_of = attrgetter("time")
@@ -244,7 +244,7 @@ class ClockOrder:
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
     def _restart(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
-        """Begin with a first packet, or again after the clock was set.
+        """Begin with the first packet, or begin again after the clock was set.
 
         After the clock was set, the index leaves out one number.
         """

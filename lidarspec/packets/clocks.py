@@ -22,7 +22,8 @@ from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 
-#: Larger readings (over 285 years) are reduced to this, so that corrupt readings do not overflow.
+#: The largest reading, ns (about 285 years). Larger, corrupt readings are set to it to avoid
+#: overflow.
 _MAX_READING_NS = 9 * 10**18
 
 
@@ -32,9 +33,9 @@ class Unwrapper:
     The result is exact over any number of wraps.
 
     A reading that is ahead by more than half a wrap period counts as a step backward, because the
-    packet is late. Arrival times decide in two cases: after a pause of more than three quarters of
-    a period they give the number of wraps, and after more than half a period they can show that the
-    step was forward.
+    packet is late. Arrival times are used in two cases. After a pause of more than three quarters
+    of a period, they give the number of wraps. After a pause of more than half a period, they can
+    show that the step was forward.
     """
 
     def __init__(self, wraps_at: float | None) -> None:

@@ -32,17 +32,19 @@ from lidarspec.packets.returns import GroupCounter
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, PacketCounter
 
-#: The number of places by which a packet can be late. If it is further back, the sensor restarted.
+#: The maximum number of places by which a packet can be late. If it is further back, the sensor
+#: restarted.
 MAX_PLACES_LATE = 64
-#: The limit for a packet that would come before the first one. It is smaller, because a wrap of the
-#: counter during a loss is more likely then.
+#: The maximum number of places by which a packet can precede the first packet of the stream. It is
+#: smaller, because a packet further back more likely shows a wrap of the counter during a loss.
 MAX_PLACES_EARLY = 10
 #: A counter with at least this many values does not wrap in normal use: if it returns to 0, the
 #: sensor has restarted.
 LONG_PERIOD = 1 << 16
-#: A counter with more values than this fills 64 bits, and its differences wrap by themselves.
+#: A counter with more values than this fills 64 bits; its differences wrap without a modulo.
 MAX_SIGNED_PERIOD = 1 << 63
-#: The limit of the first index and of its steps, so that the index fits 64 bits for any counter.
+#: The limit of the first index and of each step of the index, so that it fits in 64 bits for any
+#: counter.
 MAX_INDEX_STEP = 1 << 32
 
 
@@ -145,8 +147,8 @@ class CounterOrder:
         """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
         Args:
-            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them;
-                this adds marks for lost packets.
+            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them. The
+                returned breaks contain these marks, and marks for lost packets.
             times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
@@ -191,7 +193,7 @@ class CounterOrder:
         return index, batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clock of the next packet with the last one, after lost input."""
+        """Do not compare the clock of the next packet with the last one: input was lost."""
         self._time = None
         self._arrived = None
         self._gaps.forget()
@@ -406,7 +408,7 @@ class CounterOrder:
         return loss
 
     def _restart(self, number: int | None) -> None:
-        """Begin with a first packet, or again after the sensor restarted.
+        """Begin with the first packet, or begin again after the sensor restarted.
 
         This counts no loss. After a restart, the index leaves out one number.
         """
@@ -444,7 +446,7 @@ class CounterOrder:
 
 
 def _is_consistent(ahead: int, by_clock: float) -> bool:
-    """Return whether the counter and the clock show about the same number of packets."""
+    """Return whether counter and clock show about the same number of packets."""
     is_near = abs(ahead - by_clock) <= 1 + abs(by_clock) / 8
     return is_near and (ahead > 0) == (by_clock > 0.5)
 

@@ -19,8 +19,8 @@ from lidarspec.points.reference_evaluator import flatten_valid
 from lidarspec.spec.results import Imu
 from lidarspec.spec.sensor import SensorDescription
 
-#: The units of the columns of a sample, in the order of the columns in files. `time_ns` precedes
-#: them.
+#: The units of the columns of a sample, in the order of the columns in files. In files, `time_ns`
+#: is the first column.
 UNITS = {
     **{f"angular_velocity_{axis}": "rad/s" for axis in "xyz"},
     **{f"linear_acceleration_{axis}": "m/s2" for axis in "xyz"},

@@ -29,13 +29,13 @@ class PacketType:
         others: the names of the other frame types that packets of this type need as their state.
         clock: the clock of the packets; None without a clock.
         timed_sensor: the sensor, with its clock replaced by `clock`.
-        loss_clock: the clock that shows losses; None without a clock, or if the parts of a frame
-            have the clock, because a frame without parts then has no time.
+        loss_clock: the clock that shows losses. None without a clock, and also if the clock is in
+            the parts of a frame, because a frame without parts then has no time.
         loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
         clock_of_counter: the clock that checks the packet counter; None if there is no such clock.
         is_counted: whether the packets have a counter.
-        is_ordered_by_clock: whether the packets are ordered by their clock: datagrams that have a
-            clock, but no counter.
+        is_ordered_by_clock: whether the packets are ordered by their clock, because they are
+            datagrams that have a clock but no counter.
     """
 
     sensor: SensorDescription
@@ -123,7 +123,8 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of a frame type have a field.
 
-    Also returns True if no data frame has the field, so that reading the field reports the error.
+    Also returns True if none of the main frame types has the field. The error is then reported when
+    the field is read.
     """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [

@@ -191,7 +191,7 @@ class Packets:
 
         - If consecutive packets contain the returns (`PacketCounter.returns`): (groups of packets,
           *shape of the points of a packet, returns), ordered by `return_index`, or by the counter
-          if the packets of a group have equal ones.
+          if the return indices of a group's packets are equal.
         - If each packet contains them in the same places: (packets, *shape of the firings of a
           packet, returns).
         - Otherwise: (firings, returns).

@@ -8,8 +8,8 @@ that was sent.
 
 `Packets.order` is the sort key. With a counter, it is the index. With a clock alone, it is a time;
 losses are then found again in the sorted packets, so that scans do not depend on the order of
-arrival. A clock without a declared pace does not show that a packet is missing, so `WINDOW` packets
-are always held.
+arrival. A clock without a declared pace does not show that a packet is missing; in this case,
+`WINDOW` packets are always held.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Returns of one firing in consecutive packets (`PacketCounter.returns`), and in one packet.
 
 Some sensors send each return of their firings in a packet of its own. These packets form a group
-with consecutive counters. A group is incomplete if some of its packets are lost: then the firings
-of the others lack a return. `GroupCounter` counts incomplete groups, and `arrange_returns` puts the
-returns of each firing next to each other.
+with consecutive counters. A group is incomplete if some of its packets are lost. The firings in its
+other packets then lack a return. `GroupCounter` counts incomplete groups, and `arrange_returns`
+puts the returns of each firing next to each other.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from lidarspec.points.firings import MISSING, group_firings
 from lidarspec.points.reference_evaluator import PacketBatch
 from lidarspec.spec.timing import PacketCounter
 
-#: the number of packets after which a group no longer waits for a late packet.
+#: The number of packets after which a group no longer waits for a late packet.
 MAX_PLACES_LATE = 64
 
 
 def read_groups(
     rule: PacketCounter, batch: Batch, index: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return group, place in the group and group size of each packet, (n,) each.
+    """Return the group of each packet, its position there, and the group's size, (n,).
 
     A group is identified by the index of its first packet.
 
@@ -55,7 +55,7 @@ def _to_sizes(values: Any, count: int) -> NDArray[np.int64]:
 
 
 class GroupCounter:
-    """The number of incomplete groups of packets with the returns of the same firings.
+    """Counts the incomplete groups of packets with the returns of the same firings.
 
     Args:
         rule: the counter of the packets.
@@ -158,9 +158,9 @@ def _place_by_return_index(
     members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     numbers: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return groups of packets whose places are their return index, not their counter.
+    """Return `members` with positions by return index, not by counter.
 
-    A group in which the return index does not distinguish the packets keeps its places.
+    The positions of a group stay the same if the return index does not distinguish its packets.
 
     Args:
         members: the group of each packet, its place, and the size of the group, (n,).
@@ -233,7 +233,7 @@ def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
 
 
 def _gather(cloud: PointCloud, indices: NDArray[np.intp]) -> NDArray[Any]:
-    """Return a structured array of points at some indices; missing points are not valid."""
+    """Return a structured array of the points at some indices; `MISSING` is not valid."""
     columns = {**cloud.columns, "valid": cloud.valid}
     is_missing = indices == MISSING
     kinds = [(name, column.dtype) for name, column in columns.items()]

@@ -1,12 +1,13 @@
 """Convert the times of one sensor to UTC.
 
 The time of a packet has one of three sources. If the sensor's clock has a date, UTC follows from
-what it counts (`Clock.epoch`) and from the leap seconds. A clock that counts from the full hour is
-completed by the arrival time. Every other clock, which counts from power-up or was never set, is
-mapped to the clock of the host by the line of the fastest packets (`clock_estimate`).
+what it counts (`Clock.epoch`) and from the leap seconds. If the clock counts from the full hour,
+the arrival time determines the hour. Every other clock counts from power-up or was never set. Its
+times are converted to the clock of the host by the arrival times of the fastest packets
+(`clock_estimate`).
 
-The source can change: a lock is gained or lost, a frame reports the date late, the sensor restarts.
-Each change is kept with its time, and described in `warnings`.
+The source can change, for example if the clock gains or loses its lock, if a frame reports the
+date, or if the sensor restarts. Each change is kept with its time, and described in `warnings`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS, FIRST_DATE_NS, HOUR_S, C
 Times = NDArray[np.int64]
 SECOND_NS = 1_000_000_000
 HOUR_NS = HOUR_S * SECOND_NS
-#: How many changes are described one by one.
+#: The maximum number of changes that are described one by one.
 MAX_DESCRIBED_CHANGES = 10
 
 
@@ -38,8 +39,9 @@ class UtcSource:
     """The source of UTC.
 
     Attributes:
-        kind: "clock": the sensor's clock has a date. "hour": it counts from the full hour, and the
-            arrival time completes it. "arrival": the arrival times determine it.
+        kind: "clock" if the sensor's clock has a date; "hour" if the clock counts from the full
+            hour and the arrival time gives the hour; "arrival" if UTC comes from arrival times
+            alone.
         epoch: what the clock counts, a key of `spec.timing.EPOCHS`.
         locked: whether the clock is locked; None if unknown.
         state: the meaning of the clock's status; "" if unknown.
@@ -57,7 +59,7 @@ class UtcSource:
 
     @property
     def reason(self) -> str:
-        """The reason why the clock alone does not give UTC, to be put after "the clock"."""
+        """The reason why the clock does not give UTC, to be printed after "the clock"."""
         if self.kind == "hour":
             return "counts from the full hour"
         if self.epoch in DATED_EPOCHS:
@@ -85,7 +87,7 @@ class UtcChange:
     """A change of the source of UTC.
 
     Attributes:
-        utc_ns: the UTC from which on the source applies, ns since 1970.
+        utc_ns: the UTC at which the source begins to apply, ns since 1970.
         source: the new source.
         is_first: whether it is the first source, and not a change.
     """
@@ -111,7 +113,7 @@ class UtcTimes:
         name: the name of the source, for messages.
 
     Attributes:
-        changes: the sources of UTC, each with the time from which on it applies.
+        changes: the sources of UTC so far, each with the time at which it begins to apply.
     """
 
     def __init__(self, sensor: str, clock: Clock | None, name: object = "the source") -> None:

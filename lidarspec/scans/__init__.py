@@ -2,8 +2,8 @@
 
 A scan is one revolution or frame period, by the sensor's declared rule.
 
-Batches of packets are converted to `Scan`, and these to `LaserScan`, which is a planar scan as in
-ROS. Modules in reading order:
+Batches of packets are converted to `Scan` objects. A `Scan` can be converted to a `LaserScan`,
+which is a planar scan as in ROS. Modules in reading order:
 
 * `scan`: `Scan`, the points of one revolution.
 * `laserscan`: `LaserScan`, and the nearest return at each angle of a grid.
@@ -13,7 +13,7 @@ ROS. Modules in reading order:
 * `cutter`: `ScanCutter`, which decides where a scan ends and whether it is complete.
 * `scan_ends`: the ends of scans by the sensor's rule.
 * `rotation`: the rows at which a turning angle passes a given angle.
-* `limits`: the longest and the largest scan.
+* `limits`: the maximum duration and size of a scan.
 * `completeness`: the packets of a scan, and the packets missing in it.
 * `masking`: the masked sector of a rotating sensor, in which scans are cut.
 * `selection`: selects scans of a source, parts of scans, and bytes by arrival time.

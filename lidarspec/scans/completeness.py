@@ -131,7 +131,7 @@ class OpenScan(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the start has arrived, and at least half of the packets."""
+        """Whether the start and at least half of the packets have arrived."""
         return self.has_start and self.lost <= self.packets
 
     @property
@@ -154,7 +154,10 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Return the scan's counts plus the losses before some packets; exclude the packets."""
+        """Return the counts of the scan with the losses before some packets.
+
+        The packets themselves are not added.
+        """
         return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),

@@ -3,8 +3,8 @@
 The duration of a scan, by the times of the packets, is limited to twice the slowest revolution. If
 the number of points of a scan is constant, its size is limited to twice this number. Otherwise its
 size is limited to the bytes that the serial line carries in the maximum duration, or to `MAX_BYTES`
-without a serial line. If packets are missing, the end may be missing with them, so the scan may
-then become only slightly longer than the previous scan.
+without a serial line. If packets of a scan are missing, its end may be missing too. Such a scan may
+become only slightly longer than the previous scan.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from lidarspec.spec.timing import Every
 
 #: The duration of the slowest revolution, if the sensor does not declare it.
 SLOWEST_TURN_S = 1.0
-#: The lowest time limit if packets have only arrival times, because arrival may pause.
+#: The minimum of the time limit if packets have only arrival times. Packets may arrive with pauses.
 MIN_LIMIT_S = 1.0
-#: The size limit without a constant number of points and without a serial line.
+#: The size limit, bytes, if the number of points varies and the source is not a serial line.
 MAX_BYTES = 1 << 26
-#: A scan with a gap may become longer than the last whole scan by this factor.
+#: A scan with missing packets may have at most this factor times the packets of a whole scan.
 MAX_GROWTH = 1.125
 
 
@@ -61,7 +61,7 @@ class ScanLimits:
         """Return whether a scan is within the limits.
 
         Args:
-            scan: the scan, including these packets.
+            scan: the scan, including `packets`.
             packets: the last packets of the scan.
             usual: the number of packets of a whole scan.
         """
@@ -79,7 +79,7 @@ class ScanLimits:
         """Find the first packet with which a scan exceeds the limits.
 
         Args:
-            scan: the scan, without these packets.
+            scan: the scan, without `packets`.
             packets: the next packets.
             usual: the number of packets of a whole scan.
 

@@ -191,7 +191,7 @@ class Masking:
         return packets
 
     def _mark(self, packets: Packets) -> Packets:
-        """Return packets with `masked`: the number of packets left out before each packet."""
+        """Set `masked` of packets to the number of packets that the sector leaves out."""
         angles = self._reader.angles(packets.table)
         sector = self.sector
         if not self._has_marked:

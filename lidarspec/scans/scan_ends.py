@@ -41,8 +41,9 @@ class ScanEnd(NamedTuple):
         point: the index of the first point after the end.
         packet: the row of the packet that shows the end, which may have no points; None if a point
             shows the end.
-        is_leap: whether the angle leaps by more than `MIN_TURNS_AWAY`, and twice as far as at the
-            previous end. If so, packets are missing there, or the value is not an angle.
+        is_leap: whether the angle leaps at the end, by more than `MIN_TURNS_AWAY` and by more than
+            twice the step at the previous end. If so, packets are missing there, or the value is
+            not an angle.
     """
 
     point: int

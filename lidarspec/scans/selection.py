@@ -117,9 +117,10 @@ class Selection:
 
     @property
     def needs_all_scans(self) -> bool:
-        """Whether the result depends on the scans before; a file is then not cut into pieces.
+        """Whether the result for a scan depends on the scans before it.
 
-        Scans are counted, or the times of packets in UTC depend on earlier arrival times.
+        This is the case if scans are counted, or if times are in UTC, which depends on earlier
+        arrival times. A file is then not read in pieces.
         """
         return self.is_counted or self.time == "utc"
 
@@ -141,7 +142,7 @@ def _check_order(low: Any, high: Any) -> None:
         raise UsageError(f"start and end are equal: {low}")
 
 
-#: This selection has all scans of a source.
+#: The selection of all scans of a source.
 EVERYTHING = Selection()
 
 
@@ -299,7 +300,7 @@ class ScanSelector:
         selection: the selection.
         source: the name of the source, for messages.
         skip: a function that skips the data of the source that arrived before a time, ns since
-            1970, and returns whether it did; None if the source cannot seek.
+            1970, and returns whether it skipped data; None if the source cannot seek.
 
     Attributes:
         ended: whether all selected scans have passed.

@@ -141,9 +141,9 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return the packets that have points: these packets, or their parts.
+        """Return the packets that have points: `packets`, or their parts.
 
-        A frame without parts leaves no gap in the index.
+        Parts are numbered so that a frame without parts leaves no gap in the index.
         """
         parts = packets.with_points
         if parts is not packets:
@@ -256,7 +256,9 @@ class ScanStream:
 def _read_starts(
     packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
-    """Return the starts of the scans that begin with some points; None past the end.
+    """Return the start of the scan that begins at each of some points.
+
+    The item is None if the index is past the last point.
 
     Args:
         indices: the indices of the first points of scans in `points`, ascending.
