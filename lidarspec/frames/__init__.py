@@ -4,9 +4,9 @@ The modules use the tree of a frame type (`spec.tree`) to find the layout of its
 and build single frames, and to read tables of many frames. Modules in reading order:
 
 * `schema`: the fields of a frame type as a table, without bytes.
-* `compilability`: a check for structs that have no layout.
+* `compilability`: finds structs that cannot have layouts.
 * `layout`: the offsets of all fields for one header variant, and functions that load and store.
-* `measured_size`: sizes that are found by reading the content, such as that of a text.
+* `measured_size`: sizes that are found by reading the content, such as the size of a text.
 * `parts`: searches the parts of many frames (frames within a frame) at once.
 * `layout_tree`: the layouts of a frame type, selected by header fields.
 * `wire_coder`: converts between encoded frames and the bytes of their structs.
@@ -16,7 +16,7 @@ and build single frames, and to read tables of many frames. Modules in reading o
 * `build`, `encode`: check the values of one frame, and store them by the layout.
 * `wire_fields`: finds the fields of one frame with their offsets, even if it is invalid.
 * `diagnose`: finds the first fault of a frame.
-* `plain`: parses and builds frames without a layout with construct.
+* `plain`: parses and builds frames that have no layout, with construct.
 * `commands`: builds the frame of a command from its arguments.
 * `field_paths`: paths of fields as names and indices.
 * `wire_table`: the table of a frame type: offsets, widths, units, descriptions.

@@ -76,8 +76,8 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 
     Args:
         values: the values.
-        few: with at most this number of distinct values, a search for each value is used, which is
-            then faster than sorting.
+        few: up to this number of distinct values, each value is searched for, which is faster than
+            sorting the values.
     """
     values_found = list[int]()
     left = values
@@ -114,10 +114,10 @@ def keep_freed_memory() -> None:
     It is called before the first large batch is decoded.
 
     The columns of a batch are blocks of several hundred kilobytes, which are freed after
-    milliseconds. glibc by default requests each such block from the system, and its page faults
-    take several times as long as computing the columns. glibc keeps blocks that are smaller than
-    the largest block that was ever freed. This function therefore allocates one large block and
-    frees it. The block is never written, so it takes no memory.
+    milliseconds. By default, glibc requests each such block from the system. The page faults of the
+    block take several times as long as computing the columns. glibc keeps blocks that are smaller
+    than the largest block that was ever freed. This function therefore allocates one large block
+    and frees it. The block is never written, so it takes no memory.
 
     Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
     M_TRIM_THRESHOLD to twice its value.

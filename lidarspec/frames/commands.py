@@ -39,9 +39,9 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     """Return the bytes of a command; b"" for a command that only sets control lines.
 
     Args:
-        arguments: the arguments by name, in the units of their fields. They may also have values
-            that are known only when the command is sent, by the path of their field, and values of
-            a template by name.
+        arguments: the arguments by name, in the units of their fields. The mapping may also contain
+            values that are known only when the command is sent, by the path of their field, and
+            values of a template by name.
 
     Raises:
         UnknownCommand: if the sensor has no such command.
@@ -255,13 +255,13 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
 
 
 def list_choices(info: FieldInfo, kind: Range) -> dict[str, float]:
-    """Return the names that an argument takes, and their physical values."""
+    """Return the names that an argument accepts, and their physical values."""
     values = {name: info.physical(raw) for raw, name in info.labels.items()}
     return {name: value for name, value in values.items() if kind.low <= value <= kind.high}
 
 
 def has_only_names(kind: Range, choices: Mapping[str, float]) -> bool:
-    """Return whether each number that an argument takes has a name."""
+    """Return whether each number that an argument accepts has a name."""
     return isinstance(kind, Choice) or len(choices) > kind.high - kind.low
 
 
@@ -269,7 +269,7 @@ def _find_named(info: FieldInfo, kind: Range, name: str, place: str) -> float:
     """Return the physical value of a name.
 
     Raises:
-        UsageError: if the argument takes no such name.
+        UsageError: if the argument does not accept the name.
     """
     choices = list_choices(info, kind)
     if name not in choices:

@@ -1,7 +1,7 @@
 """Check which structs can be compiled.
 
-A struct cannot be compiled if it has a part whose offset does not follow from header fields.
-construct then parses the frames.
+A struct cannot be compiled if it has a part whose offset does not follow from header fields. Frames
+of such a struct are parsed by construct.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """A part of a struct, at `path`, has no computable offset, for this `reason`."""
+    """The offset of the part at `path` of a struct cannot be computed, for a `reason`."""
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path

@@ -166,7 +166,7 @@ class _Encoder:
             raise self._make_missing_error(path.removesuffix(".size"))
         value = self.read(path)
         if value is None:
-            raise self._missing_count_error(path)
+            raise self._make_missing_field_error(path)
         return int(value)
 
     def read(self, path: str) -> Any:
@@ -435,7 +435,7 @@ class _Encoder:
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
     ) -> None:
-        """Raise `UsageError` if the header declares other parts, or a condition is false."""
+        """Raise `UsageError` if parts contradict the header, or if a condition is false."""
         for axis, region in layout.regions.items():
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
@@ -457,7 +457,7 @@ class _Encoder:
     def _make_shown_path(self, path: str) -> str:
         return f"{self._prefix}.{path}".strip(".")
 
-    def _missing_count_error(self, path: str) -> UsageError:
+    def _make_missing_field_error(self, path: str) -> UsageError:
         """Return the error for a missing field that the layout depends on."""
         for axis, counting in self._schema.counting_fields.items():
             array = get_member(self._given, axis, None)
@@ -597,8 +597,9 @@ def _find_count(
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part, given its values.
 
-    This is a kind that has all given fields and no contradicting constant; of several, the one with
-    the fewest fields that are not given. If there is none, it is the first of all kinds.
+    The kind has to have all given fields, and no constant that contradicts them. If several kinds
+    fit, the kind with the fewest fields that are not given is returned. If no kind fits, the first
+    of all kinds is returned.
     """
     possible = list[tuple[int, Kind]]()
     for kind in node.kinds:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from lidarspec.frames.parts import FoundParts
 
 
-#: The reason why an array in elements has no length for each frame.
+#: The reason why an array inside the elements of an array has no single length per frame.
 VARYING_LENGTH = "its length varies within one frame, so it cannot be a column"
 
 
@@ -211,9 +211,9 @@ class CompiledTable:
     def _present_of_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
         """Return which frames have a field in an array of elements that differ in size.
 
-        The result is (n,) if the field is in all elements or in none of each frame: a frame whose
-        elements all lack it has none, and a frame with an empty array has it. Otherwise the result
-        is (n, *lengths), for each element.
+        The result is (n,) if each frame has the field in all of its elements or in none. A frame
+        with an empty array counts as having the field. Otherwise the result has a value for each
+        element, (n, *lengths).
         """
         base, indices = without_indices(path)
         if indices:
@@ -302,7 +302,8 @@ class CompiledTable:
         The result is cached, because the clock, the points and each kind of parts use it.
 
         Returns:
-            For each group, the group, the buffer that contains its frames, and the parts in it.
+            For each group, a tuple of the group, the buffer that contains its frames, and the parts
+            in these frames.
         """
         if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)

@@ -311,8 +311,8 @@ class Leaf:
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
         """Return one element of the arrays of the field; None if it does not exist.
 
-        A negative index counts from the end. If an array with an index contains an array without
-        one, its axis is kept with length 1.
+        A negative index counts from the end. If an outer array has an index and an inner array has
+        none, the axis of the outer array is kept, with length 1.
         """
         info = get_element(self.info, path, indices)
         if info is None:
@@ -653,7 +653,7 @@ class Layout:
             are written when a frame is built, and not checked when it is parsed.
         lengths: the length of each array, by its axis; 0 for an array inside an empty array.
         regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
-        held: the bits of the fields that declare the sizes of parts, in the form of `constants`.
+        held: the bits of the fields that declare the sizes of parts, as (mask, value) by offset.
         conditions: the conditions that the values of fields have to meet.
         derived: the `Derivation` of each value without bytes of its own, by path; the `Leaf` of
             another field if the value is a copy of this field.

@@ -132,10 +132,10 @@ class HeaderWalk:
     values: Mapping[str, int]
     limit: int
     given: Mapping[str, int] = field(default_factory=dict)
-    #: A function that returns the value of a field that is not in `values`. It may replace
-    #: `values`.
+    #: A function that returns the value of a field that is not in `values`. The function may
+    #: replace `values`.
     request: ValueRequest = _raise_unknown
-    #: The size of the frame in bytes if no more bytes follow; None if more may follow.
+    #: The size of the frame in bytes if the frame is complete; None if more bytes may follow.
     room: int | None = None
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
@@ -145,13 +145,13 @@ class HeaderWalk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
-    #: The regions of unknown size.
+    #: The regions with parts whose total size is not known yet, by their axis.
     open_regions: dict[str, Region] = field(default_factory=dict)
     #: The conditions that values have to meet, each once.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: The values without bytes of their own, by path.
     derived: dict[str, Leaf | Derivation] = field(default_factory=dict)
-    #: The offset of each part; in arrays, the offset of the first element.
+    #: The offset of each part. For a part in arrays, it is the offset of the first element.
     starts: dict[str, int] = field(default_factory=dict)
     #: The number of elements without bytes in all arrays.
     empty: int = 0

@@ -1,4 +1,4 @@
-"""Sizes that are not in the header of a frame: they are found by reading the content.
+"""Sizes that are found by reading the content of a frame, not its header.
 
 The layout of a frame depends on header fields and on these sizes, so they have the methods of a
 field. The sizes of sequences of parts are in `parts`.
@@ -25,8 +25,8 @@ CUT_OFF = 1
 #: The status of a frame if the content has an invalid length.
 LENGTH = 2
 
-#: The number of marks for which each frame is searched in the first step. Most texts are shorter.
-#: Each further step searches `WINDOW_GROWTH` times as many.
+#: The number of bytes of each frame that are searched in the first step, in units of the size of
+#: the mark. Most texts are shorter. Each further step searches `WINDOW_GROWTH` times as many bytes.
 FIRST_WINDOW_MARKS = 32
 WINDOW_GROWTH = 8
 #: The maximum number of bytes that are searched in one step, of all frames together.
@@ -74,7 +74,7 @@ class MeasuredSize(ABC):
 
 @dataclass(frozen=True, eq=False)
 class TextSize(MeasuredSize):
-    """The size of bytes that a mark or the end of the datagram ends.
+    """The size of bytes that end at a mark, or at the end of the datagram.
 
     Attributes:
         ending: the mark.

@@ -75,9 +75,11 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Return values with each code of an Enum as construct has it: a string with a number.
+    """Return values with each code of an Enum as a string that also has the number.
 
-    `Const` and `Switch` of a struct that construct builds compare the names of codes.
+    construct returns codes in this way.
+
+    When construct builds a struct, `Const` and `Switch` compare the names of codes.
     """
     if isinstance(value, Mapping):
         return Container(

@@ -63,9 +63,10 @@ MIN_BATCH_ROWS = 4
 #: The number of bytes of rows that are processed together. It is small enough for the caches, and
 #: large enough to make the cost of a call of NumPy negligible.
 BLOCK_BYTES = 1 << 20
-#: `_compute_by_position` is used if all rows together have at most this number of bytes, ...
+#: `_compute_by_position` is used up to this number of bytes in all rows together.
 MAX_TABLE_BYTES = 1 << 13
-#: ... and each row has at most this number of bytes. Longer rows of the usual CRC-32 use zlib.
+#: `_compute_by_position` is used up to this number of bytes in each row. For longer rows, the usual
+#: CRC-32 uses zlib.
 MAX_TABLE_ROW_BYTES = 1 << 7
 #: From this number of rows on, `_sum_words` is faster than tables.
 MIN_SUM_ROWS = 1024
@@ -430,13 +431,13 @@ def _compute_narrow(
         )
         left = left[half:]
         left[-half:] ^= np.frombuffer(moved, np.uint64).reshape(half, -1)
-    side: NDArray[Any] = left[0]
+    words: NDArray[Any] = left[0]
     for size in (4, 2, 1):
-        parts = side.view(f"<u{size}")
+        parts = words.view(f"<u{size}")
         moved = parts[::2].tobytes().translate(_make_advance_table(size, width, poly, refin))
-        side = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
+        words = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
     return np.frombuffer(
-        side.tobytes().translate(_make_advance_table(1, width, poly, refin)), np.uint8
+        words.tobytes().translate(_make_advance_table(1, width, poly, refin)), np.uint8
     )
 
 
@@ -463,9 +464,9 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word the sums of `_sum_words` into which the word is XORed.
+    """Return a value for each word that selects the sums into which it is XORed.
 
-    If bit n of a value is set, n from 0 to 7, they include the sum that is advanced by n bytes.
+    Bit n of the value, from 0 to 7, selects the sum of `_sum_words` that is advanced by n bytes.
     """
     found = [1]
     while len(found) < number:
@@ -489,12 +490,12 @@ def _compute_wide(
     padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
     padded[:, -length:] = rows
     padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
-    side = np.zeros(padded.size // segment, table.dtype)
-    low = side.view("<u2")[:: table.itemsize // 2]
+    registers = np.zeros(padded.size // segment, table.dtype)
+    low = registers.view("<u2")[:: table.itemsize // 2]
     for pair in np.ascontiguousarray(padded.reshape(-1, segment).view("<u2").T):
         after = table.take(low ^ pair)
-        side[:] = after if width <= 16 else after ^ side >> 16
-    found = side.reshape(count, -1)
+        registers[:] = after if width <= 16 else after ^ registers >> 16
+    found = registers.reshape(count, -1)
     while found.shape[1] > 1:
         odd = found.shape[1] % 2
         jumped = _jump(

@@ -156,7 +156,7 @@ class Schema:
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
-        """The axes of the deepest nested arrays, or of the first of several."""
+        """The axes of the field that is inside the most arrays, outermost array first."""
         return max(
             (info.axes for info in self.fields.values() if info.kind != "bytes"),
             key=len,
@@ -165,7 +165,7 @@ class Schema:
 
     @property
     def has_measured_sizes(self) -> bool:
-        """Whether the layout depends on sizes that only the content determines."""
+        """Whether the layout depends on sizes that are found by reading the content."""
         return bool(self.parts or self.endings)
 
     @cached_property
@@ -211,7 +211,7 @@ class Schema:
 
     @cached_property
     def places(self) -> Mapping[str, int]:
-        """The number of arrays that contain each array, by its path."""
+        """The number of arrays that contain each array, by the path of the array."""
         return {
             axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)
         }
@@ -237,7 +237,10 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the array of parts that contains a field, or that is the path; None without."""
+        """Return the array of parts at a path, or around the field at a path.
+
+        Returns None if there is no such array.
+        """
         if not self.parts:
             return None
         base = without_indices(path)[0]
@@ -251,7 +254,7 @@ class Schema:
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:
-        """Return the number of the deepest nested arrays."""
+        """Return the maximum number of arrays that contain one field."""
         return len(self.chain)
 
 

@@ -1,9 +1,9 @@
 """Convert between encoded frames and the bytes of their structs.
 
 Most frames are sent as the bytes of their struct (`Coder`). A frame type with a wire form
-(`lidarspec.spec.wire_forms`) has a `FormCoder`. It passes the next fields to the wire form, which
-it knows from the layouts of the struct, and describes the fault of bytes that are not a valid
-frame.
+(`lidarspec.spec.wire_forms`) has a `FormCoder`. The layouts of the struct determine its next
+fields, which the coder passes to the wire form. The coder also describes the fault of bytes that
+are not a valid frame.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from lidarspec.spec.wire_forms import (
 
 #: The name under which parsed values keep the original frame, if `encode` cannot restore it.
 SPELLING = "_wire"
-#: Bytes of an invalid field to show in an error.
+#: The maximum number of bytes of an invalid field that an error shows.
 MAX_SHOWN_BYTES = 12
 
 
@@ -129,7 +129,8 @@ class FormCoder(Coder):
     Attributes:
         form: the wire form.
         tree: the layouts of the struct.
-        prefix: the bytes before the first number that are the same in all frames, by offset.
+        prefix: the bytes that are the same in all frames and are before the first number, by
+            offset.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
@@ -174,7 +175,7 @@ class FormCoder(Coder):
     def decode_whole(self, data: bytes) -> Decoded:
         """Decode a frame that consists of exactly these bytes.
 
-        The problem of the result may have no reason.
+        The problem of the result, if any, may have no reason.
         """
         return self.form.decode(data, _FieldFinder(self.tree))
 
@@ -304,7 +305,7 @@ def list_runs(layout: Layout) -> Sequence[Run]:
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
     """Return the runs of fields between two offsets of a struct.
 
-    Bytes between fields, such as constants without a name, are a text field.
+    Bytes between fields, such as constants without a name, are treated as a text field.
     """
     offsets, owners = _locate_elements(leaves)
     inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))

@@ -1,8 +1,8 @@
 """Find the fields of one frame with their offsets, even if it is invalid or truncated.
 
 `examine` finds the layout of the bytes, or as much of it as truncated bytes determine.
-`ExaminedFrame.fields` iterates over the frame tree with this layout. Errors
-(`lidarspec.frames.diagnose`) and explanations use both.
+`ExaminedFrame.fields` iterates over the frame tree with this layout. `lidarspec.frames.diagnose`
+and the explanations of frames use both.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class PlacedSeal:
 
 @dataclass(frozen=True)
 class ExaminedParts:
-    """The parts of a frame at a path; the last part is invalid unless `is_whole`."""
+    """The parts of a frame at a path. Unless `is_whole`, the last part is invalid."""
 
     parts: list[ExaminedFrame]
     is_whole: bool

@@ -295,7 +295,8 @@ class DeviceClock:
     def _was_set(self, lasting: int) -> bool:
         """Return whether the outliers show that the clock was set.
 
-        Args: lasting: the time since the first outlier, ns.
+        Args:
+            lasting: the time since the first outlier, ns.
         """
         newest = self._min_delays[-1].device
         outliers = list(self._outliers)
