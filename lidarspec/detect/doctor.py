@@ -44,7 +44,7 @@ from lidarspec.transports.udp import (
 from lidarspec.transports.usb_adapters import list_missing_drivers
 
 LOOPBACK = "lo"
-#: the reported facts that identify a device.
+#: The reported facts that identify a device.
 IDENTITY = ("serial", "firmware", "model", "temperature")
 
 
@@ -77,7 +77,7 @@ def examine(
     Args:
         source: the source to check.
         sensor: the expected sensor; None to detect it.
-        seconds: time to listen, for each baud rate.
+        seconds: the time to listen at each baud rate.
     """
     text = resolve(source)
     address = live_address(text)
@@ -265,7 +265,7 @@ def _check_interfaces(
     Args:
         numbers: the ports.
         host: the address of this computer in the SOURCE; "" if it has none.
-        rates: interface -> received packets per second.
+        rates: the received packets per second, by interface.
     """
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}

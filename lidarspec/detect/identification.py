@@ -56,19 +56,20 @@ from lidarspec.transports.protocol import no_bytes
 
 #: Relative tolerance of the clock step per packet.
 PACE_TOLERANCE = 0.03
-#: Maximum number of frames to read the model name from.
+#: The maximum number of frames to read the model name from.
 MAX_NAMED_FRAMES = 3
-#: Number of packets to simulate, to find the clock step per packet of a sensor.
+#: The number of packets to simulate, to find the clock step per packet of a sensor.
 SIMULATED_PACKETS = 64
-#: Maximum number of bytes to show in an error.
+#: The maximum number of bytes to show in an error.
 MAX_SHOWN_BYTES = 16
-#: A sensor fits if at least this share of the bytes is in its frames, from 0 to 1.
+#: A sensor fits if at least this share (0 to 1) of the bytes is in its frames.
 FITTING_SHARE = 0.2
 #: Shares that differ by at most this value are equally good.
 EQUAL_SHARE_TOLERANCE = 0.01
-#: A sensor is certain if at least this share of the bytes is in its frames, from 0 to 1.
+#: A sensor is certain if at least this share (0 to 1) of the bytes is in its frames.
 CLEAR_SHARE = 0.9
-#: Minimum number of data frames for a match without valid checksums, which may be coincidence.
+#: The minimum number of data frames for a match of frames with invalid checksums. Fewer frames may
+#: match by coincidence.
 MIN_UNCHECKED_FRAMES = 3
 
 
@@ -76,10 +77,11 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        candidates: id of each candidate that may have sent the frames -> evidence; "" for no
+        candidates: the evidence for each candidate that may have sent the frames, by id; "" without
             evidence.
-        others: id of each related model without an installed plugin that may have sent the frames
-            -> its difference. If `candidates` is empty, one of these models has sent the frames.
+        others: related models without an installed plugin that may have sent the frames: the
+            difference of each, by id. If `candidates` is empty, one of these models has sent the
+            frames.
     """
 
     candidates: dict[str, str]
@@ -94,7 +96,7 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
 
     Args:
         candidates: sensors that decode the same data frames.
-        frames: id of each candidate -> its decoded frames, in the order of arrival.
+        frames: the frames that each candidate decoded, by id, in the order of arrival.
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
@@ -147,9 +149,9 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return {id: difference} of the related models that must have sent the frames.
+    """Return related models that have sent the frames instead, as {id: difference}.
 
-    More than half of the packets must have a property that only this model has.
+    More than half of the packets have a property that only such a model has.
     """
     distinct_relatives = {
         name: relative
@@ -181,12 +183,12 @@ def _keep_matching(
 
     Args:
         candidates: the possible sensors.
-        match: returns the evidence that a sensor matches; "" if it does not match.
-        frames: id of each candidate -> its frames.
+        match: a function that returns the evidence that a sensor matches; "" if it does not match.
+        frames: the frames of each candidate, by id.
 
     Returns:
-        An empty dict if the criterion does not distinguish the sensors: none of them matches, or
-        all of several do.
+        The evidence by id. The dict is empty if the criterion does not distinguish the sensors,
+        because none of them matches, or because there are several and all of them match.
     """
     if len(candidates) == 1 and not candidates[0].relatives:
         return {}
@@ -201,7 +203,7 @@ def _keep_matching(
 
 
 def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return the evidence that the clock in the frames matches a sensor, or ""."""
+    """Return the evidence that the clock in the frames matches a sensor; "" if none."""
     if not sensor.has_points:
         return ""
     data = [item for item in frames if item.frame == sensor.data_frame]
@@ -252,7 +254,7 @@ def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
     """Return the clock step per packet of the simulated sensor, ns; None if unknown.
 
     Args:
-        sensor_id: id of the sensor; part of the key of the cache.
+        sensor_id: the id of the sensor, which is part of the key of the cache.
         sensor: the sensor.
     """
     try:
@@ -271,7 +273,7 @@ def _evaluate_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
 
 
 def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return the evidence that the frames name the model of a sensor, or ""."""
+    """Return the evidence that the frames name the model of a sensor; "" if none."""
     return next(
         (
             f"{sensor.reported['model'].paths[0]} is {text}"
@@ -301,7 +303,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
-        Role -> text, for example "serial" -> "A1234". Numbers are followed by their unit.
+        Texts by role, for example {"serial": "A1234"}. Numbers are followed by their unit.
     """
     items = sorted(frames, key=lambda item: item.offset)
     texts = dict[str, str]()
@@ -361,7 +363,8 @@ def _describe_fact(fact: Reported, value: Any, info: FieldInfo) -> str:
 def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
     """Return the raw value and the description of a field.
 
-    If the field is in repeated parts, returns the value in the first part that has it, or "".
+    If the field is in repeated parts, the value of the first part that has the field is returned.
+    Without such a part, the value is "".
     """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
@@ -378,14 +381,14 @@ def _get_nested(parsed: Any, path: str) -> Any:
 
 
 def _describe_value(value: Any, info: FieldInfo) -> str:
-    """Return the text in a field, or the name of its code, or ""."""
+    """Return the text in a field or the name of its code; "" if it has neither."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
     return info.labels.get(value, "")
 
 
 def _split_names(text: str) -> list[str]:
-    """Return the model names in a text, which may be that of several models."""
+    """Return the model names in a text, which may name several models."""
     return re.split(r",| and ", text)
 
 
@@ -402,7 +405,7 @@ class Score:
         share: the share of the bytes that are in frames of the sensor.
         data_frames: number of decoded data frames.
         found: all decoded frames.
-        why: further evidence for this sensor; "" for none.
+        why: further evidence for this sensor; "" without any.
     """
 
     sensor: Sensor
@@ -420,9 +423,9 @@ class Verdict:
         sample: the bytes.
         scores: all sensors that fit, best first.
         candidates: the sensors that remain possible after comparing related models.
-        others: id of each possible related model without an installed plugin -> its difference. If
-            `candidates` is empty, one of these models has sent the bytes.
-        fault: description of the fault if frames match a sensor except for their checksums; else
+        others: related models without an installed plugin that are possible: the difference of
+            each, by id. If `candidates` is empty, one of these models has sent the bytes.
+        fault: a description of the fault if frames match a sensor except for their checksums; else
             "".
     """
 
@@ -465,7 +468,7 @@ def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
 
 
 def _list_sensors_with_frames() -> list[Sensor]:
-    """Return the installed sensors that have frames without a configuration."""
+    """Return the installed sensors with frames that need no configuration."""
     return [sensor for sensor in sensors().values() if sensor.incoming]
 
 
@@ -510,7 +513,7 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the stored checksums as the computed checksums, so that all are valid."""
+    """Return the stored checksums in place of computed ones, so that all are valid."""
     return seal.load_stored(rows)
 
 
@@ -523,7 +526,7 @@ def _score_each(
 
     Args:
         candidates: the sensors.
-        rate: returns the score of a sensor; None if the sensor does not fit.
+        rate: a function that returns the score of a sensor; None if the sensor does not fit.
     """
     shared: dict[object, Score | None] = {}  # key: identity of the frames, and id of the sensor
     for sensor in candidates:
@@ -572,7 +575,8 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
     """Return the score of a sensor as if the reply before its data had been received.
 
     Some data frames are valid only after another frame, such as a reply. If the sensor has several
-    such data frames, returns the best score. Returns None if it has none, or if none fits.
+    types of such data frames, the best score is returned. Returns None if the sensor has no such
+    type, or if none fits.
     """
     names = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scores = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in names]
@@ -641,8 +645,8 @@ def identify_senders(
 
     Args:
         source: the source.
-        seconds: time to listen at each baud rate.
-        on_progress: called with a description of the source before each attempt.
+        seconds: the time to listen at each baud rate.
+        on_progress: a function that is called with a description of the source before each attempt.
 
     Raises:
         SourceError: if the source cannot be opened.
@@ -721,7 +725,7 @@ def format_sensor_options(sensor: Sensor) -> str:
 
 
 def verb_to_show(sensor: Sensor) -> str:
-    """Return the verb of the command line that shows a sensor's data."""
+    """Return the subcommand that shows a sensor's data."""
     if sensor.has_points:
         return "view"
     return "stats"
@@ -806,7 +810,7 @@ def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 
-#: Minimum number of equal constant bits for bytes to resemble a frame type.
+#: The minimum number of equal constant bits for bytes to resemble a frame type.
 MIN_CONSTANT_BITS = 8
 
 

@@ -26,23 +26,24 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, open_live, open_transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
-#: maximum number of datagrams to read from a file.
+#: The maximum number of datagrams to read from a file.
 MAX_FILE_DATAGRAMS = 400
-#: number of bytes after which listening to a live source stops.
+#: The number of bytes after which listening to a live source stops.
 ENOUGH_BYTES = 1 << 14
-#: time to listen to a live source.
+#: The time to listen to a live source.
 LISTEN_S = 1.2
-#: maximum duration of one read while listening.
+#: The maximum duration of one read while listening.
 LISTEN_READ_S = 0.1
-#: time to wait for data after a device has replied to a start command. Its motor may need time.
+#: The time to wait for data after a device has replied to a start command. Its motor may need time.
 DATA_TIMEOUT_S = 4.0
-#: time to wait for data if a device has not replied.
+#: The time to wait for data if a device has not replied.
 UNCONFIRMED_DATA_TIMEOUT_S = 1.0
-#: maximum duration of one read while probing. If nothing arrives in this time, the line is idle.
+#: The maximum duration of one read while probing. If nothing arrives in this time, the line is
+#: idle.
 PROBE_READ_S = 0.05
-#: time to wait for replies to the stop commands.
+#: The time to wait for replies to the stop commands.
 STOP_TIMEOUT_S = 2.0
-#: baud rate for a pseudo-terminal, which ignores it, and for examples in messages.
+#: The baud rate for a pseudo-terminal, which ignores it, and for examples in messages.
 ANY_BAUD = 115_200
 #: UDP port for examples in messages.
 EXAMPLE_PORT = 2368
@@ -79,12 +80,12 @@ def read_samples(
     """Yield the bytes of each sender of a source.
 
     If the source is a serial port without a baud rate, each rate that installed sensors declare is
-    tried. If nothing is received at the most common, the lowest and the highest rate, the other
-    rates are not tried: data that is sent at another rate is received as invalid bytes.
+    tried. Data that is sent at another rate is received as invalid bytes. If nothing is received at
+    the most common, the lowest and the highest rate, the other rates are therefore not tried.
 
     Args:
         source: the source.
-        seconds: time to listen to a live source, for each baud rate.
+        seconds: the time to listen to a live source, at each baud rate.
         on_progress: called with a description of the source before each attempt.
 
     Raises:
@@ -134,7 +135,7 @@ def read_samples(
 
 
 def has_no_baud(port: str) -> bool:
-    """Return whether a port is a pseudo-terminal, which ignores the baud rate."""
+    """Return whether a port has no baud rate, because it is a pseudo-terminal."""
     return os.path.realpath(port).startswith("/dev/pts/")
 
 
@@ -155,7 +156,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
 
 
 def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a warning if all datagrams came from other senders; empty otherwise."""
+    """Return a tuple with a warning if all datagrams came from other senders, else ()."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)

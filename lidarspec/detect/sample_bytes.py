@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: number of bytes of a file to examine. The last chunk may exceed this number.
+#: The number of bytes of a file to examine. The last chunk may exceed this number.
 MAX_SAMPLE_BYTES = 1 << 17
-#: maximum number of bytes to examine to recognise text.
+#: The maximum number of bytes to examine to recognise text.
 MAX_TEXT_BYTES = 1 << 12
-#: minimum number of bytes that can be recognised as text.
+#: The minimum number of bytes that can be recognised as text.
 MIN_TEXT_BYTES = 16
 
 
@@ -31,7 +31,7 @@ class SampleBytes:
         datagrams: whether `chunks` are datagrams.
         baud: the baud rate at which a serial port was read; None for other sources, and for a port
             without a baud rate.
-        sender: address of the sender, if the source has several senders; else "".
+        sender: the address of the sender if the source has several senders; else "".
         failure: the error if the source could not be opened; else None.
         warnings: warnings of the transport after reading.
         ports: the UDP ports to which datagrams of a capture were sent.

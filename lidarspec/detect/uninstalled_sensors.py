@@ -1,9 +1,9 @@
 """Recognize bytes of sensors that are not installed, with the table of known sensors.
 
 Without the plugin, frames cannot be parsed. The evidence is therefore weaker than in
-`identification`: the constant bytes at the start of a data frame, the frame size, and the UDP
-ports. They are often the same for several sensors of a vendor, but sufficient to name the
-distribution to install.
+`identification`. It consists of the constant bytes at the start of a data frame, the frame size,
+and the UDP ports. They are often the same for several sensors of a vendor, but sufficient to name
+the distribution to install.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from lidarspec.known_sensors import KnownSensor, Signature, install_command, kno
 from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
 
-#: maximum number of bytes at the start of a frame to put into a signature.
+#: The maximum number of bytes at the start of a frame to put into a signature.
 MAX_SYNC_BYTES = 16
-#: minimum number of constant bytes of a signature.
+#: The minimum number of constant bytes of a signature.
 MIN_SYNC_BYTES = 2
-#: minimum share of the datagrams, or of the bytes of a stream, that must match.
+#: The minimum share of the datagrams, or of the bytes of a stream, that must match a signature.
 MIN_MATCHING_SHARE = 0.2
-#: minimum number of consecutive frames in a stream, for frames of fixed size.
+#: The minimum number of consecutive frames in a stream, for frames of fixed size.
 MIN_CONSECUTIVE_FRAMES = 3
-#: minimum number of sync bytes in a stream, for frames of variable size.
+#: The minimum number of sync bytes in a stream, for frames of variable size.
 MIN_SYNC_COUNT = 8
-#: minimum ratio of the number of sync bytes to the number that is expected by coincidence.
+#: The minimum ratio of the number of sync bytes to the number that is expected in random bytes.
 MIN_RATIO_TO_CHANCE = 20
-#: maximum number of sensors in a message.
+#: The maximum number of sensors in a message.
 MAX_LISTED_SENSORS = 6
 
 
@@ -51,7 +51,7 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
 
 
 def _format_sync(constant: dict[int, int]) -> str:
-    """Return constant bytes, offset -> value, in hexadecimal; other bytes are ".."."""
+    """Return constant bytes, given by offset, in hexadecimal; other bytes are ".."."""
     length = max(constant, default=-1) + 1
     return " ".join(
         f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)

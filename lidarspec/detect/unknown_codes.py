@@ -1,4 +1,4 @@
-"""Find codes that a sensor sent and that its spec does not name, in its first frames."""
+"""Find codes in the first frames of a sensor that its spec does not name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.enum_values import EnumValue
 
-#: Maximum number of frames of one type to parse.
+#: The maximum number of frames of one type to parse.
 MAX_PARSED_FRAMES = 4
 
 

@@ -1,8 +1,7 @@
 """File formats of scans, by the suffix of the file.
 
-In: scans. Out: a file with the points, written by `write`. The file has a temporary name until it
-    is complete. `formats` returns all formats, including those of plugins. Modules in reading
-    order:
+`write` writes the points of scans to a file. The file has a temporary name until it is complete.
+`formats` returns all formats, including the formats of plugins. Modules in reading order:
 
 * `common`: functions shared by the formats.
 * `text`: .csv, .csv.gz and .xyz, one row per point.
@@ -55,14 +54,14 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: placeholder in a path -> the characters of a scan's stamp, as ISO text, that replace it.
+#: For each placeholder in a path, the characters of a scan's stamp (as ISO text) that replace it.
 TIME_PLACEHOLDERS = {
     "%F": slice(10),
     "%H": slice(11, 13),
     "%M": slice(14, 16),
     "%S": slice(17, 19),
 }
-#: matches a placeholder in a path, for the time or the number of a scan.
+#: Matches a placeholder in a path, for the time or the number of a scan.
 PLACEHOLDER = re.compile(rf"%0?\d?d|{'|'.join(TIME_PLACEHOLDERS)}")
 ARRAYS = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR)
 TABLES = (PARQUET, ARROW, FEATHER)
@@ -104,7 +103,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def _find_by_suffix(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> Format | None:
-    """Return the format with the longest suffix of a name (.csv.gz); None if unknown."""
+    """Return the format with the longest suffix of a file name; None if it is unknown."""
     name = Path(path).name.lower()
     return max(
         (format for suffix, format in formats_by_suffix.items() if name.endswith(suffix)),
@@ -213,7 +212,7 @@ def check_holds(path: str | Path, feature: str) -> None:
     """Raise UsageError if the format of a path lacks a feature of `Format.holds`.
 
     Raises:
-        UsageError: with the formats that have the feature.
+        UsageError: if the format lacks the feature. The error lists the formats that have it.
     """
     if feature not in format_of(path).holds:
         having = ", ".join(

@@ -25,11 +25,12 @@ from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: number of values in a Zarr chunk of a column of points.
+#: The number of values in a Zarr chunk of a column of points.
 POINT_CHUNK = 1 << 18
-#: number of values in a Zarr chunk of a column of scans.
+#: The number of values in a Zarr chunk of a column of scans.
 SCAN_CHUNK = 1 << 12
-#: columns with one value per scan -> type, and unit in the form that xarray reads.
+#: The type and unit of each column with one value per scan. Units are in the form that xarray
+#: reads.
 SCAN_COLUMNS: dict[str, tuple[DTypeLike, str]] = {
     "stamp_ns": (np.int64, "nanoseconds since 1970-01-01"),
     "rate_hz": (np.float64, "Hz"),
@@ -45,7 +46,7 @@ def write_array(
     Args:
         archive: the archive.
         name: the name of the array.
-        column: its values.
+        column: the values of the array.
         height: number of rows of an organized column; None for a flat column.
     """
     with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
@@ -56,7 +57,7 @@ def write_array(
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write an .npz file: an array for each column of the points, arrays about scans.
+    """Write an .npz file with an array for each column, and arrays about the scans.
 
     A column is written if all scans have it. The column `scan` has the number of each point's scan.
     `stamp_ns`, `rate_hz` and `complete` have one value per scan. The unit of an additional column
@@ -126,7 +127,7 @@ def _make_structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
 
 
 def _make_npy_header(rows: PointRows) -> bytes:
-    """Return the header. NumPy pads it, so its length does not depend on the shape."""
+    """Return the header. NumPy pads it to a length that does not depend on the shape."""
     header = io.BytesIO()
     shape = {
         "descr": np.lib.format.dtype_to_descr(rows.dtype),
@@ -161,7 +162,7 @@ class _ZarrColumn:
     def add(self, values: NDArray[Any] | None, length: int) -> None:
         """Append values.
 
-        If `values` is None, appends `length` times nan, or 0 for integers.
+        If `values` is None, `length` values of nan are appended, or of 0 for integers.
         """
         dtype = self._array.dtype
         self._waiting.append(

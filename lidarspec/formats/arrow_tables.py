@@ -21,9 +21,9 @@ from lidarspec.points.table_types import arrow_schema
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: minimum number of points in a row group or record batch; the last may have fewer.
+#: The minimum number of points in a row group or record batch; the last may have fewer.
 MIN_GROUP_ROWS = 1 << 17
-#: maximum number of record batches in a table. More are copied to a single batch.
+#: The maximum number of record batches in a table. More are copied to a single batch.
 MAX_UNJOINED_BATCHES = 8
 
 
@@ -57,7 +57,7 @@ def iter_tables(
 
     Args:
         scans: the scans.
-        path: the path of the file. If the name of a folder in the path gives a column, for example
+        path: the path of the file. If a folder of the path gives the value of a column, for example
             scan=7, the column is omitted, as in Hive.
         every_point: whether to include points without a valid return.
     """

@@ -24,9 +24,9 @@ from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 from lidarspec.transports.robotics_logs import RAW
 
-#: message type -> topic.
+#: The topic of each message type.
 TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
-#: size of a chunk of an MCAP file. Readers load a whole chunk, so it contains about one scan.
+#: The size of a chunk of an MCAP file. Readers load a whole chunk, so it contains about one scan.
 CHUNK_BYTES = 1 << 20
 
 
@@ -39,7 +39,7 @@ class BagWriter:
 
     Attributes:
         types: the message definitions.
-        units: column -> unit, for the additional columns of the scans so far.
+        units: the units of the additional columns of the scans so far, by name.
     """
 
     def __init__(self, release: str) -> None:
@@ -157,7 +157,7 @@ def _record(log: Any, bag_writer: BagWriter, messages: Iterable[RosMessage]) -> 
             log.set_custom_data(f"unit of {name}", unit)
 
 
-#: the features of these formats.
+#: The features of these formats.
 _HOLDS = ("scans", "organized", "beams", "frame-id", "packets")
 MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap, _HOLDS)
 BAG = Format(".bag", "a ROS 1 bag", write_ros1, _HOLDS)

@@ -29,13 +29,13 @@ from lidarspec.remote_files import remove
 from lidarspec.scans.scan import Scan
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: suffix of a format that writes a folder -> pattern of the files in the folder. A folder that
-#: contains any other file is not replaced.
+#: For the suffix of each format that writes a folder, a pattern of the files in the folder. A
+#: folder that contains any other file is not replaced.
 FOLDER_FILES = {
     ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
     ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
 }
-#: the GPS epoch, 1980-01-06, in ns since 1970, minus the 18 leap seconds that apply since 2017.
+#: The GPS epoch, 1980-01-06, in ns since 1970, minus the 18 leap seconds that apply since 2017.
 #: Unix time minus this value is GPS time.
 GPS_EPOCH_NS = (315_964_800 - 18) * 10**9
 _Piece = TypeVar("_Piece")

@@ -16,7 +16,7 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: column -> name of the field in the standard.
+#: The name of each column in the standard.
 NAMES = {
     **{
         "x": "cartesianX",
@@ -32,18 +32,19 @@ NAMES = {
         "return_index": "returnIndex",
     },
 }
-#: group of limits in the header -> {beginning of a limit's name: field in the standard}.
+#: The limits in the header, by group: the beginning of a limit's name, and its field in the
+#: standard.
 LIMITS = {
     "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
     "intensityLimits": {"intensity": "intensity"},
     "indexBounds": {"row": "rowIndex", "column": "columnIndex", "return": "returnIndex"},
 }
-#: the standard's value for a point without valid coordinates.
+#: The standard's value for a point without valid coordinates.
 INVALID = 2
-#: prefix and URL of the extension that contains the additional columns.
+#: The prefix and URL of the extension that contains the additional columns.
 PREFIX = "lidarspec"
 EXTENSION = "urn:lidarspec:columns"
-#: types that libE57Format does not support -> their replacements.
+#: The replacements of types that libE57Format does not support.
 REPLACED_TYPES = {
     "f2": np.float32,
     "b1": np.uint8,
@@ -119,7 +120,7 @@ def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]
 
 
 def _make_header(number: int, scan: Scan) -> dict[str, Any]:
-    """Return the header of a scan: name -> value."""
+    """Return the header of a scan: values by name."""
     units = ", ".join(f"{name} [{unit}]" for name, unit in scan.points.units.items() if unit)
     start = (scan.stamp_ns - GPS_EPOCH_NS) * 1e-9
     return {
@@ -137,7 +138,7 @@ def _make_header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the minima and maxima of the valid points, as group -> name -> value."""
+    """Return the minima and maxima of the valid points, by group and name."""
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}

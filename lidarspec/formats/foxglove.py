@@ -21,7 +21,7 @@ from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: NumPy type -> its number in foxglove.PackedElementField.
+#: The number of each NumPy type in foxglove.PackedElementField.
 FIELD_TYPES = {"u1": 1, "b1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
 
 

@@ -32,9 +32,9 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.tree import FieldInfo
 
-#: column name -> array of numbers, or list of texts.
+#: Columns by name: arrays of numbers, or lists of texts.
 Columns = dict[str, Any]
-#: frame type -> the packets that arrived together.
+#: The packets that arrived together, by frame type.
 Batch = Mapping[str, Packets]
 
 
@@ -60,7 +60,7 @@ def frame_columns(packets: Packets) -> Columns:
 def _read_numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
     """Return a field in its unit, (n, ...) float64.
 
-    If the field is an integer without a unit, and all frames have it, returns the integers.
+    If the field is an integer without a unit, and all frames have it, the integers are returned.
     """
     values = packets[path]
     if info.kind == "int" and not info.scaled and values.ndim == 1 and not np.isnan(values).any():

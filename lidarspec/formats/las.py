@@ -21,19 +21,19 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: columns that LAS has a standard field for.
+#: Columns for which LAS has a standard field.
 STANDARD_COLUMNS = ("x", "y", "z", "intensity", "time", "return_index", "valid")
-#: columns that become extra dimensions.
+#: Columns that are written as extra dimensions.
 EXTRA_COLUMNS = ("ring", "column")
-#: types that extra dimensions do not support -> their replacements.
+#: The replacements of types that extra dimensions do not support.
 REPLACED_TYPES = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
-#: size of a coordinate step.
+#: The size of a coordinate step, metres.
 STEP_M = 1e-4
-#: maximum coordinate for which the offset of coordinates stays 0.
+#: The maximum coordinate, metres, for which the offset of coordinates stays 0.
 MAX_UNSHIFTED_M = 1e5
-#: the origin of adjusted standard GPS time, in ns since 1970.
+#: The origin of adjusted standard GPS time, in ns since 1970.
 ADJUSTED_GPS_EPOCH_NS = GPS_EPOCH_NS + 10**18
-#: number of points per write.
+#: The number of points per write.
 BLOCK_POINTS = 1 << 17
 MAX_STEPS = (1 << 31) - 1
 MAX_INTENSITY = 0xFFFF
@@ -103,7 +103,7 @@ def _fill_header(
     """Add extra dimensions, and the facts of the first scan, to a header.
 
     Returns:
-        Column -> name of its extra dimension.
+        The name of the extra dimension of each column.
     """
     taken = {*header.point_format.dimension_names, *header.point_format.dtype().names}
     extra_names = {
@@ -164,7 +164,7 @@ def _fill_records(
     Args:
         rows: the records.
         part: the columns of the points.
-        extra_names: column -> name of its extra dimension.
+        extra_names: the name of the extra dimension of each column.
         offsets: the offsets of x, y and z, in metres.
     """
     valid = part["valid"]

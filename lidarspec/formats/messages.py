@@ -24,7 +24,7 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.robotics_logs import DATAGRAM, RAW, STAMP, STREAM
 
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
-#: NumPy type -> its number in PointField. Values of other types are written as float64.
+#: The number of each NumPy type in PointField. Values of other types are written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _SECOND = 1_000_000_000
 

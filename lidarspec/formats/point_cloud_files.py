@@ -22,8 +22,8 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: type that a format, or its common readers, do not support -> the type that replaces it. A 64-bit
-#: integer becomes a float, which is exact up to 2**53.
+#: The replacements of types that a format or its common readers do not support. A 64-bit integer
+#: becomes a float, which is exact up to 2**53.
 _PCD_TYPES = {"f2": "f4", "b1": "u1"}
 _PLY_TYPES = {
     **_PCD_TYPES,
@@ -31,7 +31,7 @@ _PLY_TYPES = {
     **dict.fromkeys(("u4", "i8", "u8"), "f8"),
 }
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-#: maximum number of bytes that the size field before compressed points can express.
+#: The largest size that the field before compressed points can express, bytes.
 _MAX_COMPRESSED_BYTES = (1 << 32) - 1
 
 

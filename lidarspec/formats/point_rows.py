@@ -19,12 +19,12 @@ from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import iter_released
 
-#: the first columns of a row; additional columns follow.
+#: The first columns of a row; additional columns follow.
 NAMES = STRUCTURED.names or ()
-#: number of characters that are reserved for a number in a header.
+#: The number of characters that are reserved for a number in a header.
 RESERVED_DIGITS = 20
-#: number of bytes per write. They fit into the processor's cache, which makes copying three times
-#: as fast.
+#: The number of bytes per write. This fits into the processor's cache, so copying is three times as
+#: fast.
 WRITE_BYTES = 1 << 20
 
 
@@ -37,7 +37,8 @@ class PointRows:
 
     Args:
         scans: the scans.
-        layout: takes {column: type} of the first scan and returns the type of a row.
+        layout: a function that returns the type of a row, given the types of the first scan's
+            columns by name.
         every_point: whether to include points without a valid return.
         is_image: whether to order the points of an organized scan row by row. Used only for a
             single scan of which every point is written.
@@ -119,8 +120,8 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
     Args:
         path: the file.
         rows: the rows.
-        header: returns the header. It is called before the rows, and again when the number of rows
-            is known, so the length of the header must not depend on this number.
+        header: a function that returns the header. It is called before the rows, and again when the
+            number of rows is known, so the length of the header must not depend on this number.
     """
     with path.open("wb") as file:
         file.write(header(rows))

@@ -27,15 +27,16 @@ from lidarspec.points.colours import make_ramp
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: radius of a point in the viewer.
+#: The radius of a point in the viewer, pixels.
 POINT_RADIUS_PX = 1.5
-#: length of a sensor's axes.
+#: The length of the drawn axes of a sensor, metres.
 AXIS_LENGTH_M = 0.3
-#: number of points after which the data is flushed, to limit the memory use.
+#: The number of points after which the data is flushed, to limit the memory use.
 FLUSH_POINTS = 1 << 13
-#: maximum number of bytes per read of a pipe.
+#: The maximum number of bytes per read of a pipe.
 MAX_PIPE_READ_BYTES = 1 << 16
-#: names of the timelines: the time of the sensor's clock, the arrival time, the number of the scan.
+#: The names of the timelines: for the time of the sensor's clock, the arrival time, and the number
+#: of the scan.
 SENSOR = "sensor_time"
 HOST = "host_time"
 NUMBER = "scan"
@@ -102,7 +103,7 @@ class RerunRecording:
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
-        """Log a scan. The first scan is logged after the facts about its sensor.
+        """Log a scan; before the first scan, log the facts about its sensor.
 
         Raises:
             OSError: if the recording cannot be written.
@@ -226,7 +227,7 @@ class _PipeCopy(threading.Thread):
     The SDK does not write the file itself, because it may wait forever if the disk is full.
 
     Attributes:
-        end: file descriptor of the pipe's end to write to.
+        end: the file descriptor of the end of the pipe that is written to.
         failure: the error that ended the writing; None if there is no error. Data after an error is
             read from the pipe and discarded.
 

@@ -21,14 +21,14 @@ from lidarspec.formats.common import find_points, select_points, write_in_thread
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: NumPy type -> format of its numbers. Seven digits are half a micrometre at a distance of 1 m.
+#: The format of the numbers of each NumPy type. Seven digits are half a micrometre at 1 m.
 _NUMBER_FORMATS = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
-#: format of times in seconds, with nine decimals for nanoseconds.
+#: The format of times in seconds, with nine decimals for nanoseconds.
 _TIME_FORMAT = "%.9f"
-#: number of rows that are formatted together; this is a third faster than single rows.
+#: The number of rows that are formatted together; this is a third faster than single rows.
 BLOCK_ROWS = 1 << 10
-#: level of gzip. Level 1 compresses numbers to 34 % of their size; the default level 6 reaches 27 %
-#: in five times the time.
+#: The level of gzip. Level 1 compresses numbers to 34 % of their size; the default, level 6,
+#: compresses them to 27 % in five times the time.
 _GZIP_LEVEL = 1
 
 
@@ -93,7 +93,7 @@ def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArr
     """Write the rows of columns.
 
     Args:
-        put: writes a text to the file.
+        put: a function that writes a text to the file.
         template: the %-format of a row.
         columns: the columns, (n,) each.
     """

@@ -2,10 +2,10 @@
 
 A candidate is an offset at which the constants of a frame type match.
 
-A frame type with `after` is active from the frame type that its `after` names, until a frame of a
-type that is named in another `after`. The active types can therefore change with every frame. To
-keep this fast, all candidates of one type in a piece are checked together when the type first
-becomes active.
+A frame type with `after` becomes active when a frame of the type named in its `after` arrives. It
+stays active until a frame arrives whose type is named in another `after`. The active types can
+therefore change with every frame. To keep this fast, all candidates of one type in a piece are
+checked together when the type first becomes active.
 
 Weak types (`confirm` > 1) are checked in the same way, but only the first frame of a run is a live
 candidate (`weak_frames`).
@@ -145,7 +145,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return a filter by the constants of some types, without the first two of each type."""
+        """Return a filter by all constants of some types except the first two of each."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -219,9 +219,9 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 class ConstantFilter:
     """Finds the offsets at which the constants of types match, for several types at once.
 
-    A set of types is an integer with one bit for each type. There is a table for each offset in a
-    frame with a constant. For each value of the byte at this offset, the table contains the set of
-    types that allow the value.
+    A set of types is an integer with one bit for each type. There is a table for each offset at
+    which a frame has a constant. For each value of the byte at this offset, the table contains the
+    set of types that allow the value.
 
     Args:
         constants: the constants of each type, for at most `MAX_TYPES` types.

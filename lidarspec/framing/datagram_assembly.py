@@ -24,10 +24,9 @@ from lidarspec.framing.results import Counters, Indices, Numbers
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: The maximum number of incomplete messages. At most as many keys of completed and dropped messages
-#: are stored.
+#: The maximum number of incomplete messages, and of stored keys of completed and dropped messages.
 MAX_WAITING_MESSAGES = 8
-#: The time after which an incomplete message is dropped.
+#: The time after which an incomplete message is dropped, ns.
 MAX_WAIT_NS = 10**9
 
 #: The maximum payload of a datagram in bytes.
@@ -51,7 +50,7 @@ class _PartialMessage:
         place: the offset in the input of the fragment that arrived first.
         at: the arrival time of this fragment, ns.
         parts: the payloads of the fragments by index.
-        size: the number of bytes in them.
+        size: the total size of the payloads in bytes.
     """
 
     count: int

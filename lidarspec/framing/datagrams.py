@@ -58,8 +58,8 @@ class _DatagramBatch:
     """Checks some datagrams, once for each set of active types.
 
     Args:
-        steady: the result of checking them as frames of one type and layout; None if this was not
-            possible.
+        steady: the result of checking the datagrams as frames of one type and layout; None if this
+            was not possible.
     """
 
     def __init__(

@@ -33,14 +33,14 @@ from lidarspec.spec.sensor import SensorDescription
 
 __all__ = ["BACKENDS", "Decoder", "select_backend", "decode_all", "is_stream"]
 
-#: The maximum size of a piece of a stream in which most bytes belong to frames, the maximum size of
-#: all other pieces, and the minimum size of a piece.
+#: Limits of the size of a piece of a stream: the maximum if most bytes of the piece belong to
+#: frames, the maximum for all other pieces, and the minimum.
 MAX_REGULAR_PIECE_BYTES = 24 << 16
 MAX_PIECE_BYTES = 6 << 16
 MIN_PIECE_BYTES = 1 << 12
 
-#: The maximum number of datagrams of a list that are decoded together, of rows of an array, and the
-#: approximate maximum size of both.
+#: Limits of the datagrams that are decoded together: the number of datagrams of a list, the number
+#: of rows of an array, and the approximate total size of both.
 MAX_LIST_DATAGRAMS = 1 << 14
 MAX_ARRAY_DATAGRAMS = 1 << 17
 MAX_BATCH_BYTES = 1 << 23

@@ -42,8 +42,8 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Fault, get_member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
-#: The number of attempts with random frames, and this number if the sensor declares a `sweep`,
-#: which is then used if no random frame is plausible.
+#: The number of attempts with random frames: without a declared `sweep` of the sensor, and with
+#: one. If no random frame is plausible, the `sweep` is used.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8
 #: The first attempt makes one random frame. Each further attempt makes `GROWTH` times as many
@@ -56,8 +56,8 @@ BATCH_BYTES = 1 << 22
 HEADERS = 400
 #: Numbers up to these limits are drawn more often, because most counts and keys are low.
 LOW_NUMBERS = (8, 40)
-#: The probability of drawing a label or the key of a switch for a header field, and the number of
-#: these values.
+#: The probability of drawing a label or the key of a switch for a header field, and the maximum
+#: number of labels and keys to draw from.
 NAMED_SHARE = 0.7
 MAX_NAMED_VALUES = 16
 #: The rule of `lidarspec check` for a frame type without an example.
@@ -424,5 +424,5 @@ def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
 
 
 def return_raw(raw: int, _: random.Random) -> int:
-    """Return a given raw value, in place of a function that draws a random one."""
+    """Return a given raw value. It is used in place of functions that draw values."""
     return raw

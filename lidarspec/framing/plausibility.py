@@ -53,7 +53,8 @@ from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, P
 from lidarspec.spec.description import Frame
 from lidarspec.spec.tree import FieldInfo
 
-#: If a few bits have at most this number of allowed values, they are compared with each value.
+#: The maximum number of allowed values that bits are compared with. If more values are allowed, a
+#: table is used.
 ALLOWED = 2
 
 #: The status of a frame for each status of its parts: `parts.FOUND`, `CUT_OFF`, `LENGTH`,
@@ -68,7 +69,7 @@ class CandidateChecker:
 
     Args:
         prefix: the constants that the candidates were already checked for.
-        met: the conditions of the struct on values.
+        met: the conditions of the struct on the values of its fields.
         checks: the conditions of the plausibility function; None if the function has to be called.
 
     Attributes:

@@ -143,7 +143,7 @@ def find_common_step(starts: Indices) -> int:
 
 
 def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
-    """Return the result for a piece that ends with some frames and the begin of another."""
+    """Return the result for a piece with some frames, and the first bytes of another."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
     need = 0
@@ -155,7 +155,7 @@ def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceRe
 def _count_needed(
     framing: Framing, mode: SearchState, kind: int, layout: Layout, rest: bytes
 ) -> int:
-    """Return the size from the start of a frame that is needed to check it further, in bytes.
+    """Return how many bytes of an incomplete frame are needed to check it further.
 
     Returns 0 if the type and the layout are not certain, or if a constant is wrong.
     """

@@ -38,10 +38,10 @@ VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
 #: Up to this number of layouts, searching for the frames of each layout is faster than sorting.
 MAX_UNSORTED_LAYOUTS = 16
-#: Up to this number of layouts, the frames of each layout need not be counted first.
+#: Up to this number of layouts, counting the frames of each layout first saves no time.
 MAX_UNCOUNTED_LAYOUTS = 4
 
-#: The number of bytes in the repr of a frame.
+#: The number of bytes that the repr of a frame shows.
 REPR_BYTES = 8
 
 #: The counter for each status of a rejected candidate.
@@ -62,15 +62,16 @@ class Counters:
 
     Attributes:
         frames: the number of frames by type.
-        bytes_filler: the number of declared fillers among the skipped bytes.
+        bytes_filler: the number of skipped bytes that are in declared fillers.
         pending: the number of bytes that wait because a candidate needs more bytes.
         bad_checksum, bad_length, implausible: the numbers of rejected candidates, by the reason.
         bad_constant: the number of datagrams without the constants of any frame. In a stream, such
             bytes are not candidates and are skipped.
         lost, duplicates, late: the numbers of lost, duplicate and late packets, found by the
             sensor's counter or clock.
-        incomplete_returns: groups of packets with the returns of the same firings of which some,
-            but not all, packets were lost (`PacketCounter.returns`).
+        incomplete_returns: the number of incomplete groups of packets. A group contains the returns
+            of the same firings (`PacketCounter.returns`); it is incomplete if some, but not all, of
+            its packets were lost.
         fragments_lost: the number of fragments that were missing when their message was dropped.
         fragments_late: the number of fragments that arrived twice, or after their message was
             joined or dropped.
@@ -437,7 +438,7 @@ def to_array(numbers: Numbers) -> NDArray[np.int64]:
 
 
 def _shift(forms: Indices, first: int) -> Indices:
-    """Return indices of layouts, increased by the number of layouts before them."""
+    """Return indices of layouts, increased by `first`; -1 (unknown) is unchanged."""
     form = broadcast_value(forms)
     if form is None:
         return np.where(forms < 0, -1, forms + first)

@@ -2,9 +2,9 @@
 
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
 invalid candidate, the search continues at the next byte. At one offset, the first type in order
-that matches is used. A type with `after` is active only if the last frame whose type is named in
-any `after` is of the type that it names. Frames of a type with `confirm` are accepted only in runs
-without gaps (`lidarspec.framing.weak_frames`).
+that matches is used. A type with `after` is active depending on the last frame whose type is named
+in any `after`: this frame must be of the type that the type's own `after` names. Frames of a type
+with `confirm` are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
 
 All candidates of a piece are checked together, and accepted together up to the next conflict or
 frame that changes the active types. The time is therefore linear in the size of the input for any
@@ -186,7 +186,7 @@ class _FrameWalk:
                 self._mode.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
-        """Accept the rest of a run that ends at an offset so far; return its new end."""
+        """Accept further frames of the run that ended at an offset; return its new end."""
         if self._mode.run_end != self._base + position:
             return position
         for kind, runs in self._runs.items():

@@ -145,7 +145,7 @@ def find_runs(
 
 
 def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the rows of values in an ascending array, and whether they are in it."""
+    """Return the rows of wanted values in an ascending array, and whether they exist."""
     if not len(values):
         return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)
     rows = np.minimum(values.searchsorted(wanted), len(values) - 1)
