@@ -25,7 +25,7 @@ from lidarspec.packets.clock_estimate import ClockJump, DeviceClock
 from lidarspec.packets.clock_findings import ClockFinding
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.packets.packet_type import find_clock
+from lidarspec.packets.packet_type import get_packet_type
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, HOUR_S, Clock, ClockState
@@ -136,7 +136,6 @@ class ClockMonitor:
         self, sensor: SensorDescription, *, drift_limit_ppm: float = DRIFT_LIMIT_PPM
     ) -> None:
         self._clock = _find_main_clock(sensor)
-        self._timed_sensor = replace(sensor, clock=self._clock)
         self._drift_limit_ppm = drift_limit_ppm
         self.samples = deque[OffsetSample](maxlen=KEPT_SAMPLES)
         self._estimate = DeviceClock(ESTIMATE_PARTS)
@@ -163,11 +162,12 @@ class ClockMonitor:
         self._packets += len(packets)
         if not len(packets) or clock is None:
             return []
-        if find_clock(packets.sensor, packets.frame) != clock:
+        packet_type = get_packet_type(packets.sensor, packets.frame)
+        if packet_type.clock != clock:
             return []
         try:
             events = self._read_status(packets)
-            readings = clock_ns(self._timed_sensor, packets.batch())
+            readings = clock_ns(packet_type.timed_sensor, packets.batch())
         except Exception as error:  # the plugin's functions
             packets.stats.error(PluginError.of(error, "clock"), len(packets))
             return []

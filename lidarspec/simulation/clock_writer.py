@@ -333,14 +333,11 @@ class FrameClock:
         Raises:
             UsageError: if the status cannot be written.
         """
-        clock = self._sensor.clock
-        if clock is None or clock.status is None:
-            return None
-        frames = [clock.status.frame] if clock.status.frame else self._sensor.data_frames
-        if self._frame not in frames:
+        clock = find_status_clocks(self._sensor).get(self._frame)
+        if clock is None:
             return None
         read = self._writer.read if self._writer is not None else None
-        return StatusWriter(self._sensor, self._first, read)
+        return StatusWriter(replace(self._sensor, clock=clock), self._first, read)
 
     def check(self, faults: ClockFaults) -> None:
         """Raise UsageError if faults of the clock cannot be written into these frames.
@@ -360,12 +357,9 @@ class FrameClock:
             )
 
     def check_status(self) -> None:
-        """Raise UsageError if these frames cannot show that the clock is not locked."""
-        if self._status is None:
-            raise UsageError(
-                f"{self._sensor.id} does not declare the status of its clock in {self._frame!r}"
-                " frames, so the clock cannot lose its lock"
-            )
+        """Raise UsageError if these frames, which have the status, cannot show a lost lock."""
+        status = self._status  # raises UsageError
+        assert status is not None, self._frame
 
     def apply(self, table: CompiledTable, timeline: ClockTimeline, times: Times) -> None:
         """Write the faults of a timeline into frames.
@@ -426,6 +420,20 @@ def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
     if completes and paths and all(path in fields for path in paths):
         return shared
     return None
+
+
+def find_status_clocks(sensor: Sensor) -> dict[str, Clock]:
+    """Return {frame type: clock} of the frame types that contain the status of a clock."""
+    clocks = dict[str, Clock]()
+    for name in sensor.main_frames:
+        clock = find_clock(sensor, name)
+        if clock is None or clock.status is None:
+            continue
+        frame = clock.status.frame or name
+        source = clock.status.source
+        if callable(source) or source in get_codec(sensor.frames[frame]).schema.columns:
+            clocks.setdefault(frame, clock)
+    return clocks
 
 
 class StatusWriter:

@@ -45,7 +45,7 @@ from lidarspec.points.conventions import coordinates, find_direction
 from lidarspec.points.reference_evaluator import list_parts
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.clock_faults import ClockFaults, ClockTimeline
-from lidarspec.simulation.clock_writer import FrameClock
+from lidarspec.simulation.clock_writer import FrameClock, find_status_clocks
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.raw_values import PartRows, round_raw, write_raw
 from lidarspec.simulation.scenes import Room, Scene
@@ -1082,17 +1082,22 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
         )
     if not faults.unlocked:
         return
-    clock = sensor.clock
-    frame = clock.status.frame if clock is not None and clock.status is not None else ""
-    if not frame:
-        frame_simulation(sensor, sensor.data_frame).clock.check_status()
-    elif frame in periodic:
-        others.find_clock(frame).check_status()
-    else:
+    status_frames = list(find_status_clocks(sensor))
+    if not status_frames:
         raise UsageError(
-            f"{sensor.id} cannot lose its lock, because its status is in {frame!r} frames, which"
-            " the simulated sensor does not send"
+            f"{sensor.id} does not declare the status of its clock, so the clock cannot lose its"
+            " lock"
         )
+    if sensor.has_points and sensor.data_frame in status_frames:
+        frame_simulation(sensor, sensor.data_frame).clock.check_status()
+        return
+    sent = [name for name in status_frames if name in periodic]
+    if not sent:
+        raise UsageError(
+            f"{sensor.id} cannot lose its lock, because its status is in {status_frames[0]!r}"
+            " frames, which the simulated sensor does not send"
+        )
+    others.find_clock(sent[0]).check_status()
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:

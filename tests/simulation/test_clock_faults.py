@@ -29,6 +29,7 @@ from lidarspec.spec import (
 )
 from lidarspec.spec.timing import DATED_EPOCHS
 from tests.shapes import SHAPES
+from tests.shapes.receiver import SENSOR as RECEIVER
 from tests.shapes.synced import FREE, HOLDOVER, LOCKED, PERIOD_NS, STATES
 
 SYNCED = SHAPES["shape-synced"]
@@ -272,6 +273,35 @@ def test_a_sensor_without_a_lock_cannot_lose_it() -> None:
             simulate(sensor, 1, clock=parse_clock_faults(faults))
     # A restart only sets the status if there is one.
     simulate(ls.sensor("ldrobot-stl27l"), 1, clock=parse_clock_faults("restart@1s"))
+
+
+def make_receiver(status: ClockStatus) -> Sensor:
+    """Return a sensor without points; one of its frame types has a clock and this status."""
+    shape = RECEIVER
+    assert shape.clock is not None
+    fix = replace(shape.frames["fix"], clock=replace(shape.clock, status=status))
+    return replace(shape, frames={**shape.frames, "fix": fix}, clock=None)
+
+
+@pytest.mark.parametrize("source", ["quality", lambda f: f.quality])
+def test_the_status_of_a_frame_without_points_follows_the_faults(source: Any) -> None:
+    states = {0: ClockState("no fix", False), 3: ClockState("fix", True)}
+    sensor = make_receiver(ClockStatus(source, states))
+    for faults in ("unlock@1s", "restart@1s"):
+        frames = simulate(sensor, 24, clock=parse_clock_faults(faults))
+        packets = sensor.decode([data for data in frames if data[1] == 1], frame="fix")
+        assert read_clock_status(packets).tolist() == [3] * 10 + [0] * 10
+
+
+def test_a_frame_without_points_cannot_lose_a_lock_that_it_does_not_report() -> None:
+    states = {0: ClockState("no fix", False), 3: ClockState("fix", True)}
+    for sensor, reason in (
+        (make_receiver(ClockStatus("rate", states, frame="rate_reply")), "does not send"),
+        (make_receiver(ClockStatus("quality", {3: ClockState("fix", True)})), "distinguish"),
+        (RECEIVER, "does not declare the status"),
+    ):
+        with pytest.raises(UsageError, match=reason):
+            simulate(sensor, 1, clock=parse_clock_faults("unlock@1s"))
 
 
 def with_states(states: dict[int, ClockState]) -> Sensor:
