@@ -49,8 +49,7 @@ def frame_columns(packets: Packets) -> Columns:
         if info.kind == "other":
             columns |= _format_objects(path, packets.table.raw(path))
         elif info.kind == "bytes":
-            frame = packets.frame.partition(".")[0]  # the rest is the path of parts
-            is_text = getattr(packets.sensor.frames[frame].wire, "is_text", False)
+            is_text = getattr(packets.sensor.frames[packets.frame_type].wire, "is_text", False)
             columns[path] = _format_bytes(packets.table.raw(path), is_text=is_text)
         else:
             columns |= _split_elements(path, _read_numbers(packets, path, info))

@@ -19,6 +19,7 @@ from lidarspec.spec.tree import (
     Ending,
     FieldInfo,
     Formula,
+    Kind,
     Node,
     Number,
     Op,
@@ -180,14 +181,20 @@ class Schema:
         The path of a field in a part includes the name of the kind of part: "tags.points.angle".
         """
         names = dict(self.fields)
-        for axis, node in self.separate_parts.items():
-            for kind in node.kinds:
-                before = f"{axis}.{kind.name}".rstrip(".")
-                names |= {
-                    f"{before}.{path}": info
-                    for path, info in make_schema(kind.root).scan_names.items()
-                }
+        for before, kind in self.part_kinds.items():
+            names |= {
+                f"{before}.{path}": info for path, info in make_schema(kind.root).scan_names.items()
+            }
         return names
+
+    @property
+    def part_kinds(self) -> Mapping[str, Kind]:
+        """The kinds of the separate parts, by path, such as "tags.points"."""
+        return {
+            f"{axis}.{kind.name}".rstrip("."): kind
+            for axis, node in self.separate_parts.items()
+            for kind in node.kinds
+        }
 
     def within(self, path: str) -> tuple[str, str, str] | None:
         """Split a path that leads into parts into axis, kind and remaining path.

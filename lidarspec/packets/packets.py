@@ -152,6 +152,11 @@ class Packets:
             target[...] = column
         return array
 
+    @property
+    def frame_type(self) -> str:
+        """The frame type of the packets, also for parts, whose `frame` is a path."""
+        return self.frame.partition(".")[0]
+
     def count(self, array: str) -> NDArray[np.intp]:
         """Return the length of an array in each packet, (n,).
 

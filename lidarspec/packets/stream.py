@@ -380,10 +380,7 @@ class ImuStream:
         for packets in batches:
             if not len(packets):
                 continue
-            try:
-                parts.append(packets.imu())
-            except SpecError as error:
-                packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
+            parts.append(read_imu(packets))
         samples = join_samples(parts)
         if self.waiting is not None:
             self.waiting.add(samples)
@@ -399,6 +396,19 @@ class ImuStream:
         if name not in self._streams:
             self._streams[name] = self._make_stream(name)
         return self._streams[name]
+
+
+def read_imu(packets: Packets) -> ImuSamples:
+    """Return the IMU samples of packets; if the plugin's function fails, count it and return none.
+
+    Args:
+        packets: packets of a frame type with IMU samples.
+    """
+    try:
+        return packets.imu()
+    except SpecError as error:
+        packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
+        return join_samples([])
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ def _find_origin(run: PointRun, point: int) -> PointOrigin:
     else:
         frame_row = int(rows[row])
     return PointOrigin(
-        frame=packets.frame.partition(".")[0],
+        frame=packets.frame_type,
         offset=int(packets.offset[row]),
         host_ns=int(packets.host_ns[row]),
         part=find_part(packets, row, run.parts_before),
