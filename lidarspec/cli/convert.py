@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -33,8 +33,6 @@ from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import make_recorder
 from lidarspec.errors import (
-    PluginError,
-    SpecError,
     UnknownField,
     UnknownFrame,
     UsageError,
@@ -46,9 +44,10 @@ from lidarspec.errors import (
 from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
 from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
-from lidarspec.frames.schema import make_schema
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
+from lidarspec.packets.stream import read_imu
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.remote_files import find_files
@@ -65,6 +64,8 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
+#: How many types of parts a remark lists.
+MAX_LISTED_PARTS = 3
 #: The suffixes of files with packets. In `convert`, `.bin` is a file with points, as in KITTI.
 _PACKET_SUFFIXES = tuple(suffix for suffix in SUFFIXES if suffix != ".bin")
 
@@ -99,7 +100,7 @@ class _Counts:
 @click.argument("sources", metavar="IN...", nargs=-1)
 @click.argument("target", metavar="OUT")
 @sensor_option
-@count_option("scans")
+@count_option("scans; with -f frames, with --imu samples")
 @selecting("times", "scans", "every", "ranges", "returns", "columns", "time", "beams", "frame_id")
 @points_option
 @click.option(
@@ -245,9 +246,13 @@ def convert(
     else:
         sensor = named_sensor(sensor_id)
     with open_device(source, sensor) as device:
-        if frame is not None or not (is_imu or device.sensor.has_points):
-            if is_imu or organized or with_packets or chooses_scans:
-                raise UsageError("frames can be selected only by -n, --slice and --time")
+        if is_imu and frame is not None:
+            raise UsageError("--imu cannot be combined with -f")
+        writes_frames = frame is not None or not (is_imu or device.sensor.has_points)
+        if (writes_frames or is_imu) and (organized or with_packets or chooses_scans):
+            items = "frames" if writes_frames else "IMU samples"
+            raise UsageError(f"{items} can be selected only by -n, --slice and --time")
+        if writes_frames:
             frames = _choose_frames(device, target, frame)
             summary = _write_frames(device, target, frames, selection, count)
         elif is_imu:
@@ -273,31 +278,37 @@ def _write_imu(
     device: Device, target: str, selection: Selection, count: int | None
 ) -> dict[str, Any]:
     """Write IMU samples; return the entries of the summary."""
-    samples = join_samples(list(_iter_imu(device, selection)))[:count]
-    if not len(samples):
-        raise _no_data_error(device, target)
+    device.sensor.require_imu()
+    batches = list[ImuSamples]()
+    number = 0
+    with contextlib.closing(_iter_imu(device, selection)) as arriving:
+        for samples in arriving:
+            batches.append(samples)
+            number += len(samples)
+            if count is not None and number >= count:
+                break
+    if not number:
+        raise _no_data_error(device, target, device.sensor.imu_frames)
+    samples = join_samples(batches)[:count]
     write_imu(target, samples)
     note(f"{target}: {len(samples)} IMU samples from {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
 
 
-def _iter_imu(device: Device, selection: Selection) -> Iterator[ImuSamples]:
+def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
     """Yield the IMU samples of the selected packets, with times by the selected clock.
 
     Errors of a plugin are counted.
 
     Raises:
-        UsageError: if no frame of the sensor has IMU samples, or if a required time is unknown.
+        UsageError: if a required time is unknown.
     """
-    device.sensor.require_imu()
-    for selected in _select_frames(device, device.sensor.imu_frames, selection, None):
-        for packets in selected.values():
-            try:
-                samples = packets.imu()
-            except SpecError as error:
-                packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
-                continue
-            yield samples if device.mount is None else samples.turn(device.mount.rotation)
+    batches = _select_frames(device, device.sensor.imu_frames, selection, None)
+    with contextlib.closing(batches):
+        for selected in batches:
+            for packets in selected.values():
+                samples = read_imu(packets)
+                yield samples if device.mount is None else samples.turn(device.mount.rotation)
 
 
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
@@ -314,11 +325,11 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     sensor = device.sensor
     frames = sensor.incoming
     if frame is not None:
-        name, _, parts = frame.partition(".")
+        name = frame.partition(".")[0]
         if name not in frames:
             raise UnknownFrame(name, frames, place=sensor.id)
-        known = _list_parts(sensor, name)
-        if parts and frame not in known:
+        known = [name, *_list_parts(sensor, name)]
+        if frame not in known:
             raise UnknownField(frame, known, place=sensor.id)
         return [frame]
     if len(frames) > 1 and not holds_several_types(target):
@@ -338,68 +349,76 @@ def _write_frames(
     count: int | None,
 ) -> dict[str, Any]:
     """Write the fields of frames; return the entries of the summary."""
+    sensor = device.sensor
     types = list(frames)
-    parts = [part for frame in frames for part in _list_parts(device.sensor, frame)]
+    parts = [
+        part for frame in frames if frame in sensor.frames for part in _list_parts(sensor, frame)
+    ]
     if holds_several_types(target):
         types += parts
     elif parts:
+        shown = " or ".join(f"-f {part}" for part in parts[:MAX_LISTED_PARTS])
+        if len(parts) > MAX_LISTED_PARTS:
+            shown += f" (lidarspec show {sensor.id} lists {len(parts)} kinds of parts)"
         note(
-            f"{target} has no columns for the parts of {frames[0]}: repeat with"
-            f" -f {' or -f '.join(parts)}, or write an .mcap file"
+            f"{target} has no columns for the parts of {frames[0]}: repeat with {shown},"
+            " or write an .mcap file"
         )
     batches = _select_frames(device, types, selection, count)
     first = next(batches, None)
     if first is None:
-        raise _no_data_error(device, target)
+        raise _no_data_error(device, target, frames)
     written = write_frames(target, itertools.chain([first], batches))
     noun = "rows" if any("." in name for name in types) else "frames"
-    note(f"{target}: {written} {noun} from {device.sensor.id}; {device.stats}")
-    return {"frames": written}
+    note(f"{target}: {written} {noun} from {sensor.id}; {device.stats}")
+    return {noun: written}
 
 
 def _list_parts(sensor: Sensor, frame: str) -> list[str]:
-    """Return the types of the parts in frames of a type, such as "report.tags.temperature".
-
-    Returns an empty list for a type that is itself a type of parts.
-    """
-    if frame not in sensor.frames:
-        return []
-    separate_parts = make_schema(sensor.frames[frame].tree).separate_parts
-    return [
-        ".".join(filter(None, (frame, axis, kind.name)))
-        for axis, node in separate_parts.items()
-        for kind in node.kinds
-    ]
+    """Return the types of the parts in frames of a type, such as "report.tags.temperature"."""
+    schema = get_codec(sensor.frames[frame]).schema
+    return [f"{frame}.{path}" for path in schema.part_kinds]
 
 
 def _select_frames(
     device: Device, types: Sequence[str], selection: Selection, count: int | None
-) -> Iterator[dict[str, Packets]]:
+) -> Generator[dict[str, Packets]]:
     """Yield batches with the selected frames and their parts, without empty batches.
+
+    At its end, or when it is closed, warnings about the clock are printed.
 
     Args:
         types: the frame types, and types of parts.
+
+    Raises:
+        UsageError: if a required time is unknown, or if there are frames, but none is in the slice.
     """
     frames = list(dict.fromkeys(name.partition(".")[0] for name in types))
     slices = {frame: TimeSlice(selection.times) for frame in frames}
     clocks = {frame: PacketTimes(selection.time, device.source) for frame in frames}
-    left = math.inf if count is None else count
-    for arrived in device.packets_by_frame(frames):
-        selected = dict[str, Packets]()
-        for frame, packets in arrived.items():
-            times = clocks[frame].read(packets)
-            which = np.flatnonzero(slices[frame].holds(times))
-            which = which[: int(min(left, len(which)))]
-            left -= len(which)
-            if len(which):
-                chosen = packets.with_times(times).take(which)
-                selected |= _take_types(chosen, types)
-        if selected:
-            yield selected
-        if left <= 0 or all(wanted.ended for wanted in slices.values()):
-            break
-    for warning in dict.fromkeys(text for clock in clocks.values() for text in clock.warnings):
-        note(warning)
+    number = 0
+    limit = math.inf if count is None else count
+    try:
+        for arrived in device.packets_by_frame(frames):
+            selected = dict[str, Packets]()
+            for frame, packets in arrived.items():
+                times = clocks[frame].read(packets)
+                which = np.flatnonzero(slices[frame].holds(times))
+                which = which[: int(min(limit - number, len(which)))]
+                number += len(which)
+                if len(which):
+                    chosen = packets.with_times(times).take(which)
+                    selected |= _take_types(chosen, types)
+            if selected:
+                yield selected
+            if number >= limit or all(wanted.ended for wanted in slices.values()):
+                break
+    finally:
+        for warning in dict.fromkeys(text for clock in clocks.values() for text in clock.warnings):
+            note(warning)
+    for wanted in slices.values():
+        if wanted.first is not None and not number:
+            raise wanted.missed_error(device.source, "frames")
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
@@ -558,10 +577,14 @@ def _detect_sensor(source: str, target: str) -> Sensor:
         raise error if sample is None else nearest_fault_error(sample) from None
 
 
-def _no_data_error(device: Device, target: str) -> Exception:
+def _no_data_error(device: Device, target: str, types: Sequence[str] = ()) -> Exception:
     """Return the error that explains why a file contains no data of the sensor.
 
-    The file is empty or damaged, it has data of another sensor, or it has no lidar data.
+    The file is empty or damaged, it has only other types of frames, it has data of another sensor,
+    or it has no lidar data.
+
+    Args:
+        types: the frame types, and types of parts, that were searched; empty for data frames.
     """
     sensor = device.sensor
     stats = device.stats
@@ -574,6 +597,11 @@ def _no_data_error(device: Device, target: str) -> Exception:
     failure = stats.failure(sensor.id)
     if failure is not None:
         return failure
+    if types and stats.frames:
+        reason = f"{source} has no {' or '.join(types)}; it has {', '.join(stats.frames)}"
+        return suggest(
+            WireError(reason, sensor=sensor.id), f"lidarspec stats {quote(source)} -s {sensor.id}"
+        )
     instead = identify_file(sensor, source)
     if instead is not None:
         error = WireError(f"{source} {instead[0]}", sensor=sensor.id)

@@ -429,8 +429,9 @@ def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path
     )
 
 
-def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
-    plugin, bytes_ = tmp_path / "inertia.py", tmp_path / "in.bin"
+def write_inertia(folder: Path) -> Path:
+    """Write a plugin file with a sensor that has an IMU, and return its path."""
+    plugin = folder / "inertia.py"
     hook = [
         "from lidarspec.spec import hookimpl",
         "from tests.shapes.inertia import SENSOR",
@@ -438,6 +439,11 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
         "def lidarspec_sensors():",
     ]
     plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    return plugin
+
+
+def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
+    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
     sensor = SHAPES["shape-inertia"]
     bytes_.write_bytes(b"".join(simulate(sensor, 40)))
     told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
@@ -465,16 +471,41 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
     )
 
 
+def test_reading_ends_after_the_requested_imu_samples(tmp_path: Path) -> None:
+    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)) * 2000)
+    summary = run_json("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu", "-n", 10)
+    assert summary["samples"] == 10
+    assert summary["stats"]["bytes_in"] < bytes_.stat().st_size
+
+
+@pytest.mark.parametrize(
+    "words", [("--scans", ":1"), ("--range", "1m:2m"), ("--returns", "last"), ("-f", "data")]
+)
+def test_options_for_scans_are_refused_for_imu_samples(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)))
+    target = tmp_path / "imu.csv"
+    error = ran("convert", bytes_, target, "-s", plugin, "--imu", *words, code=2).stderr
+    assert "IMU samples can be selected only by" in error or "--imu cannot be combined" in error
+    assert not target.exists()
+
+
+def test_a_slice_without_imu_samples_states_the_times_of_the_file(tmp_path: Path) -> None:
+    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)))
+    words = ("convert", bytes_, tmp_path / "out.csv", "-s", plugin, "--slice", "100:200")
+    for chosen in (("--imu",), ("-f", "data")):
+        error = ran(*words, *chosen, code=2).stderr
+        assert "in.bin has frames from 0 s to" in error
+        assert "the selection is outside this range" in error
+
+
 def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> None:
     """The clock of the shape counts from power-up: UTC is the arrival without its delay."""
-    plugin = tmp_path / "inertia.py"
-    hook = [
-        "from lidarspec.spec import hookimpl",
-        "from tests.shapes.inertia import SENSOR",
-        "@hookimpl",
-        "def lidarspec_sensors():",
-    ]
-    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    plugin = write_inertia(tmp_path)
     sensor = SHAPES["shape-inertia"]
     recording = tmp_path / "drive.lsr"
     began_ns = 1_785_283_200 * 10**9

@@ -248,10 +248,30 @@ def test_parts_of_one_kind_become_csv(tagged: Path, tmp_path: Path) -> None:
     result = ran("convert", tagged, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
     assert "no columns for the parts of data" in result.stderr
     assert "-f data.tags.temperature" in result.stderr
-    unknown = ran(
-        "convert", tagged, tmp_path / "no.csv", "-s", TAGS, "-f", "data.tags.heat", code=2
-    )
-    assert "unknown field 'data.tags.heat'" in unknown.stderr
+    for name in ("data.tags.heat", "data."):
+        unknown = ran("convert", tagged, tmp_path / "no.csv", "-s", TAGS, "-f", name, code=2)
+        assert f"unknown field '{name}'" in unknown.stderr
+
+
+def test_missing_frames_and_parts_are_named(recording: Path, tagged: Path, tmp_path: Path) -> None:
+    target = tmp_path / "no.csv"
+    words = ("convert", recording, target, "-s", RECEIVER, "-f", "rate_reply")
+    missing_frame = ran(*words, code=4).stderr
+    assert "has no rate_reply; it has fix, warmth" in missing_frame
+    frames = tmp_path / "tags.bin"
+    frames.write_bytes(SHAPES["shape-tags"].build("data", number=0, tags=[], padding=b"\0"))
+    words = ("convert", frames, target, "-s", TAGS, "-f", "data.tags.temperature")
+    assert "has no data.tags.temperature; it has data" in ran(*words, code=4).stderr
+
+
+def test_a_remark_lists_only_some_of_the_parts(
+    tagged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lidarspec.cli.convert.MAX_LISTED_PARTS", 1)
+    result = ran("convert", tagged, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
+    (remark,) = [line for line in result.stderr.splitlines() if "has no columns" in line]
+    assert remark.count("-f data.") == 1
+    assert "lidarspec show shape-tags lists 3 kinds of parts" in remark
 
 
 @pytest.mark.slow
