@@ -32,6 +32,7 @@ from lidarspec.framing.decoder import DecoderObserver
 from lidarspec.framing.results import Counters, Found
 from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
+from lidarspec.packets.returns import describe_incomplete_groups
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
@@ -134,10 +135,8 @@ class Device(ClosingContext):
             if text:
                 warnings.append(f"{self.source}: {text}")
         if stats.incomplete_returns:
-            warnings.append(
-                f"{self.source}: some firings lack a return, because packets were lost;"
-                " incomplete_returns in stats counts these firings"
-            )
+            text = describe_incomplete_groups(stats.incomplete_returns)
+            warnings.append(f"{self.source}: {text}")
         if stats.nominal:
             warnings.append(_describe_nominal(self.sensor))
         if self._selector is not None:

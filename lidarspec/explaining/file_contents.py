@@ -26,6 +26,7 @@ from lidarspec.detect.identification import (
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, printable, suggest
 from lidarspec.explaining.clock_text import describe_clock
+from lidarspec.packets.returns import describe_incomplete_groups
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
 from lidarspec.sensor_operations import Sensor
@@ -451,11 +452,7 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
         rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
         yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
     if content.incomplete_returns:
-        yield (
-            "returns",
-            f"{content.incomplete_returns} groups of packets lack a return, because packets were"
-            " lost",
-        )
+        yield "returns", describe_incomplete_groups(content.incomplete_returns)
     if content.clock:
         yield "clock", printable(content.clock)
     for name, text in content.info.items():

@@ -54,6 +54,13 @@ def _to_sizes(values: Any, count: int) -> NDArray[np.int64]:
     return np.broadcast_to(sizes, (count,))
 
 
+def describe_incomplete_groups(count: int) -> str:
+    """Return a sentence about the number of incomplete groups, `incomplete_returns`."""
+    if count == 1:
+        return "1 group of packets lacks a return, because packets were lost"
+    return f"{count} groups of packets lack a return, because packets were lost"
+
+
 class GroupCounter:
     """Counts the incomplete groups of packets with the returns of the same firings.
 
@@ -171,9 +178,10 @@ def _place_by_return_index(
         return members
     own = numbers[:, 0].astype(np.int64)
     is_place = (numbers == own[:, None]).all(axis=1) & (own < sizes)
-    keys = groups * int(sizes.max()) + own
-    _, rows, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    is_place &= counts[rows.reshape(-1)] == 1
+    rows = np.flatnonzero(is_place)
+    keys = groups[rows] * int(sizes.max()) + own[rows]
+    _, numbers_of_keys, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    is_place[rows] = counts[numbers_of_keys.reshape(-1)] == 1
     is_kept = np.isin(groups, groups[~is_place])
     return groups, np.where(is_kept, places, own), sizes
 

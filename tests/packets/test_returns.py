@@ -78,8 +78,17 @@ def test_a_lost_half_is_missing_and_counted() -> None:
     assert (packets.stats.lost, packets.stats.incomplete_returns) == (4, 2)
 
 
-@pytest.mark.parametrize("lost", [(), (5, 8, 12, 13)])
-def test_lost_halves_are_one_warning(lost: tuple[int, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lost", "warnings"),
+    [
+        ((), []),
+        ((5,), ["1 group of packets lacks a return, because packets were lost"]),
+        ((5, 8, 12, 13), ["2 groups of packets lack a return, because packets were lost"]),
+    ],
+)
+def test_lost_halves_are_one_warning(
+    lost: tuple[int, ...], warnings: list[str], tmp_path: Path
+) -> None:
     path = tmp_path / "pairs.lsr"
     with ls.Recorder(path, PAIRS) as recorder:
         for index in range(40):
@@ -87,8 +96,7 @@ def test_lost_halves_are_one_warning(lost: tuple[int, ...], tmp_path: Path) -> N
                 recorder.write(Chunk(make_packet(index), 10**18 + index * 10**7))
     with ls.open(path, PAIRS) as device:
         list(device.packets())
-        found = [text for text in device.warnings if "incomplete_returns" in text]
-    assert len(found) == bool(lost)
+        assert device.warnings == [f"{path}: {text}" for text in warnings]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])
@@ -114,6 +122,16 @@ def test_a_stream_may_begin_and_end_within_a_pair() -> None:
 
 def test_a_lost_first_half_is_counted_at_the_end_of_the_input() -> None:
     assert decode([make_packet(index) for index in range(10) if index != 8]) == (1, 1)
+
+
+def test_invalid_return_numbers_do_not_change_other_pairs() -> None:
+    """Pair 0 has an invalid number, and pair 1 arrives with the second return first."""
+    frames = [
+        PAIRS.build("data", PAIRS.parse(make_packet(index)), second=second)
+        for index, second in enumerate([4, 1, 1, 0])
+    ]
+    returns = PAIRS.decode(frames).returns()
+    assert returns["return_index"][:, 0, 0].tolist() == [[4, 1], [0, 1]]
 
 
 def test_single_returns_are_not_paired() -> None:
