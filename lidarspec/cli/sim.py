@@ -108,7 +108,11 @@ PLACES = (
     show_default=True,
     help="Delay datagrams so that up to N later datagrams overtake them.",
 )
-@click.option("--unplug", type=DURATION, help="Time between simulated disconnections.")
+@click.option(
+    "--unplug",
+    type=DURATION,
+    help="Time for which the sensor stays connected before each disconnection.",
+)
 @click.option(
     "--shake",
     type=click.FloatRange(min=0),

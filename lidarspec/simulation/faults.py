@@ -34,7 +34,7 @@ class Faults:
         loss: fraction of packets to drop, 0 to 1.
         reorder: maximum delay of a datagram, in packets; 0 for no delay. One datagram in ten is
             delayed.
-        unplug: time between disconnections, in seconds; 0 for no disconnection.
+        unplug: time before each disconnection, in seconds; 0 for no disconnection.
         absent: duration of each disconnection, in seconds.
         shake: standard deviation of the noise on IMU measurements, in m/s2 and rad/s; 0 for no
             noise.
