@@ -428,6 +428,7 @@ class SimulatedDevice:
         self._scene = scene or make_room(seed)
         self._source = random.Random(f"device {seed}")
         self._replies = ReplyMaker(sensor, self.faults.shake)
+        self._periodic_rates = find_periodic_rates(sensor)
         self._plan: list[_PlannedData] = []
         self._planned = 0
         self._stream: _FrameStream | None = None
@@ -574,6 +575,8 @@ class SimulatedDevice:
             due = [self._plan[0].at] if self._plan else []
             due += [self._stream.due] if self._stream else []
             times += [self._powered + math.ceil(at / self.rate) for at in due]
+            if self._late:
+                times.append(self._late_until)
         return min(times, default=None)
 
     @property
@@ -585,7 +588,7 @@ class SimulatedDevice:
         return self._powered + math.ceil(max(times) / self.rate)
 
     def _is_periodic(self, due: _PlannedData) -> bool:
-        return bool(due.frame and self.sensor.frames[due.frame].simulation.rate)
+        return due.frame in self._periodic_rates
 
     def _clock(self, now: int) -> float:
         """Return the time of the device, ns since power-on.
@@ -616,14 +619,12 @@ class SimulatedDevice:
 
     def _plan_next(self, due: _PlannedData) -> None:
         """Plan the next frame of a type that is sent periodically."""
-        if due.frame:
-            rate = self.sensor.frames[due.frame].simulation.rate
-        else:
-            rate = 0.0
-        if rate:
-            repetition = due.repetition + 1
-            data = self._replies.make_periodic_frame(due.frame, repetition)
-            self._put(due.at + SECOND / rate, due.link, due.frame, data, repetition)
+        if not self._is_periodic(due):
+            return
+        repetition = due.repetition + 1
+        data = self._replies.make_periodic_frame(due.frame, repetition)
+        period_ns = SECOND / self._periodic_rates[due.frame]
+        self._put(due.at + period_ns, due.link, due.frame, data, repetition)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
         """Plan the reply to a command, unless the command is ignored while data is sent.
@@ -682,7 +683,7 @@ class SimulatedDevice:
 
     def _begin_periodic(self, at: float) -> None:
         """Plan the first frame of each type without points that is sent periodically."""
-        for name in find_periodic_rates(self.sensor):
+        for name in self._periodic_rates:
             self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:

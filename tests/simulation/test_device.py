@@ -220,6 +220,17 @@ def test_a_deadline_is_when_something_comes() -> None:
     assert on(mini()).deadline is None
 
 
+def test_the_end_of_a_delay_is_a_deadline() -> None:
+    """A sensor that waits for a command sends nothing else."""
+    device = on(a1())
+    device.delay_output(0.5, 0)
+    assert send_command(device, "get_info", 10 * MS) == b""
+    assert device.deadline == SECOND // 2
+    assert device.outgoing(SECOND // 2 - 1) == []
+    assert device.outgoing(SECOND // 2)
+    assert device.deadline is None
+
+
 def test_periodic_frames_are_made_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     filled = 0
     fill = RestingImu.fill
