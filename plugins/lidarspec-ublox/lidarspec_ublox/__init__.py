@@ -288,11 +288,25 @@ def utc_time(f: Fields) -> Any:
     return unix_time(f.year, f.month, f.day, f.hour, f.minute, f.second), f.nano * 1e-9
 
 
+def is_resolved(f: Fields) -> Any:
+    """Return whether date and time are valid, and no second is uncertain."""
+    valid = f.valid
+    return (valid.date == 1) & (valid.time == 1) & (valid.fully_resolved == 1)
+
+
+# The manual does not say what the receiver counts before UTC is valid.
 PVT_CLOCK_STATUS = ClockStatus(  # p. 150: "UTC time of day has been fully resolved"
-    "valid.fully_resolved",
+    is_resolved,
     {
-        0: ClockState("time not fully resolved", locked=False),
+        0: ClockState("time not fully resolved", locked=False, epoch=""),
         1: ClockState("time resolved by GNSS", locked=True),
+    },
+)
+TIMEUTC_CLOCK_STATUS = ClockStatus(  # p. 168: "Valid UTC Time"
+    "valid.utc",
+    {
+        0: ClockState("UTC not valid", locked=False, epoch=""),
+        1: ClockState("UTC valid", locked=True),
     },
 )
 
@@ -421,7 +435,7 @@ GNSS = Sensor(
         "nav_timeutc": Frame(
             NAV_TIMEUTC,
             plausible=is_date,
-            clock=Clock(utc_time, epoch="utc"),
+            clock=Clock(utc_time, epoch="utc", status=TIMEUTC_CLOCK_STATUS),
             simulation=Simulation(timeutc_sweep, rate=1),
         ),
         "tim_tp": Frame(TIM_TP, plausible=is_pulse, simulation=Simulation(pulse_sweep, rate=1)),

@@ -11,8 +11,10 @@ import pytest
 import lidarspec as ls
 import lidarspec_ublox
 from lidarspec import simulate
-from lidarspec.errors import WireError
+from lidarspec.errors import UsageError, WireError
 from lidarspec.packets.clock_monitor import ClockMonitor
+from lidarspec.packets.clock_status import read_clock_status
+from lidarspec.packets.utc_times import UtcTimes
 
 GNSS = ls.sensor("ublox-gnss")
 VECTORS = json.loads((Path(lidarspec_ublox.__file__).parent / "vectors.json").read_text())
@@ -63,6 +65,34 @@ def test_the_state_of_the_clock_is_that_of_the_receiver() -> None:
     monitor.add(packets)
     report = monitor.report()
     assert (report.epoch, report.state, report.locked) == ("utc", "time resolved by GNSS", True)
+
+
+@pytest.mark.parametrize(
+    ("frame", "flag", "state"),
+    [
+        ("nav_pvt", "date", "time not fully resolved"),
+        ("nav_pvt", "time", "time not fully resolved"),
+        ("nav_pvt", "fully_resolved", "time not fully resolved"),
+        ("nav_timeutc", "utc", "UTC not valid"),
+    ],
+)
+def test_an_invalid_time_is_not_used_as_utc(frame: str, flag: str, state: str) -> None:
+    stream = b"".join(bytes.fromhex(vector["hex"]) for vector in INCOMING)
+    values = next(GNSS.parse(item.data) for item in GNSS.split(stream) if item.frame == frame)
+    valid = GNSS.decode(GNSS.build(frame, values), frame=frame)
+    times = UtcTimes(GNSS.id, GNSS.frames[frame].clock)
+    assert times.convert(valid).tolist() == valid.time_ns.tolist()
+    assert times.warnings == []
+
+    values["valid"][flag] = 0
+    invalid = GNSS.decode(GNSS.build(frame, values), frame=frame)
+    host_ns = 1_800_000_000 * 10**9
+    with pytest.raises(UsageError, match="UTC is unknown"):
+        times.convert(invalid)
+    utc_ns = times.to_utc(invalid.time_ns.item(), host_ns, read_clock_status(invalid).item())
+    assert utc_ns == host_ns
+    assert times.changes[-1].source.state == state
+    assert times.changes[-1].source.locked is False
 
 
 def test_times_are_utc() -> None:
