@@ -266,8 +266,8 @@ VLP16 = Sensor(
     # 12 shots, or 6 with dual return, with periods of 110.592 and 46.080 us
     relatives={
         "velodyne-hdl32e": (
-            "it sends one packet every 1327 us (664 us with dual return), an HDL-32E every 553"
-            " us (276 us)"
+            "it sends one packet every 553 us (276 us with dual return), a VLP-16 every 1327 us"
+            " (664 us)"
         ),
         **HI_RES_RELATIVE,
         **VLP32A_RELATIVE,
@@ -332,7 +332,7 @@ PUCK_HI_RES = make_related_model(
             "the product is 0x22, or 0x21 with old firmware",
             lambda f: (f.product == 0x22) | (f.product == 0x21),
         ),
-        "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),
+        "velodyne-hdl32e": Relative("the product is 0x21", lambda f: f.product == 0x21),
         **VLP32A_RELATIVE,
     },
     status="manual",

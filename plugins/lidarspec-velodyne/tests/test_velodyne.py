@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -446,6 +447,17 @@ def test_the_simulated_sensor_turns_ten_times_a_second(
     assert cloud.ring is not None
     assert set(cloud.ring.tolist()) == set(range(lasers))
     assert cloud.valid.mean() > 0.9
+
+
+def test_the_difference_of_an_hdl32e_names_its_own_interval_first() -> None:
+    intervals_us = [
+        round(np.diff(sensor.decode(simulate(sensor, 2)).time_ns).item() / 1000)
+        for sensor in (HDL32E, VLP16)
+    ]
+    text = VLP16.relatives["velodyne-hdl32e"]
+    assert isinstance(text, str)
+    numbers = [int(number) for number in re.findall(r"(\d+) us", text)]
+    assert numbers[::2] == intervals_us
 
 
 def test_the_hour_is_that_of_the_position_packets() -> None:
