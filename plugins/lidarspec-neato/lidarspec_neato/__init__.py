@@ -146,21 +146,37 @@ def sweep(i: int, count: int) -> dict[str, float]:
     return {"start_angle": i * count % 360, "speed": 300}
 
 
-NO_DIFFERENCE = "the packets are identical; the direction of rotation and the label differ"
-XV11_MODELS = ("neato-xv11", "xiaomi-lds01rr", "xiaomi-lds02rr")
+#: The direction of rotation of each model with these packets: 1 is counter-clockwise.
+XV11_DIRECTIONS = {"neato-xv11": 1, "xiaomi-lds01rr": 1, "xiaomi-lds02rr": -1}
+
+
+def describe_differences(own: str) -> dict[str, str]:
+    """Return id -> the difference to this model, of each model with the packets of an XV-11."""
+    texts = {}
+    for other, direction in XV11_DIRECTIONS.items():
+        if other == own:
+            continue
+        if direction == XV11_DIRECTIONS[own]:
+            texts[other] = "the packets are identical; the label names the model"
+        elif direction == 1:
+            texts[other] = "the packets are identical, but it rotates counter-clockwise"
+        else:
+            texts[other] = "the packets are identical, but it rotates clockwise"
+    return texts
+
 
 XV11 = Sensor(
     "neato-xv11",
     vendor="Neato",
     model="XV-11",
     frames={"data": Frame(DATA, data=True, plausible=plausible)},
-    points=partial(points, direction=1),
+    points=partial(points, direction=XV11_DIRECTIONS["neato-xv11"]),
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200)},
     simulation=Simulation(partial(sweep, count=4)),
     range_limits=(0.15, 6.0),
     beams=360,
-    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "neato-xv11"},
+    relatives=describe_differences("neato-xv11"),
     status="vectors",
     source="xv_11_laser_driver; kaiaai/LDS, LDS_NEATO_XV11. Range limits are assumed",
 )
@@ -169,7 +185,7 @@ LDS01RR = dataclasses.replace(
     id="xiaomi-lds01rr",
     vendor="Xiaomi",
     model="LDS01RR",
-    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds01rr"},
+    relatives=describe_differences("xiaomi-lds01rr"),
     source="kaiaai/LDS, LDS_LDS01RR. Range limits are assumed",
 )
 LDS02RR = dataclasses.replace(
@@ -177,8 +193,8 @@ LDS02RR = dataclasses.replace(
     id="xiaomi-lds02rr",
     vendor="Xiaomi",
     model="LDS02RR",
-    points=partial(points, direction=-1),
-    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds02rr"},
+    points=partial(points, direction=XV11_DIRECTIONS["xiaomi-lds02rr"]),
+    relatives=describe_differences("xiaomi-lds02rr"),
     source="kaiaai/LDS, LDS_LDS02RR. Range limits are assumed",
 )
 HLS_LFCD2 = Sensor(

@@ -10,8 +10,9 @@ from lidarspec import simulate
 from tests.evidence import decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
-XV11, LDS02RR, LFCD = (
+XV11, LDS01RR, LDS02RR, LFCD = (
     ls.sensor("neato-xv11"),
+    ls.sensor("xiaomi-lds01rr"),
     ls.sensor("xiaomi-lds02rr"),
     ls.sensor("turtlebot3-lds-01"),
 )
@@ -37,6 +38,15 @@ def test_the_xv11_counts_counter_clockwise_and_the_lds02rr_clockwise() -> None:
     np.testing.assert_allclose(
         np.rad2deg(decode(LDS02RR, data).points().azimuth) % 360, [0, 359, 358, 357], atol=1e-4
     )
+
+
+def test_only_a_model_that_rotates_the_other_way_differs_in_direction() -> None:
+    label = "the packets are identical; the label names the model"
+    clockwise = "the packets are identical, but it rotates clockwise"
+    counter_clockwise = "the packets are identical, but it rotates counter-clockwise"
+    assert XV11.relatives == {"xiaomi-lds01rr": label, "xiaomi-lds02rr": clockwise}
+    assert LDS01RR.relatives == {"neato-xv11": label, "xiaomi-lds02rr": clockwise}
+    assert LDS02RR.relatives == dict.fromkeys(["neato-xv11", "xiaomi-lds01rr"], counter_clockwise)
 
 
 @pytest.mark.parametrize("sensor", [XV11, LDS02RR, LFCD], ids=lambda sensor: sensor.id)
