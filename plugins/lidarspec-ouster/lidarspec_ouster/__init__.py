@@ -224,9 +224,10 @@ def configure(
     metadata = metadata or (None if arguments else sensor.options.get("metadata"))
     if metadata is not None:
         if arguments:
+            names = " and ".join(arguments)
             raise UsageError(
-                f"{sensor.id}: {' and '.join(arguments)} cannot be set if metadata are given,"
-                " because the metadata contain this value"
+                f"{sensor.id}: {names} cannot be set if metadata are given, because the metadata"
+                f" contain {names}"
             )
         unit = read_unit(metadata)
         models = [

@@ -401,6 +401,11 @@ def test_layouts_that_there_are_not_are_refused(options: dict[str, Any]) -> None
         OS1.configure(**options)
 
 
+def test_a_layout_beside_metadata_is_refused_by_name() -> None:
+    with pytest.raises(ls.UsageError, match="because the metadata contain rows and turn"):
+        OS1.configure(metadata="unit.json", rows=16, turn=512)
+
+
 def test_metadata_say_what_the_clock_counts(tmp_path: Path) -> None:
     metadata = json.loads(make_nominal_unit("OS1", 32, 512, "LEGACY").to_metadata())
     metadata["config_params"]["timestamp_mode"] = "TIME_FROM_PTP_1588"
