@@ -261,7 +261,7 @@ def read_reply(reply: Any) -> dict[str, Any]:
         code = page["error_code"]
     except (ValueError, KeyError, TypeError):
         raise ValueError(
-            f"the reply is not JSON of PFSDP; its HTTP status is {reply.status}"
+            f"expected a JSON object with error_code, got HTTP status {reply.status}"
         ) from None
     if code != 0:
         raise ValueError(f"{page.get('error_text')} (error {code})")

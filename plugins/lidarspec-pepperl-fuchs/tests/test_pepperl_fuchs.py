@@ -99,9 +99,18 @@ def test_a_shorter_last_packet_is_no_loss() -> None:
     assert R2000.decode(shorter[:7] + shorter[8:]).stats.lost == 1
 
 
-def test_an_error_of_the_scanner_is_reported() -> None:
-    refusal = b'{"error_code": 120, "error_text": "Invalid handle"}'
-    answers = {**R2000.simulation.answers, "start": [("reply", {"status": 400, "body": refusal})]}
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (
+            b'{"error_code": 120, "error_text": "Invalid handle"}',
+            r"start: Invalid handle \(error 120\)",
+        ),
+        (b'{"port": 80}', "expected a JSON object with error_code, got HTTP status 400"),
+    ],
+)
+def test_an_error_of_the_scanner_is_reported(body: bytes, message: str) -> None:
+    answers = {**R2000.simulation.answers, "start": [("reply", {"status": 400, "body": body})]}
     sensor = dataclasses.replace(
         R2000,
         links={**R2000.links, "http": Http(free_port())},
@@ -109,6 +118,6 @@ def test_an_error_of_the_scanner_is_reported() -> None:
     )
     with (
         virtual_port(sensor, to="udp://127.0.0.1") as port,
-        pytest.raises(CommandError, match=r"start: Invalid handle \(error 120\)"),
+        pytest.raises(CommandError, match=message),
     ):
         ls.open(port.path, sensor)
