@@ -73,9 +73,7 @@ def make_data_frame(unit: str) -> Frame:
     struct = Struct(
         "header" / Const(b"\x59\x59"),
         "distance" / Scaled(Int16ul, step, "m") * "FFFC and above: no distance",
-        "strength"
-        / Int16ul
-        * "signal strength; the distance is unreliable if it is below 100 or FFFF",
+        "strength" / Int16ul * "signal strength; below 100 and at FFFF the distance is unreliable",
         "temperature" / Scaled(Int16ul, 1 / 8, "degC", -256) * "temperature of the chip",
         "checksum" / Int8ul,
     )

@@ -212,7 +212,11 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
         clock=Clock(("seconds", "nanoseconds")),
         vendor_axes=("forward", "left", "up"),
         turn=(5.0, 20.0),
-        relatives={f"quanergy-{other}": "the packets are identical; the label names the model"},
+        relatives={
+            f"quanergy-{other}": (
+                "the packets are identical; the label, or the sensor's web page, names the model"
+            )
+        },
         status="manual",
         source="quanergy_client; rate, speed and range are assumed",
         **facts,

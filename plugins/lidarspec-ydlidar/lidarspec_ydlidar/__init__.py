@@ -177,7 +177,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
         )
     if own.number and other.number:
         return "info.model"
-    return "the packets are identical; the baud rate and the label on the housing may differ"
+    return "the packets are identical; the label names the model; the baud rate may differ"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
