@@ -126,8 +126,8 @@ TIME = Scaled(Int64ul, 1, "ns")
 
 HEADER = (
     "frame_id" / Int16ul * "counter of revolutions",
-    "init_id" / Int24ul * "changes each time the sensor starts or its configuration changes",
-    "serial" / SERIAL * "serial number of the sensor, which the metadata call prod_sn",
+    "init_id" / Int24ul * "changes with each start and each change of the configuration",
+    "serial" / SERIAL * "serial number of the sensor, prod_sn in the metadata",
     "alert_flags" / Int8ul,
     "reserved_13" / Bytes(3),
 )
@@ -138,11 +138,12 @@ FUSA_HEADER = (
     "reserved_9" / Bytes(2),
     "serial" / SERIAL * "serial number of the sensor, prod_sn in the metadata",
 )
+STATE_BITS = BitStruct("reserved" / BitsInteger(4), "state" / BitsInteger(4))
 STATE = (
     "shutdown_countdown" / Scaled(Int8ul, 1, "s") * "time until the thermal shutdown",
     "shot_limiting_countdown" / Scaled(Int8ul, 1, "s"),
-    "shutdown_state" / Int8ul * "the value is in the lowest 4 bits",
-    "shot_limiting_state" / Int8ul * "in the low 4 bits",
+    "shutdown_state" / STATE_BITS,
+    "shot_limiting_state" / STATE_BITS,
     "reserved_20" / Bytes(12),
 )
 FOOTER = ("reserved_footer" / Bytes(24), "crc" / Int64ul)

@@ -128,8 +128,10 @@ def make_packet(returns: int) -> Struct:
         "checksum" / Int32ul * "not checked: the vendor's header does not name the CRC",
         "size" / Int32ul,
         "source"
-        / Int8ul
-        * "the low bits are the number of the lidar, the high bits are the type of the time",
+        / BitStruct(
+            "time_type" / BitsInteger(4),
+            "number" / BitsInteger(4) * "number of the lidar",
+        ),
         "lidar_type" / Int8ul,
         "start" / Scaled(Float64l, 1e-6, "s") * "time of the start of the frame, since 1970",
         "mode" / Int8ul,
@@ -250,8 +252,8 @@ FALCON = Sensor(
     points=points,
     scan=OnChange("frame"),
     links={"data": Udp(8010)},
-    # "epoch time" in the vendor's header. The type of time is in the high bits of `source`, but
-    # the meaning of its values is not public.
+    # "epoch time" in the vendor's header. The type of time is `source.time_type`, but the
+    # meaning of its values is not public.
     clock=Clock(lambda f: (f.start, f.blocks[0].after), epoch="utc"),
     range_limits=(0.1, 500.0),
     turn=(5.0, 20.0),
