@@ -44,6 +44,7 @@ from lidarspec_robosense.rotor import (
     SPEED_LIMITS_HZ,
     TEMPERATURE,
     TIME,
+    WAVE_MODES,
     Rotor,
     laser_angles,
     make_angles,
@@ -57,8 +58,9 @@ from lidarspec_robosense.rotor import (
 
 BLOCKS = 12
 LASERS = 32
-DUAL = 0
-STRONGEST = 4  # return modes (manual 5.4.2)
+# return modes (manual 5.4.2)
+DUAL = WAVE_MODES["dual"]
+STRONGEST = WAVE_MODES["strongest"]
 FIRING_PERIOD_S = 55.56e-6  # from one firing of all lasers to the next (rs_driver, nebula)
 TYPE_5515 = 6
 TYPE_1615 = 7  # and 16P

@@ -113,7 +113,7 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
 
 
-#: Codes of DIFOP and of the packets of an M1 (user guides).
+#: Codes of DIFOP of most models, and of the packets of an M1 (user guides).
 SYNC_MODES = {"internal": 0, "PPS": 1, "PTP": 2, "gPTP": 3}
 SYNC_STATES = {"none": 0, "locked": 1, "timeout": 2}
 #: The mode and the status, of one byte each, make one code: mode * CODES_PER_MODE + status.
