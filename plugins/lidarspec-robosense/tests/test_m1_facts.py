@@ -76,15 +76,13 @@ def test_the_firmware_decides_the_temperature(firmware: str, byte: int, celsius:
 
 
 def test_the_load_of_the_network() -> None:
-    """Table 2 and page 6 of the M1 user guide; the rate is that of 630 packets a frame."""
+    """The rate is that of 630 packets a frame, 10 frames a second."""
     packets = ls.simulate(M1, 1500)
     data = [packet for packet in packets if len(packet) == 1210]
     times_ns = M1.decode(data).time_ns
     rate_hz = 1e9 * (len(data) - 1) / np.ptp(times_ns)
     assert rate_hz == pytest.approx(6300, rel=1e-3)
     assert rate_hz * 1210 * 8 == pytest.approx(61e6, rel=1e-3)  # bits a second
-    printed = 58.2e6
-    assert printed == pytest.approx(6000 * 1210 * 8, rel=3e-3)
     assert len(M1.example("difop")) == 256
 
 
