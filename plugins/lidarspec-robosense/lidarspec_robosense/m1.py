@@ -294,45 +294,56 @@ def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
     }
 
 
+def change_sweep(simulation: Simulation, **values: Any) -> Simulation:
+    """Return a simulation with other arguments of its sweep."""
+    assert simulation.sweep is not None  # for mypy
+    return dataclasses.replace(simulation, sweep=functools.partial(simulation.sweep, **values))
+
+
+def select_firmware(sensor: Sensor, firmware: str) -> Sensor:
+    """Return the sensor with the temperature in degC, by the formula of this firmware."""
+    struct = Struct(*HEADER_START, TEMPERATURES[firmware], *BLOCKS_AND_TAIL)
+    data = dataclasses.replace(sensor.frames["data"], struct=struct)
+    return dataclasses.replace(
+        sensor,
+        frames={**sensor.frames, "data": data},
+        simulation=change_sweep(sensor.simulation, temperature=25),
+        info={**sensor.info, "temperature": "data.mems_tmp"},
+    )
+
+
+def select_simulated_returns(sensor: Sensor, returns: str) -> Sensor:
+    """Return the sensor whose simulation sends and reports these returns."""
+    is_dual = returns == "dual"
+    difop = sensor.frames["difop"]
+    difop = dataclasses.replace(difop, simulation=change_sweep(difop.simulation, is_dual=is_dual))
+    return dataclasses.replace(
+        sensor,
+        frames={**sensor.frames, "difop": difop},
+        simulation=change_sweep(sensor.simulation, is_dual=is_dual),
+    )
+
+
 def configure(
     sensor: Sensor,
     /,
     *,
     firmware: Literal["current", "2021"] | None = None,
-    returns: Literal["single", "dual"] | None = None,
+    simulated_returns: Literal["single", "dual"] | None = None,
 ) -> Sensor:
     """Return the sensor with a temperature in degC, or with other returns of a simulated sensor.
 
     Args:
         firmware: "current" if the byte of the temperature is degC + 80 (M1P user guide, rs_driver),
             "2021" if it is signed degC (rs_driver of April 2021).
-        returns: the returns that the simulated sensor sends. Real packets contain their mode.
+        simulated_returns: the returns that the simulated sensor sends. Real packets contain their
+            mode.
     """
     if firmware is not None:
-        struct = Struct(*HEADER_START, TEMPERATURES[firmware], *BLOCKS_AND_TAIL)
-        data = dataclasses.replace(sensor.frames["data"], struct=struct)
-        sensor = dataclasses.replace(
-            sensor,
-            frames={**sensor.frames, "data": data},
-            simulation=change_sweep(sensor.simulation, temperature=25),
-            info={**sensor.info, "temperature": "data.mems_tmp"},
-        )
-    if returns is not None:
-        is_dual = returns == "dual"
-        difop = sensor.frames["difop"]
-        reporting = change_sweep(difop.simulation, is_dual=is_dual)
-        sensor = dataclasses.replace(
-            sensor,
-            frames={**sensor.frames, "difop": dataclasses.replace(difop, simulation=reporting)},
-            simulation=change_sweep(sensor.simulation, is_dual=is_dual),
-        )
+        sensor = select_firmware(sensor, firmware)
+    if simulated_returns is not None:
+        sensor = select_simulated_returns(sensor, simulated_returns)
     return sensor
-
-
-def change_sweep(simulation: Simulation, **values: Any) -> Simulation:
-    """Return a simulation with other arguments of its sweep."""
-    assert simulation.sweep is not None
-    return dataclasses.replace(simulation, sweep=functools.partial(simulation.sweep, **values))
 
 
 def in_each_layout(field: str, text: Callable[[Any], str] | None = None) -> Reported:

@@ -132,7 +132,7 @@ def test_lost_halves_are_in_the_contents_of_a_file(packets: list[bytes], tmp_pat
 
 
 def test_a_simulated_sensor_sends_pairs() -> None:
-    dual = M1.configure(firmware="current").configure(returns="dual")
+    dual = M1.configure(firmware="current").configure(simulated_returns="dual")
     decoded = dual.decode(ls.simulate(dual, PACKETS + 20))
     assert decoded["pkt_psn"].tolist() == [*range(1, PACKETS + 1), *range(1, 21)]
     assert set(decoded["mems_tmp"].tolist()) == {25}
@@ -149,7 +149,7 @@ def test_a_simulated_sensor_sends_pairs() -> None:
     report = dual.frames["difop"].simulation.sweep
     assert report is not None
     assert report(0)["return_mode"] == 0
-    single = dual.configure(returns="single")
+    single = dual.configure(simulated_returns="single")
     assert ls.simulate(single, 40) == ls.simulate(M1.configure(firmware="current"), 40)
 
 
