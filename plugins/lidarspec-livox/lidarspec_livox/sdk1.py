@@ -88,6 +88,7 @@ TIMESTAMP_TYPES = {
 IMU_RATE_HZ = 200
 MODEL_TYPES = {"Mid-40": 1, "Tele-15": 2, "Horizon LiDAR": 3, "Mid-70": 6, "Avia": 7}
 STATES = {"starting": 0, "normal": 1, "power_saving": 2, "standby": 3, "error": 4}
+WORK_MODES = {name: STATES[name] for name in ("normal", "power_saving", "standby")}
 CLOCKS = {"power_up": 0, "ptp": 1, "gps_and_pps": GPS, "pps": 4}
 COMMAND_PORT = 55_501
 DATA_PORT = 56_001
@@ -444,7 +445,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "reboot": make_command("reboot", args={"delay": ("delay", 0, 65.535)}, retries=0),
     "set_coordinates": make_setter(COORDINATES, "coordinates", {"cartesian": 0, "spherical": 1}),
-    "set_mode": make_setter(MODE, "mode", {"normal": 1, "power_saving": 2, "standby": 3}),
+    "set_mode": make_setter(MODE, "mode", WORK_MODES),
     "set_rain_mode": make_setter(RAIN, "rain_mode", SWITCH),
     "set_fan": make_setter(FAN, "fan", SWITCH),
     "get_fan": make_command("ask", "fan", GET_FAN),

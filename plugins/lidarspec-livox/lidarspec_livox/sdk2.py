@@ -474,28 +474,25 @@ def make_setter(
         frame: the frame of the request.
         name: a key of `PARAMETERS`.
         values: fixed values by their field in the parameter.
-        args: the ranges of arguments, by their field in the parameter.
+        args: argument -> its field in the parameter, and its range.
         more: further arguments of `Command`.
     """
     all_values = {
         "parameter.key": PARAMETERS[name][0],
         **{f"parameter.value.{path}": value for path, value in (values or {}).items()},
     }
-    ranges = {path: (f"parameter.value.{path}", *limits) for path, limits in (args or {}).items()}
-    return make_request(frame, "set_ack", all_values, args=ranges, matches={"result": 0}, **more)
+    all_args = {
+        argument: (f"parameter.value.{path}", *limits)
+        for argument, (path, *limits) in (args or {}).items()
+    }
+    return make_request(frame, "set_ack", all_values, args=all_args, matches={"result": 0}, **more)
 
 
 def make_choice_setter(name: str) -> Command:
     """Return a command that sets a parameter to one of its named values."""
-    key, code = PARAMETERS[name]
-    names = {text: raw for raw, text in code.ksymapping.items()}
-    return make_request(
-        "set_number",
-        "set_ack",
-        {"parameter.key": key},
-        args={name: ("parameter.value.number", Choice(**names))},
-        matches={"result": 0},
-    )
+    enum = PARAMETERS[name][1]
+    names = {text: value for value, text in enum.ksymapping.items()}
+    return make_setter("set_number", name, args={name: ("number", Choice(**names))})
 
 
 def make_host_setter(name: str, port: int, lidar_port: int) -> Command:
@@ -520,14 +517,16 @@ COMMANDS: dict[str, Command] = {
     "set_imu": make_choice_setter("imu_enabled"),
     "enable_fov": make_choice_setter("fov_enabled"),
     "set_address": make_setter(
-        "set_net", "lidar_address", args={name: (Address(),) for name in ("ip", "mask", "gateway")}
+        "set_net",
+        "lidar_address",
+        args={name: (name, Address()) for name in ("ip", "mask", "gateway")},
     ),
     "set_attitude": make_setter(
         "set_attitude",
         "attitude",
         args={
-            **dict.fromkeys(("roll", "pitch", "yaw"), (-360, 360)),
-            **dict.fromkeys("xyz", (-MAX_POSITION_M, MAX_POSITION_M)),
+            **{name: (name, -360, 360) for name in ("roll", "pitch", "yaw")},
+            **{axis: (axis, -MAX_POSITION_M, MAX_POSITION_M) for axis in "xyz"},
         },
     ),
     **{
@@ -535,8 +534,8 @@ COMMANDS: dict[str, Command] = {
             "set_fov",
             name,
             args={
-                **dict.fromkeys(("yaw_start", "yaw_stop"), (0, 360)),
-                **dict.fromkeys(("pitch_start", "pitch_stop"), (-90, 90)),
+                **{name: (name, 0, 360) for name in ("yaw_start", "yaw_stop")},
+                **{name: (name, -90, 90) for name in ("pitch_start", "pitch_stop")},
             },
         )
         for name in ("fov_0", "fov_1")
