@@ -78,13 +78,13 @@ def agree(
     *,
     max_length: int = 200,
     kept: bool = True,
-    more: bool = False,
+    has_hidden_fields: bool = False,
 ) -> int:
     """Fail unless every engine reads the input as construct does.
 
     Args:
         kept: require that a built value gives the same bytes; False if `Rebuild` replaces a value.
-        more: whether our frames may have fields that construct hides.
+        has_hidden_fields: whether our frames may have fields that construct hides.
 
     Returns:
         The number of valid frames.
@@ -103,7 +103,7 @@ def agree(
             continue  # a frame without a byte has no place in any input
         whole.append((data, wanted))
         found = ours.parse(data)
-        if more:
+        if has_hidden_fields:
             assert has_all(plain(found), wanted), data.hex()
         else:
             assert repr(plain(found)) == repr(wanted), data.hex()
@@ -119,7 +119,7 @@ def agree(
         assert packets.stats.plugin_errors == 0, packets.stats.tracebacks
         for path in packets.table.schema.columns:
             names = path.split(".")
-            if more and not any(has_path(wanted, names) for _, wanted in whole):
+            if has_hidden_fields and not any(has_path(wanted, names) for _, wanted in whole):
                 continue
             column = column_of(packets, path)
             for one, (data, wanted) in zip(column, whole, strict=len(column) > 0):
@@ -142,8 +142,7 @@ def has_path(value: Any, names: Sequence[str]) -> bool:
         return any(has_path(part, names) for part in value)
     if not names:
         return True
-    is_there = isinstance(value, dict) and names[0] in value
-    return is_there and has_path(value[names[0]], names[1:])
+    return isinstance(value, dict) and names[0] in value and has_path(value[names[0]], names[1:])
 
 
 def column_of(packets: Packets, path: str) -> Sequence[Any]:

@@ -20,6 +20,8 @@ NAMES: dict[str, Any] = {
     **{name: getattr(vocabulary, name) for name in ("Scaled", "Checksummed", "Xor", "Sum", "Crc")},
 }
 
+#: A rebuilt value that is right in each parsed frame. Other rebuilt values replace the parsed one.
+COUNT_OF_ARRAY = "Rebuild(Int8ub, len_(this.v))"
 WORDS = (
     "Int8ub",
     "Int8sb",
@@ -70,7 +72,7 @@ class Drawn:
         size: the maximum size.
         levels: the known fields of each enclosing struct, outermost first.
         interpreted: whether to include texts, of which construct alone can read some.
-        adapted: whether to include parts that construct decodes, or reads several fields for.
+        adapted: whether to include ProcessXor and FocusedSeq.
     """
 
     source: Random
@@ -171,7 +173,7 @@ class Drawn:
             (
                 f'FocusedSeq("v", {text}, "v" / {word})',
                 f'FocusedSeq("v", "v" / Struct("x" / {word}, "y" / {self.bits("")}), {text})',
-                f'FocusedSeq("v", {text}, "n" / Rebuild(Int8ub, len_(this.v)),'
+                f'FocusedSeq("v", {text}, "n" / {COUNT_OF_ARRAY},'
                 f' "v" / Array(this.n, {word}), {text})',
             )
         )
@@ -324,8 +326,10 @@ def spec(number: int, *, interpreted: bool = False, adapted: bool = False) -> st
         interpreted: whether it may contain texts, of which construct alone can read some.
         adapted: whether it may contain ProcessXor and FocusedSeq.
     """
-    source = Random(f"spec {number} {interpreted}" + " adapted" * adapted)
-    return Drawn(source, 2 + number % 7, interpreted, adapted).struct(0)
+    seed = f"spec {number} {interpreted}"
+    if adapted:
+        seed += " adapted"
+    return Drawn(Random(seed), 2 + number % 7, interpreted, adapted).struct(0)
 
 
 def make_struct(text: str) -> construct.Construct:

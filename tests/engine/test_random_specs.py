@@ -17,11 +17,9 @@ from lidarspec import Sensor, SpecError
 from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, clouds_agree, parse_by_construct, sensor
 from tests.engine.engines import is_compiled
-from tests.engine.random_specs import make_struct, spec
+from tests.engine.random_specs import COUNT_OF_ARRAY, make_struct, spec
 
 LONGEST = 150
-#: A rebuilt value that is right in each parsed frame. Other rebuilt values replace the parsed one.
-COUNT_OF_ARRAY = "Rebuild(Int8ub, len_(this.v))"
 #: The compiled back end, if it is installed.
 JIT = ("jit",) if importlib.util.find_spec("numba") else ()
 
@@ -82,7 +80,7 @@ def try_spec(
     try:
         some = frames(ours, struct, number)
         kept = "Rebuild" not in text.replace(COUNT_OF_ARRAY, "")
-        agree(struct, some, max_length=LONGEST, kept=kept, more=adapted)
+        agree(struct, some, max_length=LONGEST, kept=kept, has_hidden_fields=adapted)
         if is_compiled(ours.frames["data"]):
             clouds_agree(struct, some, max_length=LONGEST, backends=backends)
     except BaseException as error:
