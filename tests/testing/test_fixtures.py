@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,14 +33,24 @@ PLACES = [
 ]
 
 
+@contextlib.contextmanager
+def open_simulated(
+    sensor: ls.Sensor, to: str, **settings: Any
+) -> Iterator[tuple[serving.Served, ls.Device]]:
+    """Yield a simulated sensor in virtual time, and a device that reads its port."""
+    if to == "udp":
+        to = f"udp://127.0.0.1:{free_port()}"
+    with (
+        virtual_port(sensor, to=to, virtual_time=True, **settings) as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        yield port, device
+
+
 @pytest.mark.parametrize(("name", "to", "rate"), PLACES)
 def test_in_virtual_time_a_second_of_data_comes_at_once(name: str, to: str, rate: int) -> None:
     sensor = ls.sensor(name)
-    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
-    with (
-        virtual_port(sensor, to=place, virtual_time=True) as port,
-        ls.open(port.path, sensor) as device,
-    ):
+    with open_simulated(sensor, to) as (port, device):
         port.advance(1.0)
         sent = port.device.sent[sensor.data_frame]
         assert abs(sent - rate) <= 2
@@ -48,11 +61,7 @@ def test_in_virtual_time_a_second_of_data_comes_at_once(name: str, to: str, rate
 @pytest.mark.parametrize(("name", "to", "rate"), PLACES)
 def test_late_data_come_at_once(name: str, to: str, rate: int) -> None:
     sensor = ls.sensor(name)
-    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
-    with (
-        virtual_port(sensor, to=place, virtual_time=True) as port,
-        ls.open(port.path, sensor) as device,
-    ):
+    with open_simulated(sensor, to) as (port, device):
         frames = device.stats.frames
         port.advance(0.5)
         in_time = port.device.sent[sensor.data_frame]
@@ -70,11 +79,7 @@ def test_late_data_come_at_once(name: str, to: str, rate: int) -> None:
 @pytest.mark.parametrize(("name", "to", "rate"), PLACES)
 def test_an_unplugged_sensor_comes_back(name: str, to: str, rate: int) -> None:
     sensor = ls.sensor(name)
-    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
-    with (
-        virtual_port(sensor, to=place, virtual_time=True) as port,
-        ls.open(port.path, sensor) as device,
-    ):
+    with open_simulated(sensor, to) as (port, device):
         port.advance(0.2)
         port.unplug()
         port.advance(1.0)
@@ -86,14 +91,10 @@ def test_an_unplugged_sensor_comes_back(name: str, to: str, rate: int) -> None:
 
 def test_datagrams_are_lost_and_late() -> None:
     sensor = ls.sensor("robosense-m1")
-    place = f"udp://127.0.0.1:{free_port()}"
     faults = Faults(loss=0.02, reorder=3)
-    with (
-        virtual_port(sensor, to=place, faults=faults, virtual_time=True) as port,
-        ls.open(port.path, sensor) as device,
-    ):
+    with open_simulated(sensor, "udp", faults=faults) as (port, device):
         port.advance(0.5)
-        read_until(device, lambda: device.stats.lost > 10)
+        read_until(device, lambda: device.stats.lost > 10 and device.stats.late > 10)
 
 
 @posix
