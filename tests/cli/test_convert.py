@@ -26,8 +26,10 @@ from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, process, ran, run_json
 from tests.evidence import capture
-from tests.shapes import SHAPES
+from tests.shapes import SHAPES, extras, inertia
 
+EXTRAS = Path(extras.__file__)
+INERTIA = Path(inertia.__file__)
 COLUMNS = ["x", "y", "z", "range", "azimuth", "elevation", "intensity", "time", "scan"]
 
 
@@ -403,56 +405,36 @@ def test_verbose_and_quiet_output(tmp_path: Path) -> None:
 
 
 def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path) -> None:
-    plugin, bytes_, target = tmp_path / "extras.py", tmp_path / "in.bin", tmp_path / "out.csv"
-    hook = [
-        "from lidarspec.spec import hookimpl",
-        "from tests.shapes.extras import SENSOR",
-        "@hookimpl",
-        "def lidarspec_sensors():",
-    ]
-    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
+    bytes_, target = tmp_path / "in.bin", tmp_path / "out.csv"
     bytes_.write_bytes(b"".join(simulate(SHAPES["shape-extras"], 60)))
-    told = ran("convert", bytes_, target, "-s", plugin).stderr
+    told = ran("convert", bytes_, target, "-s", EXTRAS).stderr
     assert "further columns: velocity [m/s], near_ir, signal [photons]" in told
     assert set(read(target)["signal"]) == {2**24 + 1 + number for number in range(4)}
     assert (
-        run_json("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
+        run_json("convert", bytes_, target, "-s", EXTRAS, "--force")["units"]["velocity"] == "m/s"
     )
-    assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
+    assert "velocity [m/s]" in ran("read", bytes_, "-s", EXTRAS, "-n", 1).stdout
     assert (
         "colours: velocity 0 to 0.001 m/s"
-        in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocity").stdout
+        in ran("view", bytes_, "-s", EXTRAS, "--once", "--colour", "velocity").stdout
     )
     assert (
         "did you mean 'velocity'"
-        in ran("view", bytes_, "-s", plugin, "--once", "--colour", "velocty", code=2).stderr
+        in ran("view", bytes_, "-s", EXTRAS, "--once", "--colour", "velocty", code=2).stderr
     )
 
 
-def write_inertia(folder: Path) -> Path:
-    """Write a plugin file with a sensor that has an IMU, and return its path."""
-    plugin = folder / "inertia.py"
-    hook = [
-        "from lidarspec.spec import hookimpl",
-        "from tests.shapes.inertia import SENSOR",
-        "@hookimpl",
-        "def lidarspec_sensors():",
-    ]
-    plugin.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
-    return plugin
-
-
 def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
-    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_ = tmp_path / "in.bin"
     sensor = SHAPES["shape-inertia"]
     bytes_.write_bytes(b"".join(simulate(sensor, 40)))
-    told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
+    told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", INERTIA, "--imu").stderr
     assert "120 IMU samples from shape-inertia" in told
     rows = read(tmp_path / "imu.csv")
     assert next(iter(rows)) == "time_ns"
     np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)
     assert (
-        run_json("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)[
+        run_json("convert", bytes_, tmp_path / "imu.npz", "-s", INERTIA, "--imu", "-n", 10)[
             "samples"
         ]
         == 10
@@ -461,7 +443,7 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
         assert arrays["time_ns"].tolist() == rows["time_ns"][:10].tolist()
     assert (
         "unknown format '.pcd' (known: .csv, .npz)"
-        in ran("convert", bytes_, tmp_path / "imu.pcd", "-s", plugin, "--imu", code=2).stderr
+        in ran("convert", bytes_, tmp_path / "imu.pcd", "-s", INERTIA, "--imu", code=2).stderr
     )
     assert (
         "no frame type contains IMU samples"
@@ -472,9 +454,9 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
 
 
 def test_reading_ends_after_the_requested_imu_samples(tmp_path: Path) -> None:
-    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_ = tmp_path / "in.bin"
     bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)) * 2000)
-    summary = run_json("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu", "-n", 10)
+    summary = run_json("convert", bytes_, tmp_path / "imu.csv", "-s", INERTIA, "--imu", "-n", 10)
     assert summary["samples"] == 10
     assert summary["stats"]["bytes_in"] < bytes_.stat().st_size
 
@@ -485,18 +467,18 @@ def test_reading_ends_after_the_requested_imu_samples(tmp_path: Path) -> None:
 def test_options_for_scans_are_refused_for_imu_samples(
     words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_ = tmp_path / "in.bin"
     bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)))
     target = tmp_path / "imu.csv"
-    error = ran("convert", bytes_, target, "-s", plugin, "--imu", *words, code=2).stderr
+    error = ran("convert", bytes_, target, "-s", INERTIA, "--imu", *words, code=2).stderr
     assert "IMU samples can be selected only by" in error or "--imu cannot be combined" in error
     assert not target.exists()
 
 
 def test_a_slice_without_imu_samples_states_the_times_of_the_file(tmp_path: Path) -> None:
-    plugin, bytes_ = write_inertia(tmp_path), tmp_path / "in.bin"
+    bytes_ = tmp_path / "in.bin"
     bytes_.write_bytes(b"".join(simulate(SHAPES["shape-inertia"], 40)))
-    words = ("convert", bytes_, tmp_path / "out.csv", "-s", plugin, "--slice", "100:200")
+    words = ("convert", bytes_, tmp_path / "out.csv", "-s", INERTIA, "--slice", "100:200")
     for chosen in (("--imu",), ("-f", "data")):
         error = ran(*words, *chosen, code=2).stderr
         assert "in.bin has frames from 0 s to" in error
@@ -505,7 +487,6 @@ def test_a_slice_without_imu_samples_states_the_times_of_the_file(tmp_path: Path
 
 def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> None:
     """The clock of the shape counts from power-up: UTC is the arrival without its delay."""
-    plugin = write_inertia(tmp_path)
     sensor = SHAPES["shape-inertia"]
     recording = tmp_path / "drive.lsr"
     began_ns = 1_785_283_200 * 10**9
@@ -518,7 +499,7 @@ def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> Non
     found = {}
     for time in ("sensor", "host", "utc"):
         target = tmp_path / f"{time}.csv"
-        ran("convert", recording, target, "-s", plugin, "--imu", "--time", time)
+        ran("convert", recording, target, "-s", INERTIA, "--imu", "--time", time)
         with target.open(encoding="ascii", newline="") as file:
             found[time] = np.array([int(row["time_ns"]) for row in csv.DictReader(file)])
     late_ns = np.repeat(np.arange(400) % 2 * 1_000_000, 3)
@@ -528,7 +509,7 @@ def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> Non
     bytes_.write_bytes(b"".join(frames))
     for time in ("host", "utc"):
         target = tmp_path / "none.csv"
-        failed = ran("convert", bytes_, target, "-s", plugin, "--imu", "--time", time, code=2)
+        failed = ran("convert", bytes_, target, "-s", INERTIA, "--imu", "--time", time, code=2)
         assert "no arrival times" in failed.stderr
         assert "next: repeat with --time sensor" in failed.stderr
 

@@ -22,7 +22,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Cartesian, Clock, Fields, Frame, Imu
 from tests.by_construct import reader
-from tests.shapes import SHAPES
+from tests.shapes import SHAPES, inertia
 from tests.shapes.inertia import RATE, SAMPLES
 
 SENSOR = SHAPES["shape-inertia"]
@@ -114,7 +114,7 @@ def test_scans_have_their_imu_samples(tmp_path: Path) -> None:
     number = len(SENSOR.decode(data, "imu").imu()) + len(SENSOR.decode(data).imu())
     assert_in_their_scans(list(SENSOR.scans(data)), number)
     with ls.open(
-        f"sim:{written(tmp_path)}?rate=max", written(tmp_path), record=str(tmp_path / "a.lsr")
+        f"sim:{inertia.__file__}?rate=max", inertia.__file__, record=str(tmp_path / "a.lsr")
     ) as device:
         live = next(iter(device.scans()))
         assert live.imu is not None
@@ -122,31 +122,18 @@ def test_scans_have_their_imu_samples(tmp_path: Path) -> None:
         for packets in device.packets():
             if packets.time_ns[-1] > 2_000_000_000:
                 break
-    with ls.open(tmp_path / "a.lsr", written(tmp_path)) as device:
+    with ls.open(tmp_path / "a.lsr", inertia.__file__) as device:
         recorded = join_samples(list(device.imu()))
         assert device.stats.frames["imu"] > RATE
         assert len(recorded) == device.stats.frames["imu"] + SAMPLES * device.stats.frames["data"]
-    with ls.open(tmp_path / "a.lsr", written(tmp_path)) as device:
+    with ls.open(tmp_path / "a.lsr", inertia.__file__) as device:
         assert_in_their_scans(list(device.scans()), len(recorded))
 
     async def felt() -> int:
-        async with ls.open_async(tmp_path / "a.lsr", written(tmp_path)) as device:
+        async with ls.open_async(tmp_path / "a.lsr", inertia.__file__) as device:
             return sum([len(samples) async for samples in device.imu()])
 
     assert asyncio.run(felt()) == len(recorded)
-
-
-def written(folder: Path) -> str:
-    """Write a sensor's module; return its path."""
-    path = folder / "inertia.py"
-    hook = [
-        "from lidarspec.spec import hookimpl",
-        "from tests.shapes.inertia import SENSOR",
-        "@hookimpl",
-        "def lidarspec_sensors():",
-    ]
-    path.write_text("\n".join([*hook, "    return [SENSOR]", ""]), encoding="ascii")
-    return str(path)
 
 
 def test_a_mount_and_the_axes_of_the_vendor_turn_it() -> None:

@@ -33,6 +33,7 @@ from lidarspec.spec import (
     Simulation,
     Udp,
     Xor,
+    hookimpl,
 )
 
 BLOCKS, CHANNELS = 4, 3
@@ -113,3 +114,8 @@ SENSOR = Sensor(
     status="manual",
     source="invented for the tests: further attributes of points",
 )
+
+
+@hookimpl
+def lidarspec_sensors() -> list[Sensor]:
+    return [SENSOR]

@@ -24,6 +24,7 @@ from lidarspec.spec import (
     Simulation,
     Udp,
     Xor,
+    hookimpl,
 )
 
 POINTS, SAMPLES, TURN, PERIOD = 8, 3, 20, 0.005
@@ -109,3 +110,8 @@ SENSOR = Sensor(
     status="manual",
     source="invented for the tests: an IMU beside the points",
 )
+
+
+@hookimpl
+def lidarspec_sensors() -> list[Sensor]:
+    return [SENSOR]
