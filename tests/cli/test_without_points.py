@@ -221,10 +221,11 @@ def test_texts_are_values_in_every_verb(tmp_path: Path) -> None:
 
 
 TAGS = RECEIVER.with_name("tags.py")
+TAGS_BYTES = 8  # in each frame of `tags_file`
 
 
 @pytest.fixture(scope="module")
-def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tags_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a file of two frames with parts of several kinds."""
     path = tmp_path_factory.mktemp("tags") / "tags.bin"
     heat = [dict(type=2, temperature=200 + number) for number in range(3)]
@@ -232,28 +233,30 @@ def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sensor = SHAPES["shape-tags"]
     path.write_bytes(
         b"".join(
-            sensor.build("data", number=number, tags=parts, padding=bytes(-(7 + size) % 8))
-            for number, (parts, size) in enumerate(zip(frames, (8, 8), strict=True))
+            sensor.build("data", number=number, tags=parts, padding=bytes(-(7 + TAGS_BYTES) % 8))
+            for number, parts in enumerate(frames)
         )
     )
     return path
 
 
-def test_parts_of_one_kind_become_csv(tagged: Path, tmp_path: Path) -> None:
+def test_parts_of_one_kind_become_csv(tags_file: Path, tmp_path: Path) -> None:
     target = tmp_path / "heat.csv"
-    ran("convert", tagged, target, "-s", TAGS, "-f", "data.tags.temperature")
+    ran("convert", tags_file, target, "-s", TAGS, "-f", "data.tags.temperature")
     header, *rows = target.read_text().splitlines()
     assert header.split(",")[-1] == "temperature"
     assert [row.split(",")[-1] for row in rows] == ["20", "20.1", "20.2"]
-    result = ran("convert", tagged, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
+    result = ran("convert", tags_file, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
     assert "no columns for the parts of data" in result.stderr
     assert "-f data.tags.temperature" in result.stderr
     for name in ("data.tags.heat", "data."):
-        unknown = ran("convert", tagged, tmp_path / "no.csv", "-s", TAGS, "-f", name, code=2)
+        unknown = ran("convert", tags_file, tmp_path / "no.csv", "-s", TAGS, "-f", name, code=2)
         assert f"unknown field '{name}'" in unknown.stderr
 
 
-def test_missing_frames_and_parts_are_named(recording: Path, tagged: Path, tmp_path: Path) -> None:
+def test_missing_frames_and_parts_are_named(
+    recording: Path, tags_file: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "no.csv"
     words = ("convert", recording, target, "-s", RECEIVER, "-f", "rate_reply")
     missing_frame = ran(*words, code=4).stderr
@@ -265,10 +268,10 @@ def test_missing_frames_and_parts_are_named(recording: Path, tagged: Path, tmp_p
 
 
 def test_a_remark_lists_only_some_of_the_parts(
-    tagged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tags_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lidarspec.cli.convert.MAX_LISTED_PARTS", 1)
-    result = ran("convert", tagged, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
+    result = ran("convert", tags_file, tmp_path / "frames.csv", "-s", TAGS, "-f", "data")
     (remark,) = [line for line in result.stderr.splitlines() if "has no columns" in line]
     assert remark.count("-f data.") == 1
     assert "lidarspec show shape-tags lists 3 kinds of parts" in remark
