@@ -33,7 +33,7 @@ START_S = 0.2
 PROPORTIONAL = 0.006
 INTEGRAL = 0.02
 #: Lowest speed at which the scans of lidarspec are complete.
-MIN_HERTZ = 0.5
+MIN_SPEED_HZ = 0.5
 #: Longest time between two corrections that counts, seconds.
 MAX_STEP_S = 0.2
 
@@ -119,8 +119,8 @@ def main() -> None:
     parser.add_argument("--pin", default="GPIO18", help="output for gpiozero")
     parser.add_argument("--pwm", default="", help="folder of a channel in /sys/class/pwm")
     options = parser.parse_args()
-    if not options.hertz >= MIN_HERTZ:  # the manual gives no limits
-        parser.error(f"--hertz: expected at least {MIN_HERTZ}, got {options.hertz:g}")
+    if not options.hertz >= MIN_SPEED_HZ:  # also refuses nan; the manual gives no limits
+        parser.error(f"--hertz: expected at least {MIN_SPEED_HZ}, got {options.hertz:g}")
     pin = make_pin(options.pin, options.pwm)
     control = SpeedControl(pin, options.hertz)
     control.begin()
