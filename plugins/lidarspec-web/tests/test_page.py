@@ -345,11 +345,15 @@ def test_lost_halves_of_dual_returns_are_a_figure(browser: Any, tmp_path: Path) 
         for number in numbers
     ]
     path.write_text("\n\n".join(frame.hex() for frame in frames))
+    with ls.open(path, sensor) as device:
+        list(device.packets())
+        groups = device.stats.incomplete_returns
     with serve(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
-        visit.until(
-            lambda: "Incomplete returns" in visit.page.content(), "the figure is not on the page"
-        )
+        label = visit.page.locator("dt", has_text="Incomplete returns")
+        visit.until(lambda: label.count() == 1, "the figure is not on the page")
+        figure = label.locator("xpath=following-sibling::dd[1]")
+        assert 0 < int(figure.text_content()) <= groups
         visit.context.close()
         assert not visit.errors
 
