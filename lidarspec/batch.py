@@ -1,8 +1,9 @@
 """Convert many files, large files in pieces, in several processes or on a cluster.
 
-In: captures by path, pattern or URL. `convert` writes a file of points for each capture (several
-files if the capture is larger than a piece), and a manifest. `read` returns a Dask dataframe with a
-partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask cluster.
+The captures are given by path, pattern or URL. `convert` writes a file of points for each capture,
+or several files if the capture is larger than a piece, and a manifest. `read` returns a Dask
+dataframe with a partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask
+cluster.
 
 A large file is cut by `device.file_scans`. The starts of its pieces are found one after the other:
 a task reads through a piece without computing points, and returns the bookmark of the next piece.
@@ -68,14 +69,15 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
-#: Size of a piece of a capture in bytes, if its points are written to a file.
+#: The size of a piece of a capture in bytes, if its points are written to a file.
 PIECE_BYTES = 256_000_000
-#: Size of a piece of a capture in bytes, if its points are a partition in memory.
+#: The size of a piece of a capture in bytes, if its points are a partition in memory.
 PARTITION_BYTES = 32_000_000
 MANIFEST = "manifest.jsonl"
-#: Maximum number of tasks that an executor has at a time.
+#: The maximum number of tasks that an executor has at a time.
 MAX_RUNNING_TASKS = 1000
-#: Time between two uploads of a manifest in a store, which cannot be appended to.
+#: The time between two uploads of a manifest to an object store, in which a file cannot be
+#: extended.
 MANIFEST_PERIOD_S = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
 
@@ -87,15 +89,16 @@ class FilePiece:
     """Some scans of a file, and their output.
 
     Attributes:
-        source: path or URL of the file.
-        sensor, options: the sensor's id, or "" if it is to be detected, and its options.
-        target: the output file if the source is a single piece; otherwise the number of the piece
-            is added to its name. "" without output.
+        source: the path or URL of the file.
+        sensor, options: the sensor's id, or "" to detect the sensor, and the sensor's options.
+        target: the output file; "" without output. If the source has several pieces, the number of
+            the piece is added to the file's name.
         every_point: whether to include points without a valid return.
         size: size of a piece in bytes.
         select: the selected scans. If they are selected by time or number, the file is not cut.
-        number, first: the number of the piece in the file, and of its first scan.
-        count: number of its scans; None for all scans up to the end of the file.
+        number, first: the number of the piece in the file, and the number of the piece's first
+            scan.
+        count: the number of scans in the piece; None for all scans up to the end of the file.
         bookmark: the start of the piece; None for the start of the file.
         is_last: whether it is the last piece.
     """
@@ -123,7 +126,7 @@ class FilePiece:
 
     @property
     def settings(self) -> Record:
-        """The settings that affect its result, without the file and the piece number."""
+        """The settings that affect the result, without the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
             name: str(value)
@@ -179,14 +182,14 @@ class FilePiece:
 
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
-    """Return a configured sensor; the same object each time, which has compiled code."""
+    """Return a configured sensor. Repeated calls return one object with compiled code."""
     named = named_sensor(name)
     configured: Sensor = named.configure(**dict(options)) if options else named
     return configured
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Return a piece with the number of its scans, and the next piece if any."""
+    """Return a list of the piece with its number of scans, and the next piece if any."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -227,7 +230,7 @@ def _count_scans(piece: FilePiece, scans: Iterator[Scan], counts: Record) -> Ite
 
 
 def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
-    """Write scans to the output of the piece, which appears only when complete."""
+    """Write scans to the output of the piece. The file appears when it is complete."""
     if not is_remote(piece.output):
         with system_errors(piece.output):
             Path(piece.output).parent.mkdir(parents=True, exist_ok=True)
@@ -304,7 +307,7 @@ class Manifest:
     """The records of the pieces in a folder, from this run and earlier runs.
 
     Args:
-        folder: its path or URL.
+        folder: the path or URL of the folder.
 
     Raises:
         SourceError: if the folder cannot be written to.
@@ -344,7 +347,7 @@ class Manifest:
         """Store the record of a line; return False if the line is incomplete or damaged.
 
         Raises:
-            SourceError: if its brackets are nested too deeply.
+            SourceError: if the brackets of the line are nested too deeply.
         """
         try:
             record = json.loads(line)
@@ -364,7 +367,7 @@ class Manifest:
         return normalise_path(path) in self._outputs
 
     def find_finished(self, piece: FilePiece) -> Record | None:
-        """Return the record of a piece if it need not be converted again; otherwise None."""
+        """Return the record of a piece that need not be converted again; otherwise None."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
             record is None
@@ -420,7 +423,7 @@ class Manifest:
         self._file.flush()
 
     def close(self) -> None:
-        """Write all records that are not written yet, and close the file."""
+        """Write the remaining records, and close the file."""
         if self._is_stored:
             self._put()
         else:
@@ -447,7 +450,7 @@ class _InProcessExecutor(Executor):
 
 
 def _exit_with_parent() -> None:
-    """Make this worker process end when its parent ends, without a traceback."""
+    """Make this worker process end without a traceback when its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -508,23 +511,25 @@ def convert(
 ) -> Iterator[tuple[Record, bool]]:
     """Write the points of many files into a folder.
 
-    For each finished piece, its record is yielded, and whether it was finished in an earlier run.
-    If a piece fails, its record has an "error", and the other pieces are still converted.
+    For each finished piece, a tuple is yielded: the record of the piece, and whether the piece was
+    finished in an earlier run. If a piece fails, its record has an "error", and the other pieces
+    are still converted.
 
     Args:
         sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
-        folder: path or URL. Each output has the same path in it as its source has below the part of
-            the pattern without wildcards.
+        folder: the path or URL of the folder. The path of an output in the folder is the path of
+            its source, without the part of the pattern before the first wildcard.
         to: the suffix of a format, such as "parquet".
         sensor: as in `lidarspec.open`; by default detected for each file.
         jobs: number of processes on this computer.
         scheduler: the address of a Dask scheduler whose workers are used. They must have access to
             the sources and the folder.
-        every_point: include points without a valid return.
+        every_point: whether to include points without a valid return.
         select: the selected scans of each file. If they are selected by time or number, files are
             not cut.
-        size: size of a piece in bytes. A larger file is cut, and gives several files of points.
-        force: convert finished pieces again.
+        size: the size of a piece in bytes. A larger file is cut, and its points are written to
+            several files.
+        force: whether to convert finished pieces again.
 
     Raises:
         SourceError: if a source does not exist, the folder cannot be written to, the scheduler
@@ -650,15 +655,16 @@ def read(
     """Return the points of many files as a Dask dataframe, one partition per piece.
 
     The columns are those of a Parquet file. If a file is larger than a piece, this call reads
-    through it without computing its points, to cut it. Points are computed only when Dask needs
-    them.
+    through the file to cut it into pieces, without computing points. Points are computed only when
+    Dask needs them.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
         sensor: as in `lidarspec.open`; by default detected for each file.
         every_point: include points without a valid return.
         select: as in `convert`.
-        size: size of a piece in bytes. Its points take about ten times as much memory.
+        size: the size of a piece in bytes. The points of a piece take about ten times as much
+            memory.
 
     Raises:
         SourceError: if a file does not exist.

@@ -2,10 +2,10 @@
 
 The records of a device differ in their payloads and times, but hardly in their other bytes.
 `CaptureBatches` therefore parses only one record of each kind, as `CaptureReader` does. The result
-applies to all records of the same length with the same header bytes; bytes that may vary are
-ignored (see `RecordLayout` and `Headers`). `find_records` returns the offsets of the records in a
-buffer, and `RecordKind.find` selects all records of a kind. All other records are read singly.
-Datagrams, their order and the statistics are the same as those of `CaptureReader` for any file.
+applies to all records of the same length with the same header bytes, except for bytes that may vary
+(see `RecordLayout` and `Headers`). `find_records` returns the offsets of the records in a buffer,
+and `RecordKind.find` selects all records of a kind. All other records are read singly. Datagrams,
+their order and the statistics are the same as those of `CaptureReader` for any file.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from lidarspec.frames.layout import gather_rows
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
-#: Maximum number of header bytes to compare. Records with longer headers are read singly.
+#: The maximum number of header bytes to compare. Records with longer headers are read singly.
 MAX_HEADER_BYTES = 128
 
-#: Largest size of a buffer.
+#: The largest size of a buffer.
 MAX_BUFFER_BYTES = 2 * MAX_BLOCK_BYTES
 _TRAILER_BYTES = 4
-#: Number of bytes at the start of a record that contain its length, in both formats.
+#: In both formats, the first bytes of a record, up to this number, contain its length.
 _MIN_HEAD_BYTES = 16
-#: Minimum number of consecutive records of equal length that are checked together, which is then
-#: faster than single checks.
+#: Consecutive records of equal length are checked together from this number on. For fewer records,
+#: single checks are faster.
 _MIN_RUN_RECORDS = 16
-#: Maximum number of kinds that the records of a batch are compared with, and that a batch may add.
-#: It limits the time per batch for any file.
+#: The maximum number of known kinds that the records of a batch are compared with, and of new kinds
+#: that a batch may add. It limits the time per batch for any file.
 MAX_KINDS = 16
 
 
@@ -59,7 +59,7 @@ class RecordKind:
         times: the encoding of the time.
         value: the first bytes of a record, as words.
         mask: the bits of `value` that are equal in all records of the kind.
-        trailer: NumPy type of the last word of the record, which repeats the length; None for
+        trailer: the NumPy type of the last word of the record, which repeats the length; None for
             records without this word.
     """
 
@@ -164,8 +164,8 @@ def find_records(
     """Return the offsets of the complete records between `start` and `stop`.
 
     Returns:
-        The start of each record, followed by the end of the last record; and whether `form.read`
-        must read the next record.
+        The start of each record, followed by the end of the last record, and whether `form.read`
+        must read the record after these.
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -254,7 +254,7 @@ class CapturedDatagrams:
         return b"".join(map(self.data, range(len(self))))
 
     def of(self, origin: Origin) -> CapturedDatagrams:
-        """Return the datagrams from one address, or from one port of it."""
+        """Return the datagrams from one address, or from one port of this address."""
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
@@ -381,7 +381,7 @@ class _RecordBlock:
         self._buffer = source.view()
 
     def read(self) -> Exception | None:
-        """Read the records. Return the exception if a record cannot be read, else None."""
+        """Read the records; return the exception if one cannot be read, else None."""
         if not any(self._match(kind) for kind in range(len(self._known))):
             for index in np.flatnonzero(self._kinds < 0).tolist():
                 if self._kinds[index] >= 0:
@@ -506,8 +506,8 @@ class _RecordBlock:
     def _match(self, kind: int, since: int = 0) -> bool:
         """Assign a kind to the records that match it; return whether all now have a kind.
 
-        Records before `since` are ignored, because each of them was already read as a single
-        record. A record that was rejected as malformed must not match the new kind later.
+        Records before `since` are ignored, because each of them has already been read as a single
+        record. If one of them was rejected as malformed, it must not match the new kind.
         """
         template = self._known[kind]
         number = len(self._kinds)

@@ -26,16 +26,16 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.recording.format import MAGIC
 from lidarspec.remote_files import open_stored
 
-#: number of bytes at the start of a file that its kind is detected from.
+#: The number of bytes at the start of a file from which its kind is detected.
 HEAD_BYTES = 512
-#: maximum number of bytes to decompress in one step.
+#: The maximum number of bytes to decompress in one step.
 STEP_BYTES = 1 << 13
-#: maximum number of bytes that one read of a file decompresses. A read of a pipe returns the bytes
-#: that have arrived.
+#: The maximum number of bytes that one read of a file decompresses. A read of a pipe returns the
+#: bytes that have arrived.
 READ_BYTES = 1 << 20
-#: maximum nesting of compression: 2, for a compressed capture in a zip archive.
+#: The maximum nesting of compressed files, such as a compressed capture in a zip archive.
 MAX_NESTING = 2
-#: maximum number of files of an archive to list in a message.
+#: The maximum number of files of an archive to list in a message.
 MAX_NAMES = 6
 
 
@@ -45,7 +45,7 @@ class Packing(NamedTuple):
     Attributes:
         name: name of the format.
         module: name of the Python module with the function `open` that decompresses.
-        command: shell command that decompresses a file; {} is the file.
+        command: a shell command that decompresses a file; {} stands for the file.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Packing(NamedTuple):
 
 
 ZIP = Packing("zip", "zipfile", "unzip {}")
-#: pattern of the first bytes of a compressed file -> its compression format.
+#: The compression format of a file by a pattern of its first bytes.
 PACKINGS = {
     rb"\x1f\x8b\x08[\x00-\x1f]": Packing("gzip", "gzip", "gunzip -k {}"),
     rb"BZh[1-9]1AY&SY": Packing("bzip2", "bz2", "bunzip2 -k {}"),
@@ -64,8 +64,8 @@ PACKINGS = {
     ),
     rb"PK\x03\x04": ZIP,
 }
-#: pattern of the first bytes of an unsupported file -> (its kind, the command that extracts the
-#: data).
+#: For a pattern of the first bytes of an unsupported file, the kind of the file, and the command
+#: that extracts the data.
 CONTAINERS = {
     rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
     rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x {}"),
@@ -173,7 +173,7 @@ class UnpackedFile(io.RawIOBase):
 
     @property
     def _read_part(self) -> str:
-        """The end of a message: the part of the content that was read."""
+        """The last words of a message, which name the part of the content that was read."""
         return f": only the first {self._count} decompressed bytes were read"
 
 
@@ -293,14 +293,15 @@ def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
 
 
 def refuse_container(path: str, start: bytes) -> None:
-    """Raise SourceError for an unsupported kind of file.
+    """Raise SourceError if a file is of an unsupported kind.
 
     Args:
         path: name of the file, for the message.
         start: its first `HEAD_BYTES`, decompressed.
 
     Raises:
-        SourceError: the message has the kind of the file, and the command that extracts the data.
+        SourceError: for an unsupported file. The message names the kind of the file, and the
+            command that extracts the data.
     """
     for beginning, (kind, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):

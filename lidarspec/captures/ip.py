@@ -27,19 +27,20 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 ETHERNET = 1
-#: An IPv4 packet has at most 65,535 bytes, of which 20 are its header and 8 the UDP header.
+#: The maximum payload over IPv4. A packet has at most 65,535 bytes, of which 20 are the IPv4 header
+#: and 8 are the UDP header.
 MAX_PAYLOAD_BYTES = 65_507
 _MAX_PACKET_BYTES = 65_535
 
 _LOOPBACK_LINKS = {0, 108}
 _RAW_IP_LINKS = {12, 101, 228, 229}
-#: Link type -> (offset of the EtherType, length of the header).
+#: The offset of the EtherType and the length of the header, by link type.
 _ETHERTYPE_LINKS = {
     ETHERNET: (12, 14),
     113: (14, 16),  # Linux "cooked" capture, SLL
     276: (0, 20),  # SLL2
 }
-#: Number of a link type that is not supported -> its name.
+#: The names of link types that are not supported, by number.
 _UNSUPPORTED_LINKS = {
     9: "PPP",
     50: "PPP",
@@ -52,14 +53,15 @@ _VLAN_ETHERTYPES = {0x8100, 0x88A8, 0x9100}
 _VLAN_TAG_BYTES = 4
 _IPV4_ETHERTYPE = 0x0800
 _IPV6_ETHERTYPE = 0x86DD
-#: Smaller values in the field of the EtherType are lengths (802.3).
+#: The smallest EtherType. Smaller values in its field are lengths (802.3).
 _MIN_ETHERTYPE = 0x0600
 #: The values of AF_INET, the same on all systems, and of AF_INET6 on Linux, NetBSD, FreeBSD and
 #: macOS.
 _IP_FAMILIES = {2, 10, 24, 28, 30}
 _LOOPBACK_HEADER_BYTES = 4
 
-#: EtherType -> name of a protocol that is not UDP. The next table has the names by IP protocol.
+#: The names of protocols that are not UDP, by EtherType. The next table has such names by IP
+#: protocol.
 _ETHERTYPE_NAMES = {
     0x0806: "ARP",
     0x8863: "PPPoE discovery",
@@ -87,8 +89,8 @@ _IPV4_HEADER = struct.Struct(">BxHHHBB2s4s4s")
 _IPV6_HEADER = struct.Struct(">4xHBx16s16s")
 _FRAGMENT_HEADER = struct.Struct(">BxHI")
 _UDP_HEADER = struct.Struct(">HHHH")
-#: Offsets of the bytes of an IPv4 header that differ between packets: identification and header
-#: checksum.
+#: The offsets of the bytes of an IPv4 header that differ between packets: the identification and
+#: the header checksum.
 _IPV4_VARIABLE_OFFSETS = (4, 5, 10, 11)
 
 # Locally administered addresses, which are not assigned to any device.
@@ -103,7 +105,7 @@ class NoDatagramError(Exception):
 
     Attributes:
         reason: "other" (not UDP over IP), "link" (unsupported link layer), "short" (fewer bytes
-            than the headers give) or "malformed" (header fields contradict each other).
+            than the headers declare) or "malformed" (header fields contradict each other).
         name: for "other", the protocol; for "link", the link layer.
     """
 
@@ -121,7 +123,7 @@ class IpFragment(NamedTuple):
     Attributes:
         ident: the identification, which is the same in all fragments of a packet.
         start: offset of the fragment's first byte in the body of the whole packet.
-        more: whether it is not the last fragment of the packet.
+        more: whether more fragments of the packet follow.
     """
 
     ident: int
@@ -152,7 +154,7 @@ class IpPacket(NamedTuple):
 
 
 class UdpPacket(NamedTuple):
-    """The ports, and the range of the payload in the body of the IP packet."""
+    """The ports of a UDP packet, and the range of its payload in the IP packet's body."""
 
     source: int
     destination: int
@@ -245,7 +247,7 @@ def build_udp_frame(
     """Return an Ethernet frame with an IP header, a UDP header and the payload.
 
     Args:
-        payload: the payload: at most `MAX_PAYLOAD_BYTES`, and 20 bytes more over IPv6.
+        payload: the payload, which has at most `MAX_PAYLOAD_BYTES`, or 20 bytes more over IPv6.
         source: address and port of the sender.
         destination: address and port of the receiver. Both addresses have 4 bytes, or both 16.
     """
@@ -460,8 +462,8 @@ class Reassembly:
     """Reassembles IP fragments that arrive in any order, in bounded memory.
 
     If fragments of a packet overlap, the packet is dropped (RFC 5722). A repeated fragment is
-    ignored. Incomplete packets are dropped when they are older than `TIMEOUT_NS`. The oldest are
-    also dropped if there are more than `MAX_PACKETS`, or if they have more than `MAX_BYTES`.
+    ignored. Incomplete packets are dropped when they are older than `TIMEOUT_NS`. If there are more
+    than `MAX_PACKETS`, or if they have more than `MAX_BYTES` together, the oldest are dropped.
 
     Attributes:
         dropped: the number of fragments of packets that were dropped.
@@ -469,10 +471,10 @@ class Reassembly:
 
     MAX_PACKETS = 256
     MAX_BYTES = 4 << 20
-    #: Shorter than 6.5 s, after which the 16-bit identification of IPv4 repeats at 10,000 datagrams
-    #: per second.
+    #: At 10,000 datagrams per second, the 16-bit identification of IPv4 repeats after 6.5 s. The
+    #: timeout is shorter than this.
     TIMEOUT_NS = 5_000_000_000
-    #: Size of the Python objects of a fragment. It is part of `MAX_BYTES`, so that many small
+    #: The size of the Python objects of a fragment. It is part of `MAX_BYTES`, so that many small
     #: fragments do not exceed the memory limit.
     _OVERHEAD_BYTES = 160
 
@@ -486,7 +488,7 @@ class Reassembly:
 
         Args:
             packet: the result of `parse_ip`.
-            fragment: its attribute `fragment`.
+            fragment: the attribute `fragment` of the packet.
             arrival_ns: the capture time, ns since 1970.
         """
         self._drop_older(arrival_ns - self.TIMEOUT_NS)

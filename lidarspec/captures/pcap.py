@@ -46,14 +46,14 @@ from lidarspec.transports.protocol import ClosingContext
 
 #: Link types USER0 to USER15, for private use. Captures of byte streams are written with USER0.
 USER_LINKS = range(147, 163)
-#: Maximum number of protocols to count separately; all others are counted together.
+#: The maximum number of protocols that are counted separately. All others are counted together.
 MAX_COUNTED_KINDS = 16
 #: The address and port of a datagram with unknown sender or receiver.
 UNKNOWN_ENDPOINT = ("0.0.0.0", 0)
 #: The first bytes of an IPv6 address that represents an IPv4 address (RFC 4291).
 _IPV4_MAPPED_PREFIX = bytes.fromhex("00000000000000000000ffff")
-#: A datagram over IPv6 can be this much longer, because the length field of IPv6 does not include
-#: the IP header.
+#: A datagram over IPv6 can be longer by this number of bytes, because the length field of IPv6 does
+#: not include the IP header.
 _EXTRA_PAYLOAD_BYTES_IPV6 = 20
 
 
@@ -67,8 +67,7 @@ class Datagram:
             the time of the fragment that completed it.
         source: address and port of the sender.
         destination: address and port of the receiver.
-        headers: the headers of its packet; None if the payload of a packet with equal headers may
-            be at another offset.
+        headers: the headers of its packet; None if they do not determine the offset of the payload.
     """
 
     data: bytes
@@ -89,15 +88,16 @@ class CaptureStats:
         others: the number of these packets by protocol, such as "ARP" or "TCP".
         unsupported: number of packets with an unsupported link layer, by its name, such as
             "802.11".
-        truncated_tail: whether the file ends within a record; all records before it were read.
+        truncated_tail: whether the file ends within a record. All records before this record were
+            read.
         snapped: number of UDP packets that were truncated by the snap length of the capture; they
             are not returned.
         fragments: number of IP fragments of UDP packets.
         incomplete_fragments: number of fragments of datagrams that stayed incomplete.
         malformed: number of packets and records with fields that contradict each other.
-        damaged: number of records that could not be read, so that the next readable record was
-            searched.
-        lost: number of bytes that these searches skipped.
+        damaged: the number of records that could not be read. After each, the next readable record
+            was searched.
+        lost: the number of bytes that were skipped to find these next readable records.
         stopped_at: file offset of the truncated or malformed record that ended the reading; None if
             the file was read to its end.
     """

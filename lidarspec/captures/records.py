@@ -1,15 +1,15 @@
 """Read and write the records of pcap and pcapng files.
 
 `PcapRecords` and `PcapngBlocks` read one record at a time. They also return the `RecordLayout` of a
-record, with which `bulk` recognizes similar records without reading each. `seek_time` searches a
-file by capture time.
+record, by which `bulk` recognizes similar records without reading each of them. `seek_time`
+searches a file by capture time.
 
 Malicious input cannot exhaust memory or time: `source` reads in steps of limited size, and each
 iteration of a loop either advances or ends the reading.
 
-In damaged input, an implausible length is accepted unless other records begin within the record.
-After a record that cannot be read, `skip_damage` continues at the next offset at which a record
-begins that is followed by another.
+If a record has an implausible length, the length is accepted unless other records begin within the
+record. After a record that cannot be read, `skip_damage` continues at the next two consecutive
+records.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -40,9 +40,9 @@ _PCAP = {  # magic: byte order, nanoseconds per unit of the fraction field
     NANOSECOND_MAGIC: ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-#: Header of a pcap file to write, little-endian.
+#: The header of a pcap file to write, little-endian.
 _HEAD = struct.Struct("<4sHHiIII")
-#: Header of a record of a pcap file to write.
+#: The header of a record of a pcap file to write.
 _RECORD = struct.Struct("<IIII")
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
 _SECTION_KIND = int.from_bytes(_SECTION)
@@ -53,26 +53,26 @@ _SIMPLE_PACKET = 3
 ENHANCED_PACKET = 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _LAST_KIND = 10  # the largest block type of the draft, apart from the section header
-#: Code of an option of an interface block. The next constant is another code.
+#: Codes of options of an interface block: this constant and the next one.
 _TIME_RESOLUTION = 9
 _TIME_OFFSET = 14
 
 MAX_BLOCK_BYTES = 1 << 20  # a packet with its options; longer blocks are skipped
-#: Number of offsets that are checked in one step of the search for the next record.
+#: The number of offsets that are checked in one step of the search for the next record.
 _STEP_BYTES = 1 << 16
-#: Number of bytes after each of these offsets that the check requires: a packet, its options and
-#: the header of the next packet.
+#: The number of bytes after an offset that this check requires: a packet, its options and the
+#: header of the next packet.
 _REACH_BYTES = MAX_PACKET_BYTES + (1 << 12)
-#: Maximum distance in bytes from the position that `seek_time` finds to the packet.
+#: The position that `seek_time` finds is at most this number of bytes before the packet.
 NEAR_BYTES = 1 << 21
-#: Maximum plausible difference between the times of two consecutive packets: a day.
+#: The maximum plausible difference between the times of two consecutive packets: a day.
 _MAX_RECORD_STEP_S = 86_400
-#: Maximum plausible difference between the times of any two packets of a file: a year.
+#: The maximum plausible difference between the times of any two packets of a file: a year.
 _MAX_FILE_SPAN_S = 31_536_000
 _MAX_INTERFACES = 1024
 _SECOND_NS = 1_000_000_000
-#: Latest time that `TimeEncoding.ns` converts. Records with later times are read singly, so that no
-#: int64 overflows.
+#: The latest time that `TimeEncoding.ns` converts. Records with later times are read singly, so
+#: that no int64 overflows.
 _MAX_TIME_S = 4_000_000_000
 
 
@@ -98,7 +98,7 @@ class CapturedPacket(NamedTuple):
 
 
 class NoPacketReason(Enum):
-    """The reason why a record gives no packet."""
+    """The reason why a record contains no packet."""
 
     NO_PACKET = 0
     MALFORMED = 1
@@ -111,13 +111,13 @@ def is_capture(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class TimeEncoding:
-    """How two words of a record encode a capture time.
+    """The way in which two words of a record encode a capture time.
 
     Attributes:
         word: NumPy type of the words, with the byte order.
         high: index of the first word in the record: seconds, or the upper half of a 64-bit number.
         low: index of the second word in the record: the fraction, or the lower half.
-        ticks: number of units per second, in which the fraction or the 64-bit number is given.
+        ticks: the number of units per second of the fraction, or of the 64-bit number.
         is_split: whether the words are seconds and a fraction, instead of a 64-bit number.
         offset: offset to add to each time, ns.
     """
@@ -178,7 +178,7 @@ class PcapRecords:
     """The records of a pcap file.
 
     Attributes:
-        sections: always 0; only pcapng files have sections.
+        sections: always 0, because only pcapng files have sections.
         order: the byte order of the file, as in `struct`.
         link: link-layer type of the file.
     """
@@ -409,7 +409,8 @@ class PcapngBlocks:
         """Return the first offset below `stop` at which a block may begin; None if none.
 
         If an interface block was lost, only the start of a section is accepted. Packets refer to
-        interfaces by number, so packets before it would be assigned to wrong interfaces.
+        interfaces by number, so packets before the next section would be assigned to wrong
+        interfaces.
         """
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -490,8 +491,8 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
         at: ns since 1970.
 
     Returns:
-        False if the position is unchanged, because the packet is not further ahead, or the file is
-        a pipe or compressed.
+        False if the position is unchanged. This is the case if the packet is not further ahead, or
+        if the file is a pipe or compressed.
     """
     here = low = source.offset
     high = source.size
@@ -645,10 +646,10 @@ class CaptureFormat(NamedTuple):
     """Functions that write captures of one format.
 
     Attributes:
-        head: returns the file header for a link type.
-        record: returns the record of a packet and its time in ns since 1970.
-        size: takes a piece of the file and an offset, and returns the length of the record or file
-            header there.
+        head: a function that returns the file header for a link type.
+        record: a function that returns the record for a packet and its time in ns since 1970.
+        size: a function that returns the length of the record or file header at an offset, given a
+            piece of the file and the offset.
     """
 
     head: Callable[[int], bytes]
@@ -678,7 +679,7 @@ def _block(kind: int, body: bytes) -> bytes:
     return struct.pack("<I", kind) + size + body + size
 
 
-#: File suffix -> the functions that write captures of this format.
+#: The functions that write captures of a format, by the suffix of the file.
 WRITINGS = {
     ".pcap": CaptureFormat(capture_head, packet_record, record_size),
     ".pcapng": CaptureFormat(

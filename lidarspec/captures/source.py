@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SourceError
 
-#: initial size of a buffer, and maximum number of bytes that `skip` reads at once.
+#: The initial size of a buffer, and the maximum number of bytes that `skip` reads at once.
 MIN_BUFFER_BYTES = 1 << 16
-#: number of bytes after the filled part of a buffer that callers may read, so that they can compare
-#: words of several bytes at its end. The values of these bytes are undefined.
+#: The number of bytes after the filled part of a buffer that callers may read, so that they can
+#: compare words of several bytes at its end. The values of these bytes are undefined.
 SLACK_BYTES = 256
-#: maximum number of buffers with a view that are kept for reuse.
+#: The maximum number of buffers with a view that are kept for reuse.
 MAX_VIEWED_BUFFERS = 2
 
 
@@ -62,7 +62,7 @@ class BufferedInput:
         self._use_buffer(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the arguments for pickling; the copy continues at the same offset."""
+        """Return the arguments for pickling. The copy continues at the same offset."""
         return _source_at, (self._file, self._largest, self.offset)
 
     @property

@@ -54,7 +54,7 @@ from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, open_transport, resolve
 from lidarspec.transports.protocol import no_bytes
 
-#: Relative tolerance of the clock step per packet.
+#: The relative tolerance of the clock step per packet.
 PACE_TOLERANCE = 0.03
 #: The maximum number of frames to read the model name from.
 MAX_NAMED_FRAMES = 3

@@ -1,7 +1,7 @@
 """Draft the spec of an unknown format: frames, fields and checksum.
 
-In: bytes of one sensor. Out: checksums that match, and the source of a new plugin. Modules in
-reading order:
+The modules analyse the bytes of one sensor. They return checksums that match, and the source of a
+new plugin. Modules in reading order:
 
 * `samples`: sample frames, and the possible offsets and covered bytes of a checksum.
 * `checksum_search`: finds the checksum of the frames by trying all simple checksums.

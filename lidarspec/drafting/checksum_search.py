@@ -1,4 +1,4 @@
-"""Find the checksum of sample frames: algorithm, place and covered bytes.
+"""Find the algorithm, the place and the covered bytes of the checksum of frames.
 
 All simple checksums are tried: XORs, sums of bytes and of words, their complements, XORs of words
 in groups, folded sums, and XORs that are stored in two nibbles. If none of them is certain, CRCs
@@ -38,19 +38,21 @@ from lidarspec.spec.checksums import (
     Xor,
 )
 
-#: Maximum number of matches to return.
+#: The maximum number of matches to return.
 MAX_MATCHES = 8
-#: Number of frames on which a checksum is tried before all frames are used.
+#: The number of frames on which a checksum is tried before all frames are used.
 SCREENING_FRAMES = 16
-#: Minimum share of frames with a valid checksum, for a checksum with a fitted constant.
+#: The minimum share of valid frames for a checksum whose constant is fitted to the frames.
 MIN_VALID_SHARE = 0.95
-#: Number of combinations of offset and covered bytes that are tried for a checksum in nibbles.
+#: The number of combinations of an offset and covered bytes that are tried for a checksum in
+#: nibbles.
 NIBBLE_TRIALS = 8
 ANYWHERE_NOTE = (
     "an XOR of a whole frame fits at several offsets; of these, the offset was chosen whose byte"
     " varies most"
 )
-#: Values of `WordXor.head` to try. The next constant is the values of `WordXor.groups`.
+#: Values of `WordXor.head` to try. The next constant contains the values of `WordXor.groups` to
+#: try.
 WORD_XOR_HEADS = (0, 2, 4, 6, 8, 10, 12)
 WORD_XOR_GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
 _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
@@ -63,7 +65,7 @@ class WordSum(Checksum):
     If the number of bytes is odd, a zero byte is appended.
 
     Attributes:
-        words: byte order of the words.
+        words: the byte order of the words.
         carry: whether the carry out of bit 15 is added to the sum.
     """
 
@@ -159,7 +161,7 @@ def search(
             there are more frames and if their content varies more.
         quick: whether to stop after about a second. CRCs are then searched only at the usual
             offsets, and for long frames only known CRCs are tried.
-        is_possible_place: returns whether a checksum may be at a place.
+        is_possible_place: a function that returns whether a checksum may be at a place.
     """
     samples = SampleFrames(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
@@ -239,7 +241,7 @@ def _iter_matches(
         samples: all frames.
         few: some of the frames, on which the algorithm is tried first.
         algorithm: the algorithm.
-        place: offset and size of the checksum.
+        place: the offset and size of the checksum.
         span: the covered bytes.
         tried: number of checksums that were tried so far.
     """
@@ -310,7 +312,7 @@ def _add_constant(algorithm: Checksum, constant: int) -> Checksum:
 
 
 def _find_constant(values: NDArray[np.uint64]) -> list[int]:
-    """Return [value] if enough elements have the same value, else []."""
+    """Return the value that enough elements have, in a list; [] if there is none."""
     distinct, counts = np.unique(values, return_counts=True)
     most_frequent = int(counts.argmax())
     if are_enough(int(counts[most_frequent]), len(values)):

@@ -6,9 +6,10 @@ divides the XOR of two frames of the same length, for any start value and final 
 polynomial is therefore a divisor of the greatest common divisor of such XORs.
 
 The start value and the final XOR are calculated from the polynomial. If the frames have several
-lengths, they are the solution of linear equations. If all frames have the same length, many pairs
-of values are equivalent, and the most usual pair is returned. If few frames have the same length,
-usual pairs are tried first; with the right pair, the polynomial divides each frame.
+lengths, the two values are the solution of linear equations. If all frames have the same length,
+many pairs of values are equivalent, and the most usual pair is returned. If few frames have the
+same length, usual pairs are tried first, because the polynomial divides each frame if the pair is
+correct.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from lidarspec.drafting.samples import (
 )
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
 
-#: Maximum degree of the cofactors to try in order to find a divisor.
+#: The maximum degree of the cofactors that are tried to find a divisor.
 MAX_COFACTOR_DEGREE = 11
 #: Widths of CRCs in bits. The widest is first, because the polynomial of a narrow CRC may divide
 #: the polynomial of a wide CRC.
@@ -42,17 +43,20 @@ WIDTHS = (32, 16, 8)
 #: For longer frames, division is used only for a CRC at the end. At other offsets, only the CRCs of
 #: the catalogue are tried.
 MAX_DIVIDED_BYTES = 256
-#: Cost of the division of one byte, in bytes of CRC computation.
+#: The cost of the division of one byte, in bytes of CRC computation.
 DIVISION_WORK = 32
-#: Limit of a quick search, in bytes of CRC computation. It is about one second.
+#: The limit of a quick search, in bytes of CRC computation. They take about one second.
 QUICK_WORK = 1 << 23
-#: Number of frames of the same length from which a polynomial is calculated.
+#: The number of frames of the same length from which a polynomial is calculated.
 FRAMES_PER_PICK = 4
-#: Number of selections of frames to try at the usual offset, because some frames may be damaged.
+#: The number of selections of frames to try at the usual offset, because some frames may be
+#: damaged.
 MAX_PICKS = 6
-#: Maximum number of polynomials to test with all frames, for one offset and range of covered bytes.
+#: The maximum number of polynomials to test with all frames, for one offset and range of covered
+#: bytes.
 MAX_POLYNOMIALS = 64
-#: (number of covered bytes, polynomial of the message followed by its checksum) of each frame.
+#: For each frame: the number of covered bytes, and the polynomial of the message followed by its
+#: checksum.
 Codewords = list[tuple[int, int]]
 
 
@@ -219,10 +223,10 @@ def crc_matches(
 
     Args:
         samples: the frames.
-        mixed: whether to search only for CRCs with different `refin` and `refout`, or only for CRCs
-            with equal `refin` and `refout`.
+        mixed: True to search only for CRCs with different `refin` and `refout`, False to search
+            only for CRCs with equal `refin` and `refout`.
         quick: whether to stop after a fixed amount of work. The usual offsets are tried first.
-        is_possible_place: returns whether a CRC may be at a place.
+        is_possible_place: a function that returns whether a CRC may be at a place.
     """
     if mixed:
         mirrors = [(False, True), (True, False)]
@@ -422,8 +426,8 @@ def _iter_crcs(
         words: the codewords of the frames.
         poly: the polynomial.
         reading: the bit order.
-        has_one_length: whether all frames have the same length, so that the two values are
-            ambiguous.
+        has_one_length: whether all frames have the same length, so that start value and final XOR
+            are ambiguous.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}
@@ -471,7 +475,7 @@ def _solve_registers(
     Yields nothing if the equations have no solution.
 
     Args:
-        remainders: frame length -> remainder of a frame of this length.
+        remainders: the remainder of a frame of each length, by length.
     """
     (size, rest), *others = remainders.items()
     equations = []

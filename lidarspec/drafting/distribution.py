@@ -24,9 +24,9 @@ from lidarspec.drafting.draft_code import make_template_values
 from lidarspec.errors import UsageError, system_errors
 
 Link = Literal["serial", "udp"]
-#: Names that the templates of modules define.
+#: Names that the templates of modules define, so that a sensor cannot have them.
 RESERVED_NAMES = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
-#: Maximum number of frames of a capture to write to vectors.json.
+#: The maximum number of frames of a capture to write to vectors.json.
 MAX_VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
@@ -38,7 +38,7 @@ class DistributionNames:
 
     Args:
         id: the id of the sensor.
-        distribution: the name of the distribution; "" for "lidarspec-" and the id.
+        distribution: the name of the distribution; "" for "lidarspec-" followed by the id.
         vendor: the vendor's display name; "" to derive it from the id.
         model: the model's display name; "" to derive it from the id.
 

@@ -1,8 +1,9 @@
 """Analyse unknown frames, and describe them in a `Draft`.
 
 `make_draft` finds the structure of the frames at the beginning of a stream, and then splits all
-bytes into frames. Constant bytes at the start of frames are the sync bytes. Fields with steadily
-rising values are not accepted as checksums, because an XOR often matches them by coincidence.
+bytes into frames. Constant bytes at the start of frames are the sync bytes. A field with steadily
+rising values is not accepted as a checksum, because an XOR often matches such a field by
+coincidence.
 """
 
 from __future__ import annotations
@@ -28,27 +29,27 @@ from lidarspec.drafting.periods import (
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import WireError
 
-#: Maximum number of frames to use in the search for a checksum.
+#: The maximum number of frames to use in the search for a checksum.
 MAX_CHECKSUM_FRAMES = 256
-#: Maximum number of sync bytes.
+#: The maximum number of sync bytes.
 MAX_SYNC_BYTES = 4
-#: Maximum number of sync bytes if there are fewer than `MANY_FRAMES` frames, because further
+#: The maximum number of sync bytes if there are fewer than `MANY_FRAMES` frames, because further
 #: constant bytes may be coincidence.
 MAX_SHORT_SYNC_BYTES = 2
-#: Number of frames from which on constant bytes are probably not coincidence.
+#: From this number of frames on, constant bytes are probably not coincidence.
 MANY_FRAMES = 12
-#: Smallest number of blocks in a frame.
+#: The smallest number of blocks in a frame.
 MIN_BLOCKS = 3
-#: Smallest share of a frame that its blocks fill.
+#: The smallest share of a frame that its blocks fill.
 MIN_BLOCKS_SHARE = 0.5
-#: Maximum offset after a field with the number of elements.
+#: A field with the number of elements must begin before this offset.
 MAX_COUNT_OFFSET = 8
-#: Smallest and largest size of a counted element, in bytes.
+#: The smallest and the largest size of a counted element, in bytes.
 MIN_ELEMENT_BYTES = 2
 MAX_ELEMENT_BYTES = 16
-#: Width of the widest checksum, in bytes.
+#: The width of the widest checksum, in bytes.
 MAX_CHECKSUM_BYTES = 4
-#: Number of frames in which most bits of a checksum change.
+#: In at least this number of frames, most bits of a checksum change.
 MIN_FRAMES_FOR_CHANGE = 16
 
 
@@ -60,8 +61,8 @@ class RepeatedBlocks:
         start: offset of the first block, in bytes.
         size: size of a block, in bytes.
         count: number of blocks.
-        flag: constant first bytes of each block; may be empty.
-        candidates: fields in a block with rising values.
+        flag: the constant first bytes of each block; b"" if there are none.
+        candidates: the fields with rising values in a block.
     """
 
     start: int
@@ -85,14 +86,14 @@ class Draft:
         sync: the first bytes of every frame.
         size: the length of the frames, in bytes; None if it varies.
         length: the length field; None if all frames have one length.
-        frames: (offset, bytes) of the frames with all known properties, in order.
+        frames: the offset and the bytes of each frame that has all known properties, in order.
         bytes_in: number of input bytes.
-        candidates: fields outside the blocks with rising values.
+        candidates: the fields with rising values outside the blocks.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: other checksums that match.
-        common_bytes: number of leading bytes that nearly all frames have, if the length field
-            counts bytes; else 0. These bytes are searched for fields.
+        common_bytes: if the length field counts bytes, the number of bytes that nearly all frames
+            have at least; else 0. These first bytes are searched for fields.
     """
 
     datagrams: bool
@@ -121,7 +122,7 @@ class Draft:
 
     @property
     def head_size(self) -> int:
-        """The number of bytes before the part of varying length; the size if it is fixed."""
+        """The number of bytes before the part of varying length, or of the whole frame."""
         if self.size is not None or self.length is None:
             return self.size or 0
         return max(self.length.rest - self.tail_size, self.length.end, self.common_bytes)
@@ -206,7 +207,7 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
 
 
 def _iter_frames(draft: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield (offset, bytes) of the frames with all known properties, in order.
+    """Yield (offset, bytes) of each frame that has all known properties, in order.
 
     If no valid frame begins at sync bytes, the search continues at the next byte.
     """
@@ -256,7 +257,7 @@ def _find_count(draft: Draft, data: bytes) -> Draft:
     """Return the draft with a length field, if an incomplete last frame shows one.
 
     If all whole frames have the same length, a constant byte in them may be the number of elements.
-    An incomplete frame at the end of the data shows this if the byte has another value in it.
+    This is so if the byte has another value in an incomplete frame at the end of the data.
     Otherwise, the draft is returned unchanged.
 
     Args:
@@ -331,7 +332,7 @@ def _varies_enough(match: ChecksumMatch, frames: Sequence[bytes]) -> bool:
 
 
 def _overlaps(place: ChecksumPlace, field: RisingField, length: int) -> bool:
-    """Return whether a checksum and a field overlap in a frame of a length."""
+    """Return whether a checksum and a field overlap in a frame of some length."""
     start = place.start(length)
     return start < field.end and field.offset < start + place.size
 

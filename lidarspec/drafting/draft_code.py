@@ -27,24 +27,24 @@ from lidarspec.drafting.periods import (
 from lidarspec.drafting.samples import ChecksumMatch, values
 from lidarspec.spec.checksums import ByteOrder
 
-#: Maximum number of characters in a line of the written files.
+#: The maximum number of characters in a line of the written files.
 MAX_LINE_CHARS = 100
-#: Maximum number of bytes of a constant to show in a comment.
+#: The maximum number of bytes of a constant to show in a comment.
 MAX_SHOWN_BYTES = 8
-#: Minimum number of adjacent constant bytes to declare as a field.
+#: The minimum number of adjacent constant bytes to declare as a field.
 MIN_CONSTANT_RUN = 2
-#: Maximum length of a range of unknown bytes that is searched for constant bytes. Longer ranges are
-#: mostly measurements, which may be constant because the scene does not change.
+#: The maximum length of a range of unknown bytes that is searched for constant bytes. Longer ranges
+#: are mostly measurements, which may be constant because the scene does not change.
 MAX_CONSTANT_SEARCH_BYTES = 64
 #: A checksum with fewer bits of evidence may be coincidence.
 WEAK_EVIDENCE_BITS = 12
-#: Maximum number of alternatives to list in a comment.
+#: The maximum number of alternatives to list in a comment.
 MAX_ALTERNATIVES = 3
 #: If constants and checksum have at most this number of bits, random bytes may look like a frame.
 #: The draft then requires two consecutive frames.
 WEAK_FRAME_BITS = 24
-#: Minimum share of frames in which a field is between this and the next value of another field. The
-#: field is then probably the end of an interval.
+#: A field is probably the end of an interval if it is between the start of this interval and the
+#: next start in at least this share of frames.
 MIN_BETWEEN_SHARE = 0.875
 
 
@@ -56,7 +56,7 @@ class DraftField:
         start: offset in the frame or block, in bytes.
         size: size in bytes.
         name: the name of the field; "" for the end of the frame or block.
-        code: the construct expression after the name.
+        code: the construct expression that follows the name.
         evidence: the comments before the field.
     """
 
@@ -206,7 +206,7 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
 
 
 def _iter_sync_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield the sync bytes as fields, split at the borders of the checksum's span.
+    """Yield the sync bytes as fields, split where the covered bytes begin or end.
 
     Sync bytes that belong to the first block are omitted.
     """
@@ -435,7 +435,7 @@ def _span_cuts(draft: Draft) -> list[int]:
 
 
 def _find_angles(draft: Draft) -> list[str]:
-    """Return the paths of all angle fields; those in blocks of points come first."""
+    """Return the paths of all angle fields; fields in blocks of points come first."""
     paths = []
     if draft.blocks:
         paths = [

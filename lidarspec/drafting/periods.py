@@ -28,7 +28,7 @@ from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
 
-#: full circle in raw units -> (raw unit in degrees, description of the raw unit).
+#: For each full circle in raw units, the raw unit in degrees and its description.
 CIRCLES = {
     360: (1.0, "whole degrees"),
     3_600: (0.1, "tenths of a degree"),
@@ -39,55 +39,55 @@ CIRCLES = {
     360_000: (0.001, "thousandths of a degree"),
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
-#: Number of frames below which constant bytes may be coincidence. Only the first and the last bytes
-#: of a frame are then searched for fields.
+#: With fewer frames than this, constant bytes may be coincidence. In this case, only the first and
+#: the last bytes of a frame are searched for fields.
 FEW_FRAMES = 8
-#: Number of first bytes to search if there are few frames.
+#: The number of bytes at the start of frames to search if there are few frames.
 HEAD_SEARCH_BYTES = 16
-#: Number of last offsets to search if there are few frames.
+#: The number of offsets at the end of frames to search if there are few frames.
 TAIL_SEARCH_BYTES = 8
-#: Minimum share of regular steps of a rising field.
+#: The minimum share of regular steps of a rising field.
 MIN_REGULAR_SHARE = 0.9
-#: Largest relative difference between regular steps.
+#: The largest relative difference between regular steps.
 STEP_TOLERANCE = 0.05
-#: Absolute difference between steps that is regular at any step size, in raw units.
+#: The absolute difference between steps that is regular at any step size, in raw units.
 STEP_SLACK_UNITS = 4
-#: Minimum factor by which the steps must vary more without the lowest byte of a field.
+#: Without the lowest byte of a field, its steps must vary more by at least this factor.
 MIN_COARSENING = 1.5
-#: Maximum ratio of a step to the usual step. It is also the minimum ratio of a field's range of
-#: values to the usual step.
+#: The maximum ratio of a step to the usual step. The ratio of a field's range of values to the
+#: usual step must be at least this.
 MAX_STEP_RATIO = 4
-#: Maximum share of frames with the same value as the frame before, for example with two returns per
-#: firing.
+#: The maximum share of frames with the same value as the frame before, for example with two returns
+#: per firing.
 MAX_UNCHANGED_SHARE = 0.75
-#: Maximum number of bytes of a stream to search.
+#: The maximum number of bytes of a stream to search.
 MAX_SEARCHED_BYTES = 1 << 15
-#: Minimum frame length to search for. The next constant is the maximum.
+#: The minimum frame length to search for. The next constant is the maximum frame length.
 MIN_FRAME_BYTES = 4
 MAX_FRAME_BYTES = 4096
-#: Maximum number of distances to try as frame length.
+#: The maximum number of distances to try as frame length.
 MAX_DISTANCES = 48
 #: A byte is constant if it has its usual value in at least this share of frames. The other frames
 #: may be damaged.
 MIN_CONSTANT_SHARE = 0.9
-#: Minimum share of the bytes that must be in frames.
+#: The minimum share of the bytes that must be in frames.
 MIN_FRAMED_SHARE = 0.5
 #: Shares that differ by less than this are treated as equal.
 SHARE_TOLERANCE = 0.03
 #: A structure with frames of several lengths is preferred if it has at least this number of frames,
-#: and the structure with frames of equal length has fewer.
+#: and if the structure with frames of equal length has fewer frames than this.
 MANY_FRAMES = 12
-#: The shortest period is used whose weight is at least this share of the best weight.
+#: Of the periods whose weight is at least this share of the best weight, the shortest is used.
 MIN_RELATIVE_WEIGHT = 0.75
-#: Maximum number of byte pairs to try as sync bytes.
+#: The maximum number of byte pairs to try as sync bytes.
 MAX_SYNC_PAIRS = 32
-#: Smallest number of frames of a structure.
+#: The smallest number of frames of a structure.
 MIN_FRAMES = 3
-#: A structure is rejected if random bytes have it with a higher probability.
+#: A structure is rejected if the probability that random bytes have it is higher than this.
 MAX_CHANCE = 1e-3
 #: The length field must begin before this offset.
 MAX_LENGTH_FIELD_OFFSET = 8
-#: Maximum size of the elements that a length field counts, in bytes.
+#: The maximum size of the elements that a length field counts, in bytes.
 MAX_UNIT_BYTES = 16
 
 
@@ -103,10 +103,10 @@ class RisingField:
             other field that rises.
         circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
-        right: number of regular steps.
+        right: the number of regular steps.
         total: number of steps.
         wraps: number of wraps.
-        first: the value of a counter after a wrap.
+        first: for a counter, the value after a wrap.
     """
 
     offset: int
@@ -131,7 +131,7 @@ class RisingField:
         return f"{self.kind}_{self.offset}"
 
     def describe_evidence(self, container: str = "frame") -> str:
-        """Return the evidence in words.
+        """Return the evidence for the field as a text.
 
         Args:
             container: "frame" or "block", which contains the field.
@@ -310,8 +310,8 @@ def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
 def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
-    If the highest value and the decrease at a wrap match a full circle in a usual unit, returns the
-    full circle; else the decrease.
+    This is a full circle in a usual unit if the highest value and the decrease at a wrap match the
+    circle. Otherwise it is the decrease.
 
     Args:
         highest: the highest value.
@@ -458,7 +458,7 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
     """Return the structure of frames of the same length; None if none is found.
 
     Distances at which most bytes are equal are tried. The result has the distance with the largest
-    share of constant bytes, or a shorter distance that is almost as good.
+    share of constant bytes, or a shorter distance with nearly the same share.
     """
     lags = np.arange(MIN_FRAME_BYTES, min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])

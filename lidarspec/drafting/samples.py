@@ -15,27 +15,28 @@ from lidarspec.spec.checksums import ByteOrder, Checksum
 
 Part = Literal["all", "before", "behind"]
 
-#: Maximum length of frames that are searched at every offset.
+#: The maximum length of frames that are searched at every offset.
 MAX_FULLY_SEARCHED_BYTES = 64
-#: Maximum distance from both ends at which longer frames are searched.
+#: Longer frames are searched at offsets up to this distance from each end.
 MAX_END_DISTANCE_BYTES = 12
-#: Maximum number of first bytes that a checksum at the end may omit.
+#: A checksum at the end of a frame may leave out at most this number of bytes at the start.
 MAX_OMITTED_HEAD_BYTES = 6
-#: Maximum number of bytes after a checksum that is considered to be at the end.
+#: A checksum is considered to be at the end if at most this number of bytes follow it.
 MAX_TAIL_BYTES = 4
-#: Minimum range of values of a byte that varies widely.
+#: A byte varies widely if the range of its values is at least this.
 MIN_WIDE_RANGE = 96
-#: Factor that prefers the usual place of a checksum, the end of the frame.
+#: The factor that prefers the usual place of a checksum, the end of the frame.
 USUAL_PLACE_WEIGHT = 1.1
-#: Minimum share of frames with a valid checksum, because some may be damaged.
+#: The minimum share of frames with a valid checksum. The other frames may be damaged.
 MIN_VALID_SHARE = 0.6
-#: Bits of evidence at which the search ends. One in a million wrong checksums has as much evidence.
+#: The bits of evidence at which the search ends. By coincidence, one in a million wrong checksums
+#: has as much evidence.
 SURE_EVIDENCE_BITS = 20
 
 
 @dataclass(frozen=True)
 class ChecksumPlace:
-    """The place of a checksum in a frame: offset and size, in bytes.
+    """The place of a checksum in a frame: its offset and size, in bytes.
 
     A negative offset counts from the end of the frame.
     """
@@ -82,7 +83,7 @@ class CoveredSpan:
         return [(first, last) for first, last in chosen if last > first]
 
     def describe(self, place: ChecksumPlace, length: int) -> str:
-        """Return the covered bytes in words."""
+        """Return a text that describes the covered bytes."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
         ) == length - place.size:
@@ -104,13 +105,13 @@ class ChecksumMatch:
 
     Attributes:
         algorithm: the algorithm.
-        place: offset and size of the checksum in the frames.
+        place: the offset and size of the checksum in the frames.
         span: the covered bytes.
         order: the byte order of the stored checksum.
-        right: number of frames with a valid checksum.
+        right: the number of frames with a valid checksum.
         total: number of all frames.
-        evidence_bits: bits of evidence; a high value means that the match is certain. One of
-            2**evidence_bits wrong checksums would match as well by coincidence.
+        evidence_bits: a measure of certainty: one of 2**evidence_bits wrong checksums would match
+            as well by coincidence.
         source: the Python source of the algorithm.
         notes: further remarks for the user.
         name: the name of a CRC in the catalogue; "" if it has none.
@@ -148,7 +149,7 @@ class ChecksumMatch:
 
     @property
     def odds(self) -> str:
-        """How many wrong checksums one has to try until one matches by chance: "1e+09"."""
+        """The number of wrong checksums of which one matches by chance, such as "1e+09"."""
         return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property
@@ -224,7 +225,7 @@ class SampleFrames:
         """Return `number` frames of the most frequent length, and two of other lengths.
 
         Args:
-            number: number of frames, and maximum number of other lengths.
+            number: the number of frames, and the maximum number of other lengths.
             pick: index of the selection. Different indices select different frames.
         """
         largest = max(self.groups, key=len)

@@ -1,10 +1,11 @@
 """Explain frames: the meaning of every byte, faults, and differences.
 
-In: a sensor and bytes, which are a valid frame, a damaged frame or a stream; or a file. Out: an
-    `Explanation` of each frame, which can be printed as lines; or a description of the file's
-    contents. Modules in reading order:
+`explain` returns the `Explanation` of a valid or damaged frame, which can be printed as lines. A
+stream is first split into frames. `file_contents` describes the contents of a file. Modules in
+reading order:
+
 * `explanation`: `explain`, and the class `Explanation` with the rows and the first fault of a
-frame.
+  frame.
 * `frame_rows`: one frame as rows of values.
 * `damage_search`: the flipped bit, or the lost or inserted byte, that explains damage.
 * `input_segments`: splits a stream into valid frames, damaged frames, and other bytes.

@@ -70,7 +70,7 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
 
 
 def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """Return the raw value of a field that a text gives.
+    """Return the raw value of a field for a text.
 
     For a field of bytes, the text is hexadecimal. For a number, it is a label of the field, or a
     number with or without a unit.
@@ -102,11 +102,11 @@ def _parse_bytes(text: str, place: str) -> bytes:
 
 
 def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Fraction, str]:
-    """Return the number in a text, and the unit that the text has; "" for no unit.
+    """Return the number and the unit in a text; the unit is "" if the text has none.
 
     Args:
         text: a number, which may have a unit.
-        unit: the unit to convert to; used only if the text has a unit.
+        unit: the unit to convert to. It is used only if the text has a unit.
         expected: description of a valid text, for the error message.
     """
     digits, unit_text = split_unit(text)
@@ -147,8 +147,8 @@ def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | f
 def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
     """Return the length of an array, which is declared or follows from count fields.
 
-    If neither gives the length, but elements of the array are given, returns 0: the caller then
-    makes the array as long as its elements require.
+    If neither determines the length, but elements of the array are given, returns 0. The caller
+    then makes the array as long as its elements require.
     """
     declared = table.arrays.get(path)
     if isinstance(declared, int):

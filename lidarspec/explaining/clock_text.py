@@ -1,4 +1,4 @@
-"""Describe a sensor's clock in words: its epoch, state, drift and offset."""
+"""Describe a sensor's clock as text: its epoch, state, drift and offset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
 
 
 def describe_time_source(report: ClockReport) -> str:
-    """Return the epoch and the state of a clock in words."""
+    """Return a text with the epoch and the state of a clock."""
     counted = _describe_epoch(report)
     if report.state:
         return f"{counted}; {report.state}"
@@ -43,9 +43,9 @@ def _describe_epoch(report: ClockReport) -> str:
 
 
 def describe_offset(report: ClockReport) -> str:
-    """Return the offset from the host's clock in words.
+    """Return a text with the offset from the host's clock.
 
-    The difference of the time scales is subtracted.
+    The difference between the time scales of sensor and host is subtracted from the offset.
     """
     if math.isnan(report.error_s):
         return f"{report.offset_s:+.3f} s to the host; the clock starts at an arbitrary time"
@@ -56,7 +56,7 @@ def describe_offset(report: ClockReport) -> str:
 
 
 def describe_clock(report: ClockReport) -> str:
-    """Return a clock in one line."""
+    """Return the description of a clock in one line."""
     parts = [describe_time_source(report)]
     if report.verdict.code == "not_locked":
         parts = [_describe_epoch(report)]  # the verdict names the state

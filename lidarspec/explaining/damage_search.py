@@ -24,20 +24,20 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: Total size of the candidates that are checked together.
+#: The total size of the candidates that are checked together, bytes.
 BATCH_BYTES = 1 << 20
-#: Longest frame that is searched if its type is not compiled, so that construct parses each
-#: candidate.
+#: The maximum size of a frame that is searched if its type is not compiled, so that construct
+#: parses each candidate.
 MAX_PLAIN_FRAME_BYTES = 128
-#: Longest frame that is searched for lost bytes, with 256 candidates for each offset.
+#: The maximum size of a frame that is searched for lost bytes, with 256 candidates for each offset.
 MAX_LOST_BYTE_FRAME_BYTES = 512
 #: Lost bytes are searched only if the layout of the frame depends on at most this number of fields.
 #: With more fields, nearly each candidate has a different layout.
 MAX_LAYOUT_FIELDS = 4
-#: Maximum number of changes that are described separately.
+#: The maximum number of changes that are described separately.
 MAX_DESCRIBED_CHANGES = 3
-#: Kind of damage, the likeliest first -> (number of bytes that the damage adds to the frame, number
-#: of candidates for each offset).
+#: For each kind of damage, the likeliest first: the number of bytes that the damage adds to the
+#: frame, and the number of candidates for each offset.
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
@@ -46,9 +46,10 @@ class FrameChange(NamedTuple):
 
     Attributes:
         kind: "flipped bit", "inserted byte" or "lost byte".
-        offset: offset of the changed or inserted byte in the damaged frame. For a lost byte, the
-            offset of the byte after it.
-        value: the inserted or lost byte; for a flipped bit, its index, 0 for the lowest bit.
+        offset: the offset of the changed or inserted byte in the damaged frame. For a lost byte,
+            the offset of the byte that follows it.
+        value: the inserted or lost byte. For a flipped bit, the index of the bit; the lowest bit is
+            0.
     """
 
     kind: str
@@ -72,7 +73,8 @@ def find_changes(
     """Return the single changes that explain the damage to a frame.
 
     A change explains the damage if undoing it gives one valid and plausible frame of the type. The
-    kinds are tried in turn; the result has only changes of the first kind with a match.
+    kinds are tried in turn. The result contains only changes of the first kind that explains the
+    damage.
 
     Args:
         frame: the frame type.
@@ -186,12 +188,13 @@ def describe_damage(
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
-    If there are more than `MAX_DESCRIBED_CHANGES`, yields one sentence with their kind and number.
+    If there are more than `MAX_DESCRIBED_CHANGES`, one sentence with their kind and number is
+    yielded.
 
     Args:
         frame: the frame type.
         data: the damaged frame.
-        values: returns {path: value} of the fields of a frame.
+        values: a function that returns the values of the fields of a frame, by path.
     """
     matching = find_changes(frame, data)
     if len(matching) > MAX_DESCRIBED_CHANGES:

@@ -36,7 +36,7 @@ from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.scan_ends import first_points
 from lidarspec.spec import Sensor
 
-#: Maximum number of points to list in the notes. Points are in the notes if the frame has no
+#: The maximum number of points to list in the notes. Points are in the notes if the frame has no
 #: arrays.
 MAX_LISTED_POINTS = 4
 
@@ -77,7 +77,7 @@ class Explanation:
 
     @property
     def fields(self) -> dict[str, FieldValue]:
-        """Path with array indices ("points[1].intensity") -> value, in wire order."""
+        """The values by path with indices ("points[1].intensity"), in wire order."""
         return {value.path: value for row in self.rows for value in row.values}
 
     @property
@@ -93,16 +93,16 @@ class Explanation:
         return not self.frame and all(row.right for row in self.rows)
 
     def path_of(self, number: int, part: int = 0) -> str | None:
-        """Return the path of the row that contains a point; None if no row does.
+        """Return the path of the row that contains a point; None if there is no such row.
 
         Args:
-            number: index of the point in the frame, or in the part if the points are in parts.
-            part: index of the part that contains the point; 0 if the points are not in parts.
+            number: the index of the point in the frame, or in its part if the points are in parts.
+            part: the index of the part that contains the point; 0 if the points are not in parts.
         """
         return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
     def lines(self, *, every: bool = False) -> list[Line]:
-        """Return the lines of the listing, as text with roles.
+        """Return the lines of the listing, as spans of text with roles.
 
         Args:
             every: whether to draw the bits of all elements of an array, instead of only the first.
@@ -113,7 +113,7 @@ class Explanation:
         ]
 
     def differences(self, other: Explanation) -> list[FieldDifference]:
-        """Return the fields that differ in another frame, in wire order."""
+        """Return the fields that differ between this and another frame, in wire order."""
         before = self.fields
         after = other.fields
         pairs = ((path, before.get(path), after.get(path)) for path in {**before, **after})
@@ -187,7 +187,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
 
 
 def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
-    """Return {path with array indices: value} of a frame, in wire order."""
+    """Return the values of a frame by path with array indices, in wire order."""
     return FrameRows(sensor.frames[frame], data).values()
 
 
@@ -224,7 +224,7 @@ def is_valid_frame(sensor: Sensor, data: bytes, name: str) -> bool:
 def _add_points(
     sensor: Sensor, name: str, data: bytes, rows: tuple[ExplainedRow, ...]
 ) -> tuple[tuple[ExplainedRow, ...], tuple[str, ...]]:
-    """Return the rows with the points that each contains, and notes on the frame."""
+    """Return the rows with the points that each row contains, and notes on the frame."""
     frame = sensor.frames[name]
     survey = get_codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
     notes = list[str]()
@@ -305,8 +305,8 @@ def _find_point_numbers(
     Args:
         path: the path of the row.
         chain: the axes of the nested arrays with the points, outermost first.
-        axes: the array along each dimension of `numbers`; None if the dimension is not an array of
-            the frame.
+        axes: the array of the frame along each dimension of `numbers`; None for a dimension without
+            such an array.
         numbers: index of the point of each array element; -1 for an element without a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]

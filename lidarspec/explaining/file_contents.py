@@ -1,4 +1,4 @@
-"""Describe the contents of a file: its kind, senders, sensors, times, and losses.
+"""Describe the contents of a file: its kind, senders, sensors, times and losses.
 
 Only the beginning of a long file is read, and all counts refer to this part. The time of the last
 packet is also read if the transport of the file can skip to its end.
@@ -42,22 +42,23 @@ from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
 
-#: Maximum number of bytes to read from the beginning of a file. The next constant is the maximum
-#: number of packets.
+#: The maximum number of bytes to read from the beginning of a file. The next constant is the
+#: maximum number of packets.
 MAX_BEGINNING_BYTES = 1 << 26
 MAX_BEGINNING_PACKETS = 1 << 18
-#: Maximum number of bytes to decode.
+#: The maximum number of bytes to decode.
 MAX_DECODED_BYTES = 1 << 24
-#: Maximum number of senders to list.
+#: The maximum number of senders to list.
 MAX_LISTED_FLOWS = 6
-#: Maximum number of characters in a line of the description.
+#: The maximum number of characters in a line of the description.
 LINE_WIDTH = 80
-#: Minimum number of characters in the column of labels, for equal columns of several files.
+#: The minimum number of characters in the column of labels, so that several files have equal
+#: columns.
 MIN_LABEL_WIDTH = 8
 COMMAND_LABEL = "next"
 #: A time after all arrivals, ns since 1970.
 _END_NS = (1 << 63) - 1
-#: Transport of a file -> the kind of the file in words.
+#: The description of a file's kind, by the transport of the file.
 KINDS: Mapping[type[Transport], str] = {
     RecordingTransport: "a recording",
     CaptureTransport: "a capture",
@@ -90,15 +91,16 @@ class SensorContent:
 
     Attributes:
         source: the SOURCE that selects this data.
-        sensors: ids of the sensors that match.
-        share: share of the bytes that are in valid frames, from 0 to 1; None if the file names the
-            sensor.
+        sensors: the ids of the sensors that match.
+        share: the share of the bytes that are in valid frames, from 0 to 1; None if the file names
+            the sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
-        incomplete_returns: number of groups of packets in that part in which a return is lost.
-        verb: the verb of the command line that shows the data.
-        info: the facts that the sensor reports about itself in that part, by name.
-        clock: the sensor's clock in that part, in words; "" if it sends no time.
+        incomplete_returns: the number of groups of packets with a lost return, in the decoded part.
+        verb: the subcommand that shows the data.
+        info: the facts that the sensor reports about itself in the decoded part, by name.
+        clock: a description of the sensor's clock in the decoded part; "" if the sensor sends no
+            time.
     """
 
     source: str
@@ -123,7 +125,7 @@ class FileContents:
 
     Attributes:
         path: the name of the file.
-        kind: the kind of the file in words.
+        kind: a description of the kind of the file.
         size: the size of the file, in bytes.
         header: the header of a recording; None for other files.
         flows: the packets by sender and receiver, most bytes first; a byte stream has one flow.
@@ -331,7 +333,9 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 
 
 def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
-    """Return `reading`, `incomplete_returns`, `info` and `clock` of the beginning of a file.
+    """Return attributes of `SensorContent`, measured at the beginning of a file.
+
+    They are `reading`, `incomplete_returns`, `info` and `clock`.
 
     Returns an empty dict if the frames cannot be decoded.
     """
@@ -354,7 +358,7 @@ def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
 
 
 def format_contents(contents: FileContents) -> Iterator[str]:
-    """Yield the description of a file in lines: a column of labels, and one of texts.
+    """Yield the lines of the description of a file, with a column of labels.
 
     Texts are folded between words at `LINE_WIDTH`. Commands are not folded, so that they can be
     copied.

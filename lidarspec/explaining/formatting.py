@@ -17,9 +17,9 @@ from lidarspec.spec.timing import EPOCHS, Clock
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
-#: Number of bytes in a line of a hexdump.
+#: The number of bytes in a line of a hexdump.
 HEXDUMP_LINE_BYTES = 16
-#: Number of lines of a hexdump before the marked line.
+#: The number of lines of a hexdump before the marked line.
 HEXDUMP_LINES_BEFORE = 2
 DEGREES_PER_TURN = 360
 
@@ -38,7 +38,7 @@ class TextSpan(NamedTuple):
 class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
-    Without a valid return, x, y and z are nan. The range is then inf (no return) or nan.
+    Without a valid return, x, y and z are nan, and the range is inf (no return) or nan.
     """
 
     x: float
@@ -90,11 +90,11 @@ class FieldValue:
         unit: the unit; "" if the field has none.
         digits: number of decimals to print; None for a float field.
         label: the name of the raw value; "" if it has none.
-        is_unknown: whether other raw values of the field have names, but this one has none.
-        bits: text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
+        is_unknown: whether this raw value has no name, but others of the field have names.
+        bits: a text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
         docs: the documentation of the field.
         start: offset of the first byte in the frame.
-        masks: one byte for each byte of the field, in which the bits of the field are 1.
+        masks: for each byte that contains bits of the field, a mask in which these bits are 1.
     """
 
     path: str
@@ -116,7 +116,7 @@ class FieldValue:
 
     @property
     def has_meaning(self) -> bool:
-        """Whether the text has more than the raw value: a unit, or the name of a code."""
+        """Whether the value has a unit or the name of a code in addition to the raw value."""
         return bool(self.unit or self.label) or self.is_unknown
 
     def contains_bit(self, offset: int, bit: int) -> bool:
@@ -187,9 +187,9 @@ class ExplainedRow:
         path: the path of the field or element; "" for bytes that are not in a field.
         values: the fields in these bytes.
         remarks: remarks on constants, checksums and missing bytes.
-        right: False if the bytes do not match the spec.
+        right: whether the bytes match the spec.
         points: the points in this element.
-        numbers: (index of the part of the frame, index of the point in the part) of each point.
+        numbers: for each point, the index of its part in the frame, and its index in the part.
     """
 
     offset: int
@@ -203,7 +203,7 @@ class ExplainedRow:
 
     @property
     def meaning(self) -> str:
-        """One line with the values and their units, remarks, documentation and points."""
+        """A line with the values and their units, remarks, documentation and points."""
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[TextSpan]:
@@ -385,21 +385,21 @@ def format_fixed(value: float, digits: int | None) -> str:
 
 
 def limits(low: float, high: float, between: str = "..") -> str:
-    """Format a range of numbers, e.g. "0..4294967295"; integers have all their digits."""
+    """Format a range of numbers, e.g. "0..4294967295", with all digits of integers."""
     return between.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Return the range of a numeric command argument, else the name of its type."""
+    """Return the range of a numeric command argument, or the type of any other."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)
 
 
 def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
-    """Describe the values of a command argument: their names, or as `format_argument_type`."""
+    """Return the names of a command argument's values, or `format_argument_type`."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(argument_slot(sensor, command, argument).info, kind)

@@ -20,9 +20,9 @@ from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
 
-#: Maximum number of decimals to print so that all values of a field differ.
+#: The maximum number of decimals that are printed to distinguish all values of a field.
 MAX_DIGITS = 12
-#: Maximum number of further decimals to print so that each value is exact.
+#: The maximum number of further decimals that are printed to make each value exact.
 MAX_EXTRA_DIGITS = 2
 
 
@@ -32,7 +32,8 @@ class FrameRows:
     Args:
         frame: the frame type.
         data: the bytes.
-        fault: the fault of the frame; the row of its field reports it. None if the frame is valid.
+        fault: the fault of the frame, which the row of the faulty field reports; None if the frame
+            is valid.
 
     Attributes:
         after: the offset after the frame.
@@ -45,7 +46,7 @@ class FrameRows:
         self._has_form = frame.wire is not None
         self._axes = self._find_array_axes()
         decoded = frame_coder(frame).decode(data)
-        #: Offset in the frame of each byte of its struct.
+        #: The offset in the frame of each byte of its struct.
         self._offsets = decoded.offsets
         self._verdicts: dict[str, tuple[str, bool]] = {}
         fields = self._read_fields(frame, decoded.struct)
@@ -94,8 +95,8 @@ class FrameRows:
     def iter_rows(self) -> Iterator[ExplainedRow]:
         """Yield a row for each field, bit block or array element.
 
-        An array element is one row if it contains no further array. A frame with a wire form has
-        rows for the bytes before and after its struct as well.
+        An array element is one row if it contains no further array. For a frame with a wire form,
+        the bytes before and after its struct have rows as well.
         """
         if self._first:
             yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), right=True)
@@ -110,7 +111,7 @@ class FrameRows:
         return {value.path: value for row in self.iter_rows() for value in row.values}
 
     def iter_rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
-        """Yield a row of the bytes after the last field, or nothing if no bytes follow it.
+        """Yield a row with the bytes after the last field, if there are any.
 
         These bytes belong to a truncated field, or they follow the end of the frame.
         """

@@ -24,11 +24,13 @@ from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
-#: Minimum number of constant bytes at the start of a frame type to search for its damaged frames.
+#: The minimum number of constant bytes at the start of a frame type to search for its damaged
+#: frames.
 MIN_SYNC_BYTES = 2
-#: Maximum number of bytes outside frames that are kept; more are yielded as a piece.
+#: The maximum number of bytes outside frames that are kept. If there are more, they are yielded as
+#: a piece.
 MAX_HELD_BYTES = 1 << 16
-#: Used as the frame type of a whole input that may be one damaged frame of unknown type.
+#: The frame type of a piece that is the whole input, and may be one damaged frame of unknown type.
 NEAREST = "?"
 
 
@@ -40,7 +42,7 @@ class InputPiece:
         offset: offset of the first byte in the input.
         data: the bytes.
         frame: the frame type; "" for bytes that are not in a frame; or `NEAREST`.
-        datagram: whether the bytes are a datagram, or a part of a datagram, and not in a frame.
+        datagram: whether the bytes are a datagram or a part of a datagram, and are not in a frame.
     """
 
     offset: int
@@ -75,8 +77,8 @@ def iter_pieces(
         sensor: the sensor.
         chunks: the input.
         datagrams: whether each chunk is a datagram, not a piece of a stream.
-        frame: the frame type that is preferred if several types match the same bytes. Its `after`
-            is ignored. Frames of other types are yielded as well.
+        frame: the frame type that is preferred if several types match the same bytes. The `after`
+            of this type is ignored. Frames of other types are yielded as well.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -113,7 +115,7 @@ def iter_pieces(
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor with a frame type first, incoming, and without `after`."""
+    """Return the sensor with a frame type that is first, incoming, and has no `after`."""
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
@@ -256,7 +258,7 @@ def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int
     Args:
         data: the bytes.
         start: the start of the damaged frame.
-        name: its type.
+        name: the type of the damaged frame.
         ends: the offsets at which another frame may begin, and the end of the data.
     """
     following = [end for end in ends if end > start]

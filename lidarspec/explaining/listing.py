@@ -21,19 +21,20 @@ from lidarspec.explaining.formatting import (
 )
 from lidarspec.frames.wire_table import format_hex
 
-#: Maximum number of bytes in a line.
+#: The maximum number of bytes of a frame in a line.
 LINE_BYTES = 8
-#: Number of spaces for each level of nesting.
+#: The number of spaces for each level of nesting.
 INDENT = 2
-#: Maximum width of the column with bytes and bits.
+#: The maximum width of the column with bytes and bits.
 MAX_BITS_WIDTH = 35
-#: Maximum width of the column with names.
+#: The maximum width of the column with names.
 MAX_NAME_WIDTH = 36
-#: Number of bytes of a field in a line of its differences.
+#: The number of bytes of a field in a line of its differences.
 DIFFERENCE_LINE_BYTES = 4
-#: Number of columns of a line: its first spans. The text after the columns can be folded.
+#: The number of spans at the start of a line that are columns. The text after the columns can be
+#: folded.
 COLUMN_COUNT = 3
-#: Minimum width of the text after the columns; if less is left, lines are not folded.
+#: The minimum width of the text after the columns. If less width is left, lines are not folded.
 MIN_FOLDED_WIDTH = 24
 
 Line = tuple[TextSpan, ...]
@@ -245,7 +246,7 @@ def _make_missing_line(group: list[FieldDifference], which: str) -> Line:
     """Return a line for consecutive fields that only one frame has.
 
     Args:
-        which: "first" or "second", the frame that has them.
+        which: the frame that has the fields, "first" or "second".
     """
     paths = [difference.path for difference in group]
     if len(paths) == 1:

@@ -1,12 +1,13 @@
-"""Exports of a spec to the formats of other tools, by name.
+"""Export the spec of a sensor to the formats of other tools.
 
-In: a sensor. Out: the text that `export` returns. The modules below get the frame types from
-`messages` and walk their frame trees (`lidarspec.spec.tree`). They raise `ExportError` if a tree
-contains Python code, or if the target format cannot express the spec. Modules in reading order:
+`export` returns the text of an export, which is selected by name. The modules below get the frame
+types from `messages` and walk their frame trees (`lidarspec.spec.tree`). They raise `ExportError`
+if a tree contains Python code, or if the target format cannot express the spec. Modules in reading
+order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
-* `quick_start`: the start of this page: commands to copy, and notes of the plugin.
+* `quick_start`: the start of the Markdown page: commands to copy, and notes of the plugin.
 * `ksy`, `wireshark`: a Kaitai Struct format, and a dissector in Lua.
 * `c`, `c_fields`: a header in C, and its functions that read fields.
 """
@@ -26,7 +27,8 @@ from lidarspec.spec.sensor import with_frames
 if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
 
-#: Kind -> "module:function"; the function takes a Sensor and returns the text of the export.
+#: For each kind of export, "module:function". The function returns the text of the export of a
+#: Sensor.
 EXPORTS: dict[str, str] = {
     "wireshark": "lidarspec.exports.wireshark:dissector",
     "c": "lidarspec.exports.c:header",
@@ -43,7 +45,7 @@ BYTE_EXPORTS = ("wireshark", "c", "ksy")
 
 
 class ExportError(UsageError):
-    """The target of an export cannot express the spec; the message has the reason."""
+    """The target of an export cannot express the spec. The message states the reason."""
 
 
 class UnknownExport(UnknownName):
@@ -58,7 +60,7 @@ def select_frame(sensor: Sensor, frame: str) -> Sensor:
     An export of the copy describes this frame type alone.
 
     Raises:
-        UnknownFrame: if it has no frame type of this name.
+        UnknownFrame: if the sensor has no frame type of this name.
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
@@ -110,7 +112,7 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """Path of each field that stores (a part of) a checksum -> the checksum's node."""
+        """The node of the checksum that a field stores, completely or in part, by path."""
         return {
             path: node
             for node in tree.nodes(self.root)
@@ -147,7 +149,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
 
 
 def describe_left_out(sensor: Sensor) -> str:
-    """Return a sentence that names the frame types that `BYTE_EXPORTS` leave out; "" for none."""
+    """Return a sentence with the frame types that `BYTE_EXPORTS` leave out, or ""."""
     with_form = _find_wire_forms(sensor)
     if not with_form:
         return ""
@@ -182,7 +184,7 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
 
 
 def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """Return {path: formula} of the fields of a node that must equal a formula."""
+    """Return the formulas that fields of a node must be equal to, by path."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)

@@ -7,7 +7,7 @@ It does not depend on struct packing. `header` joins:
 * a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
   argument, so that all frame types share it,
 * for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions that read a
-  whole frame: they return its length, its validity, and its stored and computed checksums.
+  whole frame. They return its length, its validity, and its stored and computed checksums.
 
 `frame_length` checks that a byte exists before it reads the byte.
 """
@@ -299,8 +299,8 @@ def _join_statements(statements: Iterable[str]) -> str:
 def _iter_length_checks(layout: CLayout) -> Iterator[str]:
     """Yield C checks of the fields that determine the length, in wire order.
 
-    Each check returns 0 from the C function if the bytes end before the field, or if its value is
-    impossible.
+    Each check makes the C function return 0 if the bytes end before the field, or if the value of
+    the field is impossible.
     """
     longest = layout.message.frame.max_length
     for entry in layout.entries:
@@ -438,7 +438,7 @@ def _format_number(value: Any) -> str:
 
 
 def _format_check(entry: CEntry, wrong: str) -> str:
-    """Return a C statement that returns 0 if a condition is true.
+    """Return a C statement `return 0`, executed if a condition is true.
 
     For an entry in arrays, the statement loops over all elements.
 
@@ -479,7 +479,7 @@ _TAIL = """\
 #endif
 #endif
 """
-#: Reserved endings: the names of functions that read a whole frame end with them.
+#: The names of functions that read a whole frame end with these words, so fields cannot use them.
 _RESERVED_ENDINGS = (
     "frame_length",
     "is_frame",
@@ -540,7 +540,7 @@ def _iter_definitions(
     """Yield all definitions of a frame type.
 
     Args:
-        taken: C name in use -> its (frame type, path, ending); new names are added.
+        taken: the frame type, path and ending of each C name in use. New names are added.
         algorithms: the name of the C function of each checksum algorithm.
     """
     name = functools.partial(_make_name, taken, prefix, message.name)

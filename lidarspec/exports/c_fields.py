@@ -3,11 +3,11 @@
 `CLayout` walks a frame tree once and makes a `CEntry` for each node. An entry has the offset of the
 node as a C expression, its size, the conditions under which it is present, and the counts of the
 arrays around it. If an expression needs a length or count from the header, it calls the C function
-that reads it, so that expressions stay short.
+that reads this number, so that expressions stay short.
 
 `fields` makes the C functions from the entries: accessors of fields, counts of arrays, tests for
-optional fields, and conversions to the field's unit and the SI unit. If alternative layouts contain
-a field, its accessor uses the first alternative that is present.
+optional fields, and conversions to the field's unit and the SI unit. If several alternatives
+contain a field, its accessor uses the first alternative that is present.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from lidarspec.exports import ExportedFrame, ExportError, find_references
 from lidarspec.frames.wire_table import SizeFormula, describe_field, unit_text
 from lidarspec.spec import tree
 
-#: Comparisons are function calls, because compilers warn if a narrow type cannot have a value.
+#: The C code of each operation. Comparisons contain a function call, because compilers warn of a
+#: comparison with a value that a narrow type cannot have.
 _OPERATIONS = {
     **{
         "//": "lidarspec_floor_div({}, {})",
@@ -97,11 +98,12 @@ def quote_bytes(data: bytes) -> str:
 
 
 class CCondition(NamedTuple):
-    """A C expression that is a condition.
+    """A condition as a C expression.
 
     Attributes:
         text: the expression.
-        is_fixed: whether its value is the same for all elements of the arrays around it.
+        is_fixed: whether the value is the same for all elements of the arrays around the
+            expression.
     """
 
     text: str
@@ -113,13 +115,13 @@ class CEntry:
     """A node of a frame tree, at one position in the frame.
 
     Attributes:
-        path: path of the node, without indices; for an array, the path of its axis.
+        path: the path of the node, without indices; for an array, the path of its axis.
         node: the node.
-        start: offset of its first byte in the frame.
-        size: size in bytes.
-        depth: number of arrays around it.
-        conditions: conditions under which it is present.
-        loops: C expression of the count of each array around it, the outermost first.
+        start: the offset of the first byte of the node in the frame.
+        size: the size of the node in bytes.
+        depth: the number of arrays around the node.
+        conditions: the conditions under which the node is present.
+        loops: the C expression of the count of each array around the node, outermost first.
         part: the part of a bit block that is read; None for any other node.
     """
 
@@ -177,7 +179,7 @@ class CEntry:
 
     @property
     def span(self) -> tuple[int, SizeFormula]:
-        """(start, end) of the bytes that hold the field, as byte offsets in the entry."""
+        """The offset of the field in the entry, and the offset after its last byte."""
         if self.part is None:
             return 0, self.size
         offsets = [segment.byte for segment in self.part.bits.segments]
@@ -196,7 +198,7 @@ class CEntry:
 
 
 def format_size_arguments(node: tree.Node, depth: int) -> str:
-    """Return the arguments that a size function inside `depth` arrays is called with.
+    """Return the arguments for calling a size function inside `depth` arrays.
 
     If all elements have the same size, every index is 0.
     """
@@ -211,7 +213,7 @@ class CLayout:
 
     Attributes:
         message: the frame type.
-        name: returns the C name for a path and an ending.
+        name: a function that returns the C name for a path and an ending.
         size: size of a frame, in bytes.
 
     Raises:
@@ -238,7 +240,7 @@ class CLayout:
         ]
 
     def whole(self, path: str) -> CEntry:
-        """Return the entry of a whole array, or of all alternatives, at a path."""
+        """Return the entry of the whole array, or of all alternatives together, at a path."""
         return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: tree.Formula) -> str:
@@ -256,7 +258,7 @@ class CLayout:
         )
 
     def length(self, value: tree.Formula) -> str:
-        """Return a number of elements or bytes as C."""
+        """Return a number of elements or bytes as a C expression."""
         if isinstance(value, int):
             return str(value)
         return f"(size_t)({self.formula(value)})"
@@ -313,8 +315,8 @@ class CLayout:
     def extent_name(self, entry: CEntry) -> str:
         """Return the name of the size function of a part with alternatives.
 
-        Parts with alternatives can be nested and have the same path. A number makes their names
-        unique.
+        Parts with alternatives can be nested and have the same path, so a number in their names
+        makes them unique.
         """
         choices = [
             node
@@ -404,7 +406,7 @@ class CLayout:
         return [(CCondition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
 
 
-#: Unit -> its SI unit as part of a C name, factor and offset.
+#: For each unit: its SI unit as part of a C name, and the factor and offset of the conversion.
 SI: dict[str, tuple[str, float, float]] = {
     "cm": ("m", 0.01, 0),
     "mm": ("m", 0.001, 0),
@@ -419,7 +421,7 @@ SI: dict[str, tuple[str, float, float]] = {
     "mA": ("A", 1e-3, 0),
     "kHz": ("Hz", 1e3, 0),
 }
-#: Size of a float in bytes -> the C function that converts its bits.
+#: The C function that converts the bits of a float, by the size of the float in bytes.
 FLOAT_FUNCTIONS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
@@ -458,7 +460,7 @@ def accesses(layout: CLayout, path: str) -> list[CEntry]:
 def fields(layout: CLayout) -> Iterator[str]:
     """Yield the functions of all fields in wire order.
 
-    If several alternatives contain a field, its functions come at the place of the last one.
+    If several alternatives contain a field, its functions are at the place of the last alternative.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
@@ -470,7 +472,7 @@ def fields(layout: CLayout) -> Iterator[str]:
     yield from extents
 
 
-#: Yields one or more functions for the field or array at a path.
+#: A function that yields one or more C functions for the field or array at a path.
 Writer = Callable[[CLayout, str], Iterator[str]]
 
 
@@ -580,7 +582,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
 
 
 def _write_names(labels: Mapping[int, str], name: str) -> str:
-    """Return the function that gives the name of a code, or NULL for an unknown code."""
+    """Return the C function that returns the name of a code; NULL for an unknown code."""
     cases = [f"    case {code}: return {quote(label)};" for code, label in labels.items()]
     head = f"static inline const char *{name}(long long code)"
     return "\n".join([head, "{", "    switch (code) {", *cases, "    }", "    return NULL;", "}"])
@@ -593,8 +595,8 @@ def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str
 
     Args:
         kind: the C type of the result.
-        depth: number of arrays around the field.
-        ways: (condition, value) of each alternative; the condition "" is always true.
+        depth: the number of arrays around the field.
+        ways: the condition and the value of each alternative; the condition "" is always true.
     """
     used = " ".join(condition + " " + value for condition, value in ways)
     lines = [

@@ -39,12 +39,12 @@ class DiagramBox:
     """A box of a diagram.
 
     Attributes:
-        name: its title.
-        bits: its width; 0 if its size depends on the header.
+        name: the title of the box.
+        bits: the size of the field in bits; 0 if the size depends on the header.
         detail: the text below the title.
         tooltip: the full description.
         role: "const", "sum", "spare" or ""; it decides the colour.
-        offset: offset of its first byte.
+        offset: the offset of the first byte.
     """
 
     name: str
@@ -61,7 +61,7 @@ class BoxGroup:
 
     Attributes:
         label: the count or the condition.
-        items: the boxes and groups in it.
+        items: the boxes and groups in the group.
         optional: whether some frames do not contain the group.
     """
 
@@ -93,8 +93,8 @@ class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
-        seals: path of a field that holds a checksum -> its seal.
-        mixed: whether to show the byte order of each number, because the frame has both orders.
+        seals: the seal of each field that contains a checksum, by path.
+        mixed: whether the frame has both byte orders, so that the order of each number is shown.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -211,7 +211,7 @@ class _ItemBuilder:
     ) -> DiagramBox:
         """Return the box of the bits `low` to `high` of a value.
 
-        The box shows the bit numbers if it is not the whole value.
+        The box shows the bit numbers if it does not contain the whole value.
         """
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
@@ -255,37 +255,38 @@ class _ItemBuilder:
         )
 
 
-#: Bits in a row.
+#: The number of bits in a row.
 ROW_BITS = 32
-#: Width of a bit, in pixels.
+#: The width of a bit, in pixels.
 BIT_WIDTH_PX = 22
-#: Height of a row, in pixels.
+#: The height of a row, in pixels.
 ROW_HEIGHT_PX = 46
-#: Width of the column of offsets at the left, in pixels.
+#: The width of the column of offsets at the left, in pixels.
 LEFT_MARGIN_PX = 104
-#: Width of a level of brackets at the right, in pixels.
+#: The width of a level of brackets at the right, in pixels.
 BRACKET_WIDTH_PX = 136
-#: Margin around the drawing, in pixels.
+#: The margin around the drawing, in pixels.
 MARGIN_PX = 16
-#: Bits of the longest field that is drawn in full; a longer one is drawn as a cut row.
+#: The size in bits of the longest field that is drawn in full. A longer field is drawn as a cut
+#: row.
 MAX_DRAWN_BITS = 128
-#: Maximum number of letters of an offset that is written in one line.
+#: The maximum number of letters of an offset that is written in one line.
 MAX_OFFSET_LETTERS = 13
-#: Fill colour by role.
+#: The fill colour of each role.
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
-#: Colour of names.
+#: The colour of names.
 NAME_COLOUR = "#1c2430"
-#: Colour of details and offsets.
+#: The colour of details and offsets.
 DETAIL_COLOUR = "#64707f"
-#: Colour of lines.
+#: The colour of lines.
 LINE_COLOUR = "#4a5565"
-#: Width of a letter as a share of the font size.
+#: The width of a letter as a share of the font size.
 LETTER_ASPECT = 0.61
-#: Font size of names, in pixels.
+#: The font size of names, in pixels.
 NAME_SIZE_PX = 13
-#: Font size of details, in pixels.
+#: The font size of details, in pixels.
 DETAIL_SIZE_PX = 10.5
-#: Smallest font size of names, in pixels.
+#: The smallest font size of names, in pixels.
 MIN_NAME_SIZE_PX = 8
 
 
@@ -310,7 +311,7 @@ def svg(sensor: Sensor) -> str:
     return sheet.document(f"{sensor.id}: packet diagrams")
 
 
-#: The piece of a box in one row: left edge and upper edge in pixels, width in bits.
+#: The piece of a box in one row: its left edge and upper edge in pixels, and its width in bits.
 Piece = tuple[float, float, int]
 
 
@@ -451,7 +452,7 @@ class _Sheet:
     def _draw_cut_row(self, cell: DiagramBox) -> None:
         """Draw a field as one row with jagged cuts.
 
-        Used if the field is too long to draw in full, or if it has no fixed length.
+        This is done if the field is too long to draw in full, or if it has no fixed length.
         """
         self._end_row()
         self._draw_offset(cell, 0)
@@ -470,7 +471,7 @@ class _Sheet:
         """Draw the offset of the current row at its left; a long formula takes two lines.
 
         Args:
-            more: number of bytes of the field that are drawn in the rows above.
+            more: the number of bytes of the field that are drawn in the rows above.
         """
         text = str(cell.offset + SizeFormula(more))
         middle = text.find(" + ", len(text) // 2 - 4)
@@ -487,7 +488,7 @@ class _Sheet:
 
 
 def _find_nesting_depth(group: BoxGroup) -> int:
-    """Return the number of levels of groups inside a group; 0 for only boxes inside."""
+    """Return the number of levels of groups inside a group; 0 if it has only boxes."""
     return max(
         (1 + _find_nesting_depth(item) for item in group.items if isinstance(item, BoxGroup)),
         default=0,

@@ -1,8 +1,8 @@
-"""A whole spec as JSON, for programs in any language.
+"""Export a whole spec as JSON, for programs in any language.
 
 docs/reference/spec-json.md describes every key. Wire types, bit positions, formulas and checksums
 are complete, so that a decoder can be written from them. Python code (`points`, `plausible`,
-`sweep`) is not included. The output shows only whether a frame type has a `plausible` function.
+`sweep`) is not included; the output only states whether a frame type has a `plausible` function.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, PacketCounter, Split
 from lidarspec.spec.wire_forms import WireForm
 
-#: Version of the format. A version that removes a key, or changes its meaning, has a new number.
+#: Version of the format. The number changes if a key is removed, or if its meaning changes.
 VERSION = 1
 
 
@@ -101,7 +101,7 @@ def _to_json(fact: Any) -> Any:
 def link_data(link: Link) -> dict[str, Any]:
     """Return a link as JSON data.
 
-    The key "kind" is its class; the other keys are its attributes.
+    The key "kind" is the class of the link; the other keys are its attributes.
     """
     data = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
@@ -164,7 +164,7 @@ def _wire_form(form: WireForm) -> dict[str, Any]:
 
 
 def _arguments(described: object) -> dict[str, Any]:
-    """Return the values of the fields of a dataclass; none for another class."""
+    """Return the values of a dataclass's fields, by name; {} for any other class."""
     if not dataclasses.is_dataclass(described):
         return {}
     return {item.name: getattr(described, item.name) for item in dataclasses.fields(described)}
@@ -195,7 +195,7 @@ def _command(command: Command) -> dict[str, Any]:
 
 
 def node_data(node: tree.Node) -> dict[str, Any]:
-    """Return a node of a frame as JSON data; "kind" decides the other keys."""
+    """Return a node of a frame as JSON data. The entry "kind" decides the other keys."""
     match node:
         case tree.Struct():
             return {

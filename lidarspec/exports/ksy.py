@@ -6,9 +6,9 @@ wire order (`seq`), calculated `instances`, `enums` and inner `types`. Types are
 from the current type (`format_reference`).
 
 A bit block becomes bit-sized integers if its parts are consecutive in one of Kaitai's two bit
-orders. Otherwise it becomes bytes, and an instance calculates each part. For a field with a scale,
-an instance has the physical value. For a field with named values, an instance has the name of the
-value. Kaitai cannot express checksums, plausibility tests and points. The documentation of a
+orders. Otherwise the block becomes bytes, and an instance calculates each part. For a field with a
+scale, an instance has the physical value. For a field with named values, an instance has the name
+of the value. Kaitai cannot express checksums, plausibility tests and points. The documentation of a
 checksum's field names the algorithm.
 """
 
@@ -35,7 +35,7 @@ from lidarspec.spec.fields import slug
 
 #: A string that needs no quotes in YAML.
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./()<>=+*-]*( [A-Za-z0-9_./()<>=+*;,-]+)*")
-#: Maximum number of allowed values to list.
+#: The maximum number of allowed values to list.
 MAX_LISTED_VALUES = 16
 _RESERVED_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
@@ -94,7 +94,7 @@ def identifier(name: str) -> str:
 
 
 #: The Kaitai types around an expression, outermost first. Each is given by the path of its struct,
-#: or None for a type that has no struct and holds a single part.
+#: or by None for a type without a struct, which contains a single part.
 Scope = tuple[str | None, ...]
 
 
@@ -126,7 +126,7 @@ def number(formula: tree.Formula, scope: Scope) -> str:
 
 
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula of the fields of the last part, which is "_" in Kaitai.
+    """Return a formula of the fields of the last part; Kaitai's name for it is "_".
 
     Args:
         scope: the scope of the frame around the parts.
@@ -156,8 +156,8 @@ def to_condition(formula: tree.Formula, scope: Scope) -> str:
 
 Attribute = dict[str, Any]
 
-#: Maximum width of Kaitai's bit-sized integers. The next two constants are the sizes of its other
-#: integers and of its floats, in bytes.
+#: The maximum width of Kaitai's bit-sized integers. The next two constants are the sizes of
+#: Kaitai's other integers and of its floats, in bytes.
 MAX_BITS = 64
 INTEGER_SIZES = (1, 2, 4, 8)
 FLOAT_SIZES = (4, 8)
@@ -169,7 +169,7 @@ def block_type(
     """Return the attributes and the instances of a block's type.
 
     Args:
-        doc: returns the documentation of a field.
+        doc: a function that returns the documentation of a field.
 
 
     Raises:
@@ -262,7 +262,7 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the entry "if" of an attribute for instances that use it; {} if it has none."""
+    """Return the entry "if" of an attribute, for the instances that use the attribute."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
@@ -287,9 +287,9 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the bit position of a field's start, calculated from each segment.
+    """Return the possible bit positions of a field's start, one for each segment.
 
-    All segments give the same position if Kaitai can read the field as consecutive bits.
+    The set has one position if Kaitai can read the field as consecutive bits.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -397,7 +397,7 @@ class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
-        seals: path of a field that holds a checksum -> its seal.
+        seals: the seal of each field that contains a checksum, by path.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -410,7 +410,7 @@ class _KaitaiWriter:
         return kaitai.done(node.struct.path)
 
     def _member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
-        """Add a member to a type; `more` are further keys of its attribute."""
+        """Add a member to a type; `more` contains further keys of the attribute."""
         node = as_block(node)
         match node:
             case tree.Empty() | tree.Derived():
@@ -499,7 +499,7 @@ class _KaitaiWriter:
         kaitai.seq.append({"id": name, "type": name, **more})
 
     def _type(self, node: tree.Node, scope: Scope) -> Attribute:
-        """Return the type of a struct, or a type with any other node as its `value`."""
+        """Return the type of a struct; for any other node, a type with it as `value`."""
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
         kaitai = _KaitaiType()
@@ -609,7 +609,7 @@ class _KaitaiWriter:
 
 
 def _make_enum(labels: Mapping[int, str]) -> Attribute:
-    """Return an enum of Kaitai: code -> name, with the original name as its documentation."""
+    """Return an enum of Kaitai: names by code, documented by the original names."""
     members: dict[Any, Any] = {}
     taken = set[str]()
     for code, label in labels.items():
@@ -630,7 +630,7 @@ def _size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _value(node: tree.Node) -> tree.Node:
-    """Return an element of an array, or an alternative, as a member named `value`."""
+    """Return an array element, or an alternative, as a member named `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

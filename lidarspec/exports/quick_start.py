@@ -17,7 +17,7 @@ from lidarspec.spec.links import Serial, Tcp, Udp
 
 
 def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
-    """Return (command, purpose) of the first shell commands to use with a sensor.
+    """Return the first shell commands to use with a sensor, as (command, purpose).
 
     Args:
         source: the SOURCE in the commands; by default a typical one for the links of the sensor.

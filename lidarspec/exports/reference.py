@@ -1,4 +1,4 @@
-"""A sensor's reference page in Markdown.
+"""Export a spec as the sensor's reference page, in Markdown.
 
 The page has commands to copy, notes, links, the sensor's commands, a table of the fields of each
 frame, checksums, the clock and geometry. The notes come from the plugin; all other sections are
@@ -30,14 +30,14 @@ from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import Every, OnFlag, Split
 
-#: Status of a sensor -> its description.
+#: The description of each status of a sensor.
 STATUSES = {
     "manual": "written from the manual",
     "vectors": "agrees with published example frames",
     "capture": "agrees with captures of the device",
     "hardware": "tested with the device",
 }
-#: Class of a scan rule -> a description of the end of a scan.
+#: A description of the end of a scan for each class of scan rules.
 RULES = {
     "OnWrap": "where `{name}` passes {at:g}",
     "OnFlag": "before every packet in which `{name}` is set",
@@ -45,7 +45,7 @@ RULES = {
     "OnJump": "before every packet in which `{name}` jumps by more than {by:g}",
     "OnRewind": "before every packet in which `{name}` decreases",
 }
-#: Maximum number of channels to list.
+#: The maximum number of channels to list.
 MAX_LISTED_CHANNELS = 128
 
 
@@ -53,7 +53,7 @@ def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
     """Return the page as Markdown.
 
     Args:
-        pictures: frame type -> address of its packet diagram.
+        pictures: the address of the packet diagram of each frame type.
     """
     parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", _write_quick_start(sensor)]
     for name, picture in (pictures or {}).items():
@@ -110,7 +110,7 @@ def _describe_link(link: Link) -> str:
 
 
 def _list_levels(lines: Mapping[str, bool | None]) -> list[str]:
-    """Return the control lines with their levels."""
+    """Return the names of the control lines with their levels."""
     return [
         f"{name.upper()} {'high' if level else 'low'}"
         for name, level in lines.items()
@@ -263,7 +263,7 @@ def _decode_example(sensor: Sensor, name: str) -> PointCloud | None:
 
 
 def _list_channels(cloud: PointCloud) -> Sequence[tuple[str, str]]:
-    """Return (channel, elevation) for each channel.
+    """Return the number and the elevation of each channel.
 
     Returns an empty list if an elevation varies, or if there are too many channels.
     """

@@ -42,7 +42,7 @@ from lidarspec.spec.tree import (
     children,
 )
 
-#: Kind of argument of a command -> its Python type.
+#: The Python type of each kind of command argument.
 ARGUMENT_TYPES = {Range: "float", Port: "float", Text: "str", Address: "str", Octets: "bytes"}
 #: The keyword parameters of `parse`.
 PARSE_OPTIONS = "verify: bool = True, units: bool = False"
@@ -103,7 +103,7 @@ class _StubClasses:
         """Add the class of a struct or block, and return its name.
 
         Args:
-            name: the wanted name; a name in use gets a suffix.
+            name: the preferred name. If it is in use, a suffix is added.
             docstring: the docstring of the class.
         """
         while name in self.taken:
@@ -194,7 +194,7 @@ def _number_type(info: FieldInfo) -> str:
 
 
 def _bytes_type(info: FieldInfo) -> str:
-    """Return the type of the parsed value of bytes, which a function may decode."""
+    """Return the type of the parsed value of bytes; a function may decode the bytes."""
     if info.adapter is None:
         return "bytes"
     if info.adapter.form.startswith("text"):

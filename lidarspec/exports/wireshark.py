@@ -82,7 +82,8 @@ def _format_function(value: tree.Formula, missing: str = "") -> LuaCode:
     """Return a formula as a Lua function of the field values.
 
     Args:
-        missing: Lua text to append to each value, e.g. `" or 0"` for fields that can be missing.
+        missing: a Lua text that is appended to each value, e.g. `" or 0"` for fields that can be
+            missing.
     """
     return LuaCode(
         "function(v) return"
@@ -132,8 +133,8 @@ def quote_lua(text: str | bytes) -> str:
     )
 
 
-#: Maximum number of fields of an array element for which Wireshark shows their values in the line
-#: of the element.
+#: The maximum number of fields of an array element for which Wireshark shows their values in the
+#: line of the element.
 MAX_SUMMED_FIELDS = 4
 Table = dict[str, Any]
 
@@ -142,10 +143,10 @@ class _TableWriter:
     """Writes the tables of one frame type.
 
     Attributes:
-        prefix: text before the path of a field in Wireshark's filters.
-        kept: paths of the fields that formulas or checksums use.
-        marked: paths of the first and the last part that each checksum covers.
-        types: name of a Wireshark field in filters -> its type family.
+        prefix: the text before the path of a field in Wireshark's filters.
+        kept: the paths of the fields that formulas or checksums use.
+        marked: the paths of the first and the last part that each checksum covers.
+        types: the type family of each Wireshark field, by its name in filters.
     """
 
     def __init__(self, message: ExportedFrame, prefix: str) -> None:
@@ -378,7 +379,7 @@ class _TableWriter:
         }
 
     def _number_entries(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
-        """Return the table entries of a number: unit, scale, labels, limits and fields."""
+        """Return the table entries of a number: unit, scale, labels, limits, ProtoFields."""
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
             "UINT"
         )
@@ -423,7 +424,7 @@ class _TableWriter:
         labels: Any = None,
         mask: int | None = None,
     ) -> LuaCode:
-        """Return Lua code that declares a Wireshark field, and remember its type family.
+        """Return Lua code that declares a Wireshark field, and store its type family.
 
         Wireshark requires the same type family for all fields with one name, so a name that is used
         with another family gets "_" appended.
@@ -566,7 +567,8 @@ def _find_lowest_bit(bits: BitField, size: int, order: str) -> int | None:
     return None
 
 
-#: Wireshark's numbers (wtap) of the link types USER0 to USER15, which are reserved for private use.
+#: The numbers that Wireshark (wtap) uses for the link types USER0 to USER15, which are reserved for
+#: private use.
 USER_LINKS = tuple(range(45, 61))
 
 _HEAD = """\
@@ -663,7 +665,7 @@ def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
 
 
 def _list_patterns(sensor: Sensor) -> dict[str, list[int]]:
-    """Return {name of Wireshark's table: ports or link types of the sensor}."""
+    """Return the ports or link types of a sensor, by the name of Wireshark's table."""
     links = sensor.links.values()
     patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],

@@ -22,19 +22,20 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: records are written when they have this size. The next constant is the maximum time between
-#: writes.
+#: Waiting records are written when they have this size together. The next constant is the maximum
+#: time between two writes.
 FLUSH_BYTES = 1 << 16
 FLUSH_PERIOD_S = 0.2
-#: time between two calls of fsync.
+#: The time between two calls of fsync.
 SYNC_PERIOD_S = 1.0
-#: maximum size of the records that wait for a slow disk. Further records are dropped and counted.
+#: The maximum size of the records that wait for a slow disk. Further records are dropped and
+#: counted.
 MAX_WAITING_BYTES = 1 << 26
-#: maximum time that `sync` and `close` wait for the disk.
+#: The maximum time that `sync` and `close` wait for the disk.
 DISK_TIMEOUT_S = 60.0
 
-#: Takes bytes and an offset, and returns the length of the record at this offset; 0 or less if the
-#: record is not complete.
+#: A function that returns the length of the record at an offset, given bytes and the offset. It
+#: returns 0 or less if the record is not complete.
 Size = Callable[[bytes | bytearray, int], int]
 
 
@@ -43,8 +44,8 @@ class RecordFile:
 
     Args:
         path: the path of the file.
-        size_at: returns the length of a record. After a partial write, the file is truncated after
-            the last complete record. None if records have no borders.
+        size_at: a function that returns the length of a record; None if the file has no records.
+            After a partial write, the file is truncated after the last complete record.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -135,7 +136,7 @@ class RecordFile:
 
 
 class TrafficLog(Protocol):
-    """Interface of recorders: records the data that is received and sent.
+    """The interface of recorders, which record the data that is received and sent.
 
     Attributes:
         error: the error that ended the recording; None if there is no error.
@@ -148,7 +149,7 @@ class TrafficLog(Protocol):
         """Record received or sent data with its time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the line, such as "disconnect" or "reconnect".
+        """Record an event of the connection, such as "disconnect" or "reconnect".
 
         Args:
             at: the time, ns since 1970; by default now.
@@ -171,7 +172,7 @@ class BackgroundWriter:
 
     Args:
         path: the path of the file.
-        size_at: returns the length of a record, as in `RecordFile`.
+        size_at: a function that returns the length of a record, as in `RecordFile`.
         overwrite: whether an existing file may be replaced.
 
     Attributes:
@@ -230,7 +231,7 @@ class BackgroundWriter:
         self._raise_failure()
 
     def wait_for_room(self) -> None:
-        """Wait until more records can be added; for sources that can wait.
+        """Wait until more records can be added. Call this for sources that can wait.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.

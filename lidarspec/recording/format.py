@@ -17,14 +17,13 @@ A recording is a sequence of independent records. The first is the header, in JS
 
 An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "dropped" or "clock". For
 "dropped", the entry "records" is the number of dropped records. "clock" means that the wall clock
-was set; "ahead_ns" is the wall clock minus the arrival times, which continue without a jump.
-Readers skip unknown kinds of records.
+was set. Its entry "ahead_ns" is the wall clock minus the arrival times, which continue without a
+jump. Readers skip unknown kinds of records.
 
 Theory of operation: A length field has one or two bytes, so no record is longer than 66 kB. A
-record is used only if its checksum is valid. The reader keeps a part of the file in memory: one
-record and the rest of the last block. It stops at the first damaged record, or continues with the
-next valid record (`salvage`). If the recording process is killed, the file ends with at most one
-incomplete record.
+record is used only if its checksum is valid. The reader keeps only one record and the rest of the
+last block in memory. It stops at the first damaged record, or continues with the next valid record
+(`salvage`). If the recording process is killed, the file ends with at most one incomplete record.
 
 `Recording.seek` finds a time by bisection, without an index that a crash could destroy. This is
 possible because arrival times never decrease, and because a record can be found from any offset: it
@@ -63,7 +62,7 @@ HEADER, RECEIVED, SENT, EVENT = range(4)
 DATAGRAM = 1
 GAP = 2
 QUIET = 4
-#: maximum number of data bytes in a record.
+#: The maximum number of data bytes in a record.
 MAX_DATA_BYTES = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
 _CRC = struct.Struct("<I")
@@ -85,8 +84,9 @@ class Header:
         source: the SOURCE that was recorded.
         datagrams: whether the data consists of datagrams.
         baud: baud rate of a serial port; None for other sources.
-        versions: name of a distribution -> its version, for lidarspec and the sensor's plugin.
-        created: date and time with the time zone, ISO 8601.
+        versions: the versions of lidarspec and of the sensor's plugin, by the name of the
+            distribution.
+        created: the date and time with the time zone, in ISO 8601.
         wall_ns: wall clock of the recording computer at the start, ns since 1970.
         monotonic_ns: monotonic clock of the recording computer at the start, ns.
         version: version of the format.
@@ -116,8 +116,8 @@ class Header:
             folder: folder of the recording. Only files in this folder are opened for options.
 
         Raises:
-            UsageError: if the header names no sensor, or if the caller must pass an option again,
-                such as a file in another folder.
+            UsageError: if the header names no sensor. Also if a recorded option cannot be used, so
+                that the caller must pass it; an example is a file in another folder.
             UnknownSensor: if the sensor is not installed.
         """
         if not self.sensor:
@@ -180,7 +180,8 @@ class Record:
     """One record of a recording.
 
     Attributes:
-        direction: "in" for received data, "out" for sent data, "event" for an event of the line.
+        direction: "in" for received data, "out" for sent data, "event" for an event of the
+            connection.
         data: the bytes; JSON for an event.
         at: arrival time, ns since 1970; None if unknown.
         sender: address and port of the sender of a datagram; None if unknown.
@@ -255,15 +256,15 @@ class Recording(ClosingContext):
     Args:
         path: the file; "-" is standard input.
         file: the open or decompressed file; it is closed with the recording.
-        salvage: whether to continue with the next valid record after damage, even if the header is
-            damaged, instead of ending there.
+        salvage: True to continue with the next valid record after damage, even if the header is
+            damaged; False to end at the first damage.
 
     Attributes:
         header: the header.
         records: number of valid records so far, including the header and events.
         damaged: number of damaged parts so far, including an incomplete record at the end.
-        leftover: number of bytes in damaged parts; without `salvage`, of all bytes after the last
-            valid record.
+        leftover: the number of bytes in damaged parts; without `salvage`, the number of all bytes
+            after the last valid record.
         is_cut: whether the last damaged part is an incomplete record at the end of the file.
         offset: file offset of the next record, or of the damage that ended the reading.
 
@@ -308,8 +309,8 @@ class Recording(ClosingContext):
             at: ns since 1970.
 
         Returns:
-            False if the position is unchanged, because this record is not further ahead, arrival
-            times are unknown, or the file is a pipe.
+            False if the position is unchanged. This is the case if this record is not further
+            ahead, if arrival times are unknown, or if the file is a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():

@@ -24,7 +24,7 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: description of the error when it was last switched; "" for no error.
+        trouble: a description of the error of the last switching; "" without an error.
         written: (path, number of data bytes) of each closed file.
     """
 
@@ -59,7 +59,7 @@ class RecordingSwitch:
 
     @property
     def recording(self) -> tuple[str, int] | None:
-        """(name, number of data bytes) of the current file; None if there is no file."""
+        """The name and the number of data bytes of the current file; None without a file."""
         current = self._recorder
         if current is None:
             return None
