@@ -80,6 +80,7 @@ class PageMessages:
         broadcast = self.broadcast
         switch = broadcast.switch
         shown = at or broadcast.shown
+        damaged = self._list_damaged(since)
         warnings = list(broadcast.warnings)
         recording = None
         if switch is not None:
@@ -100,7 +101,11 @@ class PageMessages:
             "info": broadcast.info,
             "clock": broadcast.clock,
             "recording": recording,
-            "damaged": {"total": broadcast.backlog.damaged, "newest": self._list_damaged(since)},
+            # The next list begins at this total, so a piece that arrived meanwhile does not count.
+            "damaged": {
+                "total": damaged[-1]["number"] + 1 if damaged else since,
+                "newest": damaged,
+            },
         }
 
     def frame(

@@ -11,6 +11,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.faults import Faults
+from lidarspec_web.page_messages import PageMessages
+from lidarspec_web.recent_bytes import DamagedBytes, RecentBytes
 
 from .pages import FLAT, SOLID, Page, Station, write_recording
 
@@ -221,6 +223,28 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
             assert any(
                 "flipped bit" in note for frame in frames for note in frame["explanation"]["notes"]
             )
+
+
+def test_a_piece_that_arrives_while_a_state_is_made_is_listed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_recording(tmp_path, suffix=".bin", faults=Faults(errors=0.0005))
+    list_damaged = RecentBytes.list_damaged
+
+    def list_after_another(backlog: RecentBytes, number: int) -> list[DamagedBytes]:
+        backlog._keep_damaged(0, 1, 0, b"\0", is_datagram=False)
+        return list_damaged(backlog, number)
+
+    with Station(path, tmp_path, FLAT) as station, station.page() as page:
+        page.say("speed", times=20)
+        page.until("ended")
+        answers = PageMessages(station.broadcast, control=False)
+        monkeypatch.setattr(RecentBytes, "list_damaged", list_after_another)
+        first = answers.state(frozen=False, since=0)["damaged"]
+        second = answers.state(frozen=False, since=first["total"])["damaged"]
+    last = first["newest"][-1]["number"]
+    assert [piece["number"] for piece in second["newest"]] == [last + 1]
+    assert second["total"] == last + 2
 
 
 def test_damage_in_a_file_equals_that_of_explain(tmp_path: Path) -> None:
