@@ -10,6 +10,6 @@ exception. Modules in reading order:
 * `ip`: the payload of a captured frame: link layers, IP, fragments.
 * `pcap`: reads the datagrams of a capture with `records` and `ip`, and makes records to write.
 * `containers`: detects the kind of a file by its first bytes, decompresses files, and refuses
-unsupported kinds.
+  unsupported kinds.
 * `bulk`: reads the datagrams of a capture in batches, as arrays of offsets.
 """

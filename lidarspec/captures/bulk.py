@@ -37,7 +37,7 @@ MAX_HEADER_BYTES = 128
 #: The largest size of a buffer.
 MAX_BUFFER_BYTES = 2 * MAX_BLOCK_BYTES
 _TRAILER_BYTES = 4
-#: In both formats, the first bytes of a record, up to this number, contain its length.
+#: In both formats, the first bytes of a record contain its length. This is their number.
 _MIN_HEAD_BYTES = 16
 #: Consecutive records of equal length are checked together from this number on. For fewer records,
 #: single checks are faster.

@@ -54,7 +54,7 @@ class Packing(NamedTuple):
 
 
 ZIP = Packing("zip", "zipfile", "unzip {}")
-#: The compression format of a file by a pattern of its first bytes.
+#: The compression formats, by a pattern of the first bytes of the file.
 PACKINGS = {
     rb"\x1f\x8b\x08[\x00-\x1f]": Packing("gzip", "gzip", "gunzip -k {}"),
     rb"BZh[1-9]1AY&SY": Packing("bzip2", "bz2", "bunzip2 -k {}"),

@@ -8,10 +8,10 @@ packet contains no datagram.
 Two header fields are ignored, because they can be wrong in valid captures:
 
 * Checksums. If the capturing machine sent the packet itself, its network card computes them after
-the packet was captured.
+  the packet was captured.
 * The length of an unfragmented IP packet, if it is 0 or longer than the frame. It is 0 if the
-network card splits packets, and one lidar model sends the length 1234 in packets of 540 bytes. The
-length in the UDP header decides whether the payload is complete.
+  network card splits packets, and one lidar model sends the length 1234 in packets of 540 bytes.
+  The length in the UDP header decides whether the payload is complete.
 
 Source: RFC 768 (UDP), RFC 791 (IPv4), RFC 8200 (IPv6), RFC 5722 (overlapping fragments), RFC 6946
 (atomic fragments), IEEE 802.1Q (VLAN tags), and the link-layer header types of tcpdump.org.
@@ -55,8 +55,8 @@ _IPV4_ETHERTYPE = 0x0800
 _IPV6_ETHERTYPE = 0x86DD
 #: The smallest EtherType. Smaller values in its field are lengths (802.3).
 _MIN_ETHERTYPE = 0x0600
-#: The values of AF_INET, the same on all systems, and of AF_INET6 on Linux, NetBSD, FreeBSD and
-#: macOS.
+#: The value of AF_INET, which is the same on all systems, and the values of AF_INET6 on Linux,
+#: NetBSD, FreeBSD and macOS.
 _IP_FAMILIES = {2, 10, 24, 28, 30}
 _LOOPBACK_HEADER_BYTES = 4
 

@@ -250,7 +250,7 @@ class PcapRecords:
         )
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a record may begin; None if none.
+        """Return the first offset below `stop` at which a record may begin, or None.
 
         Another record, or the end of the input, must follow the record.
 
@@ -406,7 +406,7 @@ class PcapngBlocks:
         return NoPacketReason.NO_PACKET
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """Return the first offset below `stop` at which a block may begin; None if none.
+        """Return the first offset below `stop` at which a block may begin, or None.
 
         If an interface block was lost, only the start of a section is accepted. Packets refer to
         interfaces by number, so packets before the next section would be assigned to wrong

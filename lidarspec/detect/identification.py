@@ -553,7 +553,7 @@ def _score(
     """Return the score of a sensor; None if the bytes contain no data frame.
 
     Args:
-        sums: computes checksums; None to use the declared algorithms.
+        sums: a function that computes checksums; None to use the declared algorithms.
     """
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)

@@ -86,7 +86,7 @@ def read_samples(
     Args:
         source: the source.
         seconds: the time to listen to a live source, at each baud rate.
-        on_progress: called with a description of the source before each attempt.
+        on_progress: a function that is called with a description of the source before each attempt.
 
     Raises:
         SourceError: if the source cannot be opened, or if it has no baud rate or port and no

@@ -295,7 +295,8 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
 def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | None:
     """Return an earlier field that probably has the start value of `end_field`.
 
-    The value of `end_field` must nearly always be between this and the next start value.
+    The value of `end_field` must nearly always be between the start values of its frame and of the
+    next frame.
     """
     if end_field.kind == "counter":
         return None

@@ -179,7 +179,7 @@ def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
 
 
 def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """Return the share of frames in which `last` is between this and the next `first`.
+    """Return the share of frames with `last` between `first` and the next `first`.
 
     Args:
         first: a field of each frame, (n,).

@@ -222,10 +222,10 @@ class SampleFrames:
         return SampleFrames(self.frames[::step][:number])
 
     def take_similar(self, number: int, pick: int) -> SampleFrames:
-        """Return `number` frames of the most frequent length, and two of other lengths.
+        """Return frames of the most frequent length, and two of each of other lengths.
 
         Args:
-            number: the number of frames, and the maximum number of other lengths.
+            number: the maximum number of frames of the most frequent length, and of other lengths.
             pick: index of the selection. Different indices select different frames.
         """
         largest = max(self.groups, key=len)

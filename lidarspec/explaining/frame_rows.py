@@ -62,7 +62,7 @@ class FrameRows:
         self.after = len(data) if self._is_whole_text else self._end
 
     def _find_array_axes(self) -> list[str]:
-        """Return the paths of all arrays, without byte strings."""
+        """Return the paths of all arrays, except byte strings."""
         axes: list[str] = []
         for info in self._schema.all_fields.values():
             axes += info.axes[:-1] if info.kind == "bytes" else info.axes

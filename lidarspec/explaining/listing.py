@@ -41,7 +41,7 @@ Line = tuple[TextSpan, ...]
 
 
 def join_text(line: Line) -> str:
-    """Return a line without its roles."""
+    """Return the text of a line, without the roles of its spans."""
     return "".join(span.text for span in line).rstrip()
 
 

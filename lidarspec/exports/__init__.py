@@ -112,7 +112,7 @@ class ExportedFrame:
 
     @property
     def seals(self) -> dict[str, tree.Sealed]:
-        """The node of the checksum that a field stores, completely or in part, by path."""
+        """The checksum node of each field that stores a checksum or a part of one."""
         return {
             path: node
             for node in tree.nodes(self.root)

@@ -20,7 +20,7 @@ from lidarspec.spec.links import Link, Udp
 from lidarspec.spec.timing import ClockStatus, PacketCounter, Split
 from lidarspec.spec.wire_forms import WireForm
 
-#: Version of the format. The number changes if a key is removed, or if its meaning changes.
+#: The version of the format. The number changes if a key is removed, or if its meaning changes.
 VERSION = 1
 
 

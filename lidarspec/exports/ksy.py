@@ -171,7 +171,6 @@ def block_type(
     Args:
         doc: a function that returns the documentation of a field.
 
-
     Raises:
         ExportError: for an integer that is too wide for Kaitai.
     """
@@ -262,7 +261,7 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the entry "if" of an attribute, for the instances that use the attribute."""
+    """Return the entry "if" of an attribute for its instances; {} if it has none."""
     if "if" in more:
         return {"if": more["if"]}
     return {}

@@ -1,4 +1,4 @@
-"""Functions that make simple arrays fast, and settings of the memory allocator.
+"""Functions that make simple arrays quickly, and settings of the memory allocator.
 
 The arrays have one repeated value, consecutive numbers, or selected rows of another array.
 """
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: The length of the shared array that `count_up` returns slices of.
+#: The length of an array of which `count_up` returns slices.
 MAX_SHARED_COUNT = 1 << 17
 #: The size in bytes of the block that `keep_freed_memory` allocates. glibc then keeps up to twice
 #: this size of free memory at the end of the heap.

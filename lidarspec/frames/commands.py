@@ -104,13 +104,13 @@ class ArgumentSlot:
 
     Attributes:
         info: the field.
-        room: the size of the field in bytes, or the number of elements of an array; None if it
+        length: the size of the field in bytes, or the number of elements of an array; None if it
             varies.
         in_template: whether the argument is a part of a text.
     """
 
     info: FieldInfo
-    room: int | None
+    length: int | None
     is_array: bool = False
     in_template: bool = False
 
@@ -211,13 +211,13 @@ def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> A
                 sensor=sensor.id,
             )
     if left:
-        room = left[0]
+        length = left[0]
     elif info.kind == "int":
-        room = info.bits // 8
+        length = info.bits // 8
     else:
-        room = None
+        length = None
     return ArgumentSlot(
-        info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes"
+        info, length if isinstance(length, int) else None, bool(left) and info.kind != "bytes"
     )
 
 
@@ -242,10 +242,10 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
         bottom, top = info.limits if info.kind == "int" else (raw, raw)
         return min(max(raw, bottom), top)
     try:
-        data = kind.pack(value, slot.room)
+        data = kind.pack(value, slot.length)
     except ValueError:
         raise UsageError(
-            f"{place}: {argument} must be {kind.words(slot.room)}, not {value!r:.60}"
+            f"{place}: {argument} must be {kind.words(slot.length)}, not {value!r:.60}"
         ) from None
     if info.kind == "other":
         if isinstance(value, bytes):
@@ -304,5 +304,5 @@ def _resolve_filled(
         return given or 0
     slot = _make_slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
-        return _to_raw_value(slot, bytes(slot.room or 4))
+        return _to_raw_value(slot, bytes(slot.length or 4))
     return raw_argument(slot, value, given, path, f"{sensor.id} {name}")

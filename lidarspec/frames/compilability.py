@@ -11,7 +11,10 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """The offset of the part at `path` of a struct cannot be computed, for a `reason`."""
+    """The offset of a part of a struct cannot be computed.
+
+    `path` is the path of the part, and `reason` is a text.
+    """
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path

@@ -42,7 +42,7 @@ class Fault:
     Attributes:
         kind: one of the constants of this module.
         path: the path of the field, with indices.
-        offset: the first byte of the field in the frame.
+        offset: the offset of the first byte of the field in the frame.
         expected: the expected value, as a text or number.
         got: the actual value, as a text or number.
         end: the offset up to which the frame has to be read to find the fault. Faults are ordered

@@ -514,7 +514,7 @@ def fill_counts(given: Container, table: Schema) -> None:
 
 
 def remove_held(formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]) -> None:
-    """Remove the field that a formula depends on, if it is always computed."""
+    """Remove the field that a formula depends on, if this field is always computed."""
     path = None if formula is None else counting_field(formula, fields)
     if path is not None and fields[path].held:
         holder, name = _find_holder(given, path)
@@ -569,7 +569,7 @@ def _find_count(
 ) -> int:
     """Return the value of a count field for which a formula is a given length.
 
-    The field is set to values in turn to find it.
+    To find this value, the field is set to one value after another.
     """
     if info.kind == "int":
         top = int(info.limits[1])

@@ -136,7 +136,7 @@ class HeaderWalk:
     #: replace `values`.
     request: ValueRequest = _raise_unknown
     #: The size of the frame in bytes if the frame is complete; None if more bytes may follow.
-    room: int | None = None
+    frame_size: int | None = None
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
     constants: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -253,7 +253,7 @@ class HeaderWalk:
                 raise NotCompilableError(node.info.path, node.reason)
         if self.cursor > self.limit:
             raise TooLongError(path)
-        if self.room is not None and self.cursor > self.room:
+        if self.frame_size is not None and self.cursor > self.frame_size:
             raise CutOffError(path)
         if path and not shape:
             self.places[path] = (start, self.cursor)

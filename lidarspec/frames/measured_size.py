@@ -54,14 +54,15 @@ class MeasuredSize(ABC):
     ) -> tuple[Offsets | None, NDArray[Any]]:
         """Return sizes as `Leaf.read` does.
 
-        If the content cannot be valid, the size is the negative status.
+        If the content cannot be valid, the size is the status of the frame with a minus sign.
         """
 
     @abstractmethod
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return sizes as `Leaf.load` does.
 
-        If the content is incomplete or invalid, the size is the negative status.
+        If the content is incomplete or invalid, the size is the status of the frame with a minus
+        sign.
         """
 
     def read_first(self, frame: bytes | memoryview) -> int | None:

@@ -514,7 +514,7 @@ class PartsSize(MeasuredSize):
     ) -> tuple[Offsets | None, NDArray[Any]]:
         """Return sizes as `Leaf.read` does.
 
-        If the parts cannot be valid, the size is the negative status.
+        If the parts cannot be valid, the size is the status of the frame with a minus sign.
         """
         walked = self.region.walk(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
@@ -531,7 +531,7 @@ class PartsSize(MeasuredSize):
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         """Return sizes as `Leaf.load` does.
 
-        If not all parts were found, the size is the negative status.
+        If not all parts were found, the size is the status of the frame with a minus sign.
         """
         walked = self.region.find_parts(rows)[1]
         return np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))

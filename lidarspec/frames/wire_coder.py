@@ -1,9 +1,9 @@
 """Convert between encoded frames and the bytes of their structs.
 
 Most frames are sent as the bytes of their struct (`Coder`). A frame type with a wire form
-(`lidarspec.spec.wire_forms`) has a `FormCoder`. The layouts of the struct determine its next
-fields, which the coder passes to the wire form. The coder also describes the fault of bytes that
-are not a valid frame.
+(`lidarspec.spec.wire_forms`) has a `FormCoder`. While a frame is decoded, the coder finds the next
+fields by the layouts of the struct, and passes them to the wire form. The coder also describes the
+fault of bytes that are not a valid frame.
 """
 
 from __future__ import annotations

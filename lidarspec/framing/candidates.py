@@ -288,11 +288,11 @@ class Candidates:
         mode: the search state at the start of the buffer.
         final: whether no more bytes follow, so that incomplete candidates are rejected.
 
-        Attributes:
-            buffer: the bytes to search, shortened if there are too many candidates.
-            is_whole: whether `buffer` was not shortened.
-            checked: the checked candidates of each type that was searched so far, by type index.
-                Types without candidates are left out.
+    Attributes:
+        buffer: the bytes to search, shortened if there are too many candidates.
+        is_whole: whether `buffer` was not shortened.
+        checked: the checked candidates of each type that was searched so far, by type index.
+            Types without candidates are left out.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Fault, get_member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
-#: The number of attempts with random frames: without a declared `sweep` of the sensor, and with
+#: The number of attempts with random frames, for a sensor without a `sweep` and for a sensor with
 #: one. If no random frame is plausible, the `sweep` is used.
 TRIES = 40
 TRIES_BEFORE_SWEEP = 8

@@ -64,7 +64,7 @@ class Codec:
                 default, candidates extend to the end of the buffer, and more bytes may follow.
             kind: the index of this frame type.
             gathered: whether to copy the bytes of candidates to `Frames.rows`.
-            sums: computes checksums; by default the declared algorithms.
+            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         raise NotImplementedError
 

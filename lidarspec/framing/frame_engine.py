@@ -294,7 +294,7 @@ class CompiledCodec(Codec):
         return CompiledTable(self.schema, groups)
 
     def _find_stops(self, frames: Frames) -> NDArray[np.intp] | None:
-        """Return the ends of frames, if their layout depends on them."""
+        """Return the ends of frames; None if layouts do not depend on the end of a frame."""
         if self.frame.endless is None:
             return None
         return np.asarray(frames.starts + frames.sizes)

@@ -2,9 +2,9 @@
 
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
 invalid candidate, the search continues at the next byte. At one offset, the first type in order
-that matches is used. A type with `after` is active depending on the last frame whose type is named
-in any `after`: this frame must be of the type that the type's own `after` names. Frames of a type
-with `confirm` are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
+that matches is used. A type with `after` is active only if its `after` names the type of the last
+frame. For this, frames of a type that no `after` names are ignored. Frames of a type with `confirm`
+are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
 
 All candidates of a piece are checked together, and accepted together up to the next conflict or
 frame that changes the active types. The time is therefore linear in the size of the input for any

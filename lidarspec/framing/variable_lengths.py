@@ -9,8 +9,8 @@ finds such layouts. Their candidates become the rows of one array, and bytes aft
 candidate are ignored: for a checksum, they are replaced by zeros, which do not change a checksum in
 `ZERO_EXTENDED`. A test ignores elements after the end.
 
-The results are the same as those of `plausibility.CandidateChecker`. It also does all tests that
-are not a lookup of one or two bytes.
+The results are the same as those of `plausibility.CandidateChecker`. That class also does all tests
+that are not a lookup of one or two bytes.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class JointChecker:
         Args:
             offsets: the offset of each candidate, (k,).
             forms: the index of each candidate's layout, (k,).
-            sums: computes checksums; by default the declared algorithms.
+            sums: a function that computes checksums; by default the declared algorithms are used.
         """
         status = np.empty(len(offsets), np.uint8)
         sizes = self._sizes[forms]

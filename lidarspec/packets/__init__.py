@@ -9,7 +9,7 @@ that the packets need are kept with them. Modules in reading order:
 * `pace`: the declared time from one packet to the next.
 * `returns`: finds the returns of the same firings in consecutive packets.
 * `counter_order`: finds lost, duplicate and late packets by their counter.
-* `clock_order`: finds them by the clock, for datagrams without a counter.
+* `clock_order`: finds such packets by the clock, for datagrams without a counter.
 * `arrival_order`: counts losses among packets that have no counter and always arrive in order.
 * `masked_sector`: finds sectors in which a rotating sensor sends nothing on purpose.
 * `reorder`: sorts packets and drops duplicates.
@@ -17,7 +17,7 @@ that the packets need are kept with them. Modules in reading order:
 * `packet_type`: the clock and the loss detection of one frame type.
 * `stream`: makes packets from frames, batch by batch.
 * `clock_status`: the state of the sensor's clock at each packet.
-* `clock_estimate`: offset and drift between the sensor's clock and the host's.
+* `clock_estimate`: the offset and the drift between the clocks of sensor and host.
 * `clock_findings`: the faults of a clock: a code for each, its text and the next step.
 * `clock_monitor`: finds the epoch, offset, drift and faults of a clock.
 * `utc_times`: the times of packets in UTC.

@@ -1,10 +1,10 @@
-"""Conversion of a sensor's clock to the clock of the host, by the arrival times of packets.
+"""Convert the times of a sensor to times of the host, by the arrival of packets.
 
 The sensor's time has an arbitrary start, runs fast or slow by some millionths, and may restart. The
-arrival time, by the host's clock, has the correct rate, but is late by some milliseconds. This
-varies from packet to packet with the line and the operating system. A packet is never early.
+arrival time, by the host's clock, has the correct rate, but is late by some milliseconds, which
+vary from packet to packet with the line and the operating system. A packet is never early.
 
-In this module, the delay of a packet is its arrival time minus its sensor's time. Over the sensor's
+In this module, the delay of a packet is its arrival time minus the sensor's time. Over the sensor's
 time, all delays lie above a line, and many lie close to it. This is the line of packets that arrive
 at once. Its height is the offset between the clocks, and its slope is the drift.
 
@@ -15,8 +15,9 @@ between the slopes of the hull shortly before and after the middle, the previous
 because the delays do not determine a better one. If the line changes, the delays of stamps approach
 it smoothly.
 
-The clock was set in two cases: several consecutive samples are far below the line, or all samples
-of a second are far above it, by much more than their delays differ from each other.
+A change of the clock is detected in two cases: several consecutive samples are far below the line,
+or all samples of a second are far above the line, by much more than their delays differ from each
+other.
 
 Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
 measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
@@ -98,7 +99,7 @@ class ClockJump(NamedTuple):
 
 
 class DeviceClock:
-    """Conversion of the times of a sensor to those of the host.
+    """Converts the times of a sensor to times of the host.
 
     A constant delay looks the same as an offset. The results are therefore late by the shortest
     time that a packet needs in the sensor and on the line to the host.

@@ -1,4 +1,4 @@
-"""Read the status that a sensor sends of its clock (`spec.timing.ClockStatus`)."""
+"""Read the clock status that a sensor sends (`spec.timing.ClockStatus`)."""
 
 from __future__ import annotations
 

@@ -219,7 +219,8 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
     """Return the rows of packets that have a clock reading, and the readings in ns.
 
     The rows are None if all packets have a reading. If the parts of a frame have the clock, this is
-    the reading of the first part. A frame whose header leaves out a field of the clock has none.
+    the reading of the first part. A frame whose header leaves out a field of the clock has no
+    reading.
     """
     assert sensor.clock is not None
     fields = clock_fields(sensor.clock)

@@ -136,7 +136,7 @@ def read_samples(
 
 
 class WaitingSamples:
-    """A buffer of IMU samples until the scan that they belong to has ended.
+    """A buffer that keeps IMU samples until the scan that they belong to has ended.
 
     A scan has the samples from its first point to the first point of the next scan. The first scan
     also has all earlier samples.

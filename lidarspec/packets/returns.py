@@ -170,7 +170,8 @@ def _place_by_return_index(
     The positions of a group stay the same if the return index does not distinguish its packets.
 
     Args:
-        members: the group of each packet, its place, and the size of the group, (n,).
+        members: for each packet, its group, its position in the group, and the size of the group,
+            (n,).
         numbers: the return index of the points of each packet, (n, points).
     """
     groups, places, sizes = members
@@ -193,7 +194,8 @@ def _join_packets(
     """Return the indices of points in groups of packets, (groups, *shape, returns).
 
     Args:
-        members: the group of each packet, its place, and the size of the group, (n,).
+        members: for each packet, its group, its position in the group, and the size of the group,
+            (n,).
         shape: the shape of the points of each packet.
     """
     groups, places, sizes = members
@@ -241,7 +243,10 @@ def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
 
 
 def _gather(cloud: PointCloud, indices: NDArray[np.intp]) -> NDArray[Any]:
-    """Return a structured array of the points at some indices; `MISSING` is not valid."""
+    """Return a structured array of the points at some indices.
+
+    The point at the index `MISSING` is not valid.
+    """
     columns = {**cloud.columns, "valid": cloud.valid}
     is_missing = indices == MISSING
     kinds = [(name, column.dtype) for name, column in columns.items()]

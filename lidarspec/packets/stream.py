@@ -336,10 +336,10 @@ class ImuStream:
         backend: the back end that computes points, see `PacketStream`.
         state: frames of other types, by name, see `PacketStream`.
 
-        Attributes:
-            waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if
-                their times cannot be compared with the times of points, because only some of the
-                frame types have a clock.
+    Attributes:
+        waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if
+            their times cannot be compared with the times of points, because only some of the
+            frame types have a clock.
     """
 
     def __init__(

@@ -5,7 +5,7 @@ no column; their returns have the same time and ring. Several points with one re
 ring belong to successive firings: the first point with return index 0 and the first with return
 index 1 are the first firing.
 
-A firing may lack a return: it was not sent, or its packet is lost.
+A return of a firing may be missing, because it was not sent, or because its packet is lost.
 """
 
 from __future__ import annotations

@@ -82,7 +82,8 @@ class ColumnMaker(Protocol):
 
         Args:
             rows: the frames, (n, size), evenly spaced in memory.
-            values: returns the value of a node by the reference evaluator, shape (n or 1, ...).
+            values: a function that returns the value of a node by the reference evaluator, (n or 1,
+                ...).
             columns: the arrays to fill, flat and contiguous, as `columns` returns them.
         """
 
@@ -99,8 +100,8 @@ class Plan:
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
-        sent: the columns in `extra` that contain the raw integers of a field: the field by the name
-            of the column.
+        sent: for each column in `extra` that contains the raw integers of a field, this field, by
+            the name of the column.
         exact: whether coordinates and range are computed in float64 in the order in which they are
             written. All other columns are always computed in this way.
         positive: nodes whose values have to be positive numbers for the plan to be valid.
@@ -305,7 +306,7 @@ class Plan:
         If so, the coordinates of a point are either all nan or all finite.
 
         Args:
-            values: returns the value of a node for the batch.
+            values: a function that returns the value of a node for the batch.
         """
         if not self._may_be_safe:
             return False

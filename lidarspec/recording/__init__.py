@@ -5,8 +5,8 @@ the records of a file. Modules in reading order:
 
 * `format`: reads and writes the bytes of .lsr files; damaged files can be read as well.
 * `recorders`: a recorder for each suffix: .lsr for all data, .pcap and .pcapng for Wireshark, .bin
-for raw bytes.
+  for raw bytes.
 * `recorder_switch`: a recorder that can be switched on and off while a source is read.
 * `background_writer`: writes complete records in a thread, so that a slow disk does not delay
-reading.
+  reading.
 """

@@ -40,7 +40,7 @@ Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
-    """A new file. An existing file with the same path is kept until `settle`.
+    """A new file. Until `settle` is called, an existing file with its path is kept.
 
     Args:
         path: the path of the file.

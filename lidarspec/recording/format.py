@@ -5,13 +5,13 @@ A recording is a sequence of independent records. The first is the header, in JS
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
-    5       1     flags: 1 a datagram, 2 the line was interrupted before it,
-                  4 the line was silent before it
-    6       1     a, bytes of addresses
-    7       2     n, bytes of data
-    9       8     arrival time, ns since 1970, signed; the lowest number: unknown
-    17      a     sender, receiver: each a length byte, that many bytes of address,
-                  and, if there are any, the port in 2 bytes
+    5       1     flags: 1 if the data is a datagram, 2 if the line was interrupted
+                  before it, 4 if the line was silent before it
+    6       1     a, the size of the addresses
+    7       2     n, the size of the data
+    9       8     arrival time, ns since 1970, signed; the lowest number if unknown
+    17      a     sender, then receiver: each is a length byte, an address of this
+                  length, and, if the length is not 0, the port in 2 bytes
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 

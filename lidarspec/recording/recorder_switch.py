@@ -25,7 +25,7 @@ class RecordingSwitch:
 
     Attributes:
         trouble: a description of the error of the last switching; "" without an error.
-        written: (path, number of data bytes) of each closed file.
+        written: the path and the number of data bytes of each closed file.
     """
 
     def __init__(self, source: str, folder: Path) -> None:

@@ -175,10 +175,10 @@ class PcapRecorder(BackgroundWriter):
 
 
 class FrameRecorder(BackgroundWriter):
-    """Writes a byte stream as a capture with a packet for each frame, link type USER0.
+    """Writes a byte stream as a capture with a packet for each frame.
 
-    Bytes outside frames become packets as well, so that the file contains all received bytes in
-    order.
+    The link type is USER0. Bytes outside frames become packets as well, so that the file contains
+    all received bytes in order.
 
     Args:
         path: the file.

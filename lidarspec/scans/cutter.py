@@ -21,7 +21,7 @@ from lidarspec.scans.scan_ends import EndFinder, ScanEnd, first_points
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
-#: The number of packets that are searched together for one that exceeds the limits.
+#: The number of packets that are searched together for one with which the scan exceeds its limits.
 SEARCHED_PACKETS = 1024
 
 

@@ -1,9 +1,9 @@
 """Find the masked sector of a rotating sensor, and mark the packets at it.
 
 The sector is found in the first revolutions of a stream. Packets are released at once until the
-angle leaps. They are then held until the leap recurs one revolution later, or until packets of all
-angles have arrived. The first scans are therefore cut in the same way as all others. No packets are
-held after a whole revolution without a leap, or after a sector was found.
+angle leaps. The following packets are held until the leap recurs one revolution later, or until
+packets of all angles have arrived. The first scans are therefore cut in the same way as all others.
+No packets are held after a whole revolution without a leap, or after a sector was found.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from lidarspec.packets.masked_sector import JITTER
 
 Floats = NDArray[np.float64]
 
-#: An angle has to move away this far, in turns, before it can pass again.
+#: An angle has to move away this far from the given angle, in turns, before it can pass it again.
 MIN_TURNS_AWAY = 1 / 8
 #: The direction of rotation reverses when the angle has moved back this far, in turns.
 REVERSAL_TURNS = 0.5
@@ -28,8 +28,8 @@ FIRST_CHUNK_ROWS = 64
 class Rotation:
     """Finds the direction in which an angle rotates.
 
-    The direction reverses when the angle has moved back far enough. The first direction is the
-    direction of all steps so far.
+    At first, the direction is the one from the start to the current angle. After half a turn, it
+    only reverses when the angle has moved back by half a turn.
     """
 
     def __init__(self) -> None:

@@ -48,10 +48,10 @@ def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
         case Range(low, high):
             return low + share * (high - low)
         case Text(size):
-            return "x" * round(share * min(size, slot.room or size))
+            return "x" * round(share * min(size, slot.length or size))
         case Address():
-            return str(ip_address(bytes([round(share * 255)] * (slot.room or 4))))
-    return bytes(range(slot.room or round(share * 16)))
+            return str(ip_address(bytes([round(share * 255)] * (slot.length or 4))))
+    return bytes(range(slot.length or round(share * 16)))
 
 
 def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:

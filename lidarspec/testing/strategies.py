@@ -181,13 +181,13 @@ def _argument_values(slot: ArgumentSlot, kind: Taken) -> SearchStrategy[Any]:
         case Text(size) if slot.in_template:
             return st.text("abcXYZ019_.-", max_size=size)
         case Text(size):
-            longest = min(size, slot.room or size)
+            longest = min(size, slot.length or size)
             return st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=longest)
         case Address():
-            return _addresses(6 if slot.room == 16 else 4)
-    if slot.room is None:
+            return _addresses(6 if slot.length == 16 else 4)
+    if slot.length is None:
         return st.binary(max_size=MAX_OCTETS)
-    return st.binary(min_size=slot.room, max_size=slot.room)
+    return st.binary(min_size=slot.length, max_size=slot.length)
 
 
 @st.composite

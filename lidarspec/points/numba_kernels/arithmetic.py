@@ -49,7 +49,7 @@ def compile_kernel(stored, signature, **options):
     """Return a decorator that compiles a kernel, or loads its stored code.
 
     Args:
-        stored: loads and saves the compiled code.
+        stored: an object that loads and saves the compiled code.
         signature: the types of the arguments.
         options: further options of Numba.
     """

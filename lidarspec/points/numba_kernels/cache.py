@@ -190,5 +190,5 @@ def _write(path: Path, data: bytes) -> None:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Issue a warning with a text, once per text in a run of the program."""
+    """Issue a warning. Each text is issued only once in a run of the program."""
     warnings.warn(text, stacklevel=2)

@@ -24,7 +24,8 @@ from lidarspec.points.numba_kernels.kernels import compile_source, import_numba
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 
-#: The tables of a layout are made from this number of frames on; smaller batches are left to NumPy.
+#: The tables of a layout are made after this number of frames. The next constant is the size of the
+#: smallest batch that uses them; NumPy computes smaller batches.
 MIN_FRAMES_SEEN = 4096
 MIN_BATCH_FRAMES = 64
 #: The largest number of covered bytes whose tables fit in the fastest caches.

@@ -44,7 +44,7 @@ class ProgramRun:
 
     Attributes:
         rows: the frames, (n, size).
-        values: returns the value of a node for the batch, (n or 1, ...).
+        values: a function that returns the value of a node for the batch, (n or 1, ...).
         views: the array of each register for the current chunk.
         start: the first packet of the current chunk.
         stop: the packet after the current chunk.
