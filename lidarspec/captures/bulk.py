@@ -96,13 +96,13 @@ class RecordKind:
                 at = np.empty(0, np.int64)
             matches[same] = True if some is None else some
             return matches, at
-        heads = _windows(storage, starts, self.value.nbytes)
+        heads = _gather_windows(storage, starts, self.value.nbytes)
         differs = heads.view(np.uint64) ^ self.value
         differs &= self.mask
         at, good = self.times.ns(heads)
         if self.trailer is not None:
             ends = (
-                _windows(storage, starts + (self.length - _TRAILER_BYTES), _TRAILER_BYTES)
+                _gather_windows(storage, starts + (self.length - _TRAILER_BYTES), _TRAILER_BYTES)
                 .view(self.trailer)
                 .ravel()
             )
@@ -207,7 +207,7 @@ def _count_equal_lengths(
     return count
 
 
-def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
+def _gather_windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
     """Return the `width` bytes after each start, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray(
         (len(storage) - width + 1,), f"V{width}", storage, 0, (1,)
@@ -415,7 +415,7 @@ class _RecordBlock:
     def batch(self) -> CapturedDatagrams:
         """Return the datagrams of these records."""
         if self._only is not None and not self._singles:
-            return self._uniform(self._only)
+            return self._make_uniform_batch(self._only)
         matched = np.flatnonzero(self._kinds >= 0)
         self._reader.stats.packets += len(matched) - self._matched_singles
         kinds = self._kinds[matched]
@@ -442,7 +442,7 @@ class _RecordBlock:
             buffer, columns[0], columns[1], columns[2], columns[3], tuple(names)
         )
 
-    def _uniform(self, kind: RecordKind) -> CapturedDatagrams:
+    def _make_uniform_batch(self, kind: RecordKind) -> CapturedDatagrams:
         """Return the batch if all records are of one kind."""
         number = len(self._at)
         self._reader.stats.packets += number - self._matched_singles

@@ -138,7 +138,7 @@ class UnpackedFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         room = min(len(buffer), self._step)
         count = 0
-        while count < room and (data := self._next(room - count)):
+        while count < room and (data := self._read_some(room - count)):
             buffer[count : count + len(data)] = data
             count += len(data)
         return count
@@ -150,7 +150,7 @@ class UnpackedFile(io.RawIOBase):
                 self._packed.close()
         super().close()
 
-    def _next(self, size: int) -> bytes:
+    def _read_some(self, size: int) -> bytes:
         if self.damage is not None:
             return b""
         try:
@@ -217,7 +217,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         if packing is None:
             break
         if packing is ZIP:
-            content = _of_archive(name, file, member)
+            content = _open_archive_member(name, file, member)
             member = ""
         else:
             content = import_library(packing.module, "zstd").open(file)
@@ -233,7 +233,7 @@ def _packing(start: bytes) -> Packing | None:
     )
 
 
-def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
+def _open_archive_member(name: str, file: BinaryIO, member: str) -> Any:
     """Open one file of a zip archive."""
     if not file.seekable():
         raise SourceError(

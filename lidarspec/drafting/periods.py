@@ -84,7 +84,7 @@ MAX_SYNC_PAIRS = 32
 #: The smallest number of frames of a structure.
 MIN_FRAMES = 3
 #: A structure is rejected if the probability that random bytes have it is higher than this.
-MAX_CHANCE = 1e-3
+MAX_CHANCE_PROBABILITY = 1e-3
 #: The length field must begin before this offset.
 MAX_LENGTH_FIELD_OFFSET = 8
 #: The maximum size of the elements that a length field counts, in bytes.
@@ -556,7 +556,7 @@ def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period:
         return False
     log_chance = constant_count - expected - constant_count * math.log(constant_count / expected)
     periods = min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES)
-    return math.log(periods) + log_chance > math.log(MAX_CHANCE)
+    return math.log(periods) + log_chance > math.log(MAX_CHANCE_PROBABILITY)
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:

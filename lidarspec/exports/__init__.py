@@ -88,13 +88,16 @@ def export(sensor: Sensor, kind: str) -> str:
         raise UnknownExport(kind, EXPORTS)
     module, _, function = EXPORTS[kind].partition(":")
     plain = replace(
-        sensor, vendor=_line(sensor.vendor), model=_line(sensor.model), source=_line(sensor.source)
+        sensor,
+        vendor=_make_line(sensor.vendor),
+        model=_make_line(sensor.model),
+        source=_make_line(sensor.source),
     )
     text: str = getattr(importlib.import_module(module), function)(plain)
     return text
 
 
-def _line(text: str) -> str:
+def _make_line(text: str) -> str:
     """Return a text as one printable line for a heading, comment or string.
 
     Each export escapes its own special characters.

@@ -17,7 +17,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: The name of each column in the standard.
-NAMES = {
+FIELD_NAMES = {
     **{
         "x": "cartesianX",
         "y": "cartesianY",
@@ -34,13 +34,13 @@ NAMES = {
 }
 #: The limits in the header, by group: the beginning of a limit's name, and its field in the
 #: standard.
-LIMITS = {
+LIMITS_BY_GROUP = {
     "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
     "intensityLimits": {"intensity": "intensity"},
     "indexBounds": {"row": "rowIndex", "column": "columnIndex", "return": "returnIndex"},
 }
 #: The standard's value for a point without valid coordinates.
-INVALID = 2
+INVALID_COORDINATES = 2
 #: The prefix and URL of the extension that contains the additional columns.
 PREFIX = "lidarspec"
 EXTENSION = "urn:lidarspec:columns"
@@ -70,7 +70,9 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             files.callback(file.image_file.cancel)
             file.image_file.extensionsAdd(PREFIX, EXTENSION)
             for number, scan in enumerate(scans):
-                own = select_columns(scan, (*NAMES, *scan.points.extra), every_point=every_point)
+                own = select_columns(
+                    scan, (*FIELD_NAMES, *scan.points.extra), every_point=every_point
+                )
                 _add_scan(libe57, file, _make_header(number, scan), _convert_columns(own))
             file.close()
         except libe57.E57Exception as error:  # the library omits the text of system errors
@@ -103,11 +105,12 @@ def _add_scan(
 def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return the columns with the names of the standard, converted to supported types."""
     invalid = ~own["valid"]
-    columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
-    columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
+    columns = {FIELD_NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
+    columns["cartesianInvalidState"] = invalid * np.uint8(INVALID_COORDINATES)
     if invalid.any():
         columns |= {
-            name: np.where(invalid, 0, columns[name]) for name in (NAMES[axis] for axis in "xyz")
+            name: np.where(invalid, 0, columns[name])
+            for name in (FIELD_NAMES[axis] for axis in "xyz")
         }
     if "returnIndex" in columns:
         columns["returnCount"] = np.full(
@@ -149,7 +152,7 @@ def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
             if field in columns
             for end, extreme in (("Minimum", np.fmin), ("Maximum", np.fmax))
         }
-        for group, names in LIMITS.items()
+        for group, names in LIMITS_BY_GROUP.items()
         if columns.keys() & names.values()
     }
 

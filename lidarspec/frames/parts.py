@@ -44,7 +44,7 @@ FAILED = 4
 MAX_COLUMN_BITS = 63
 
 #: The announced size of a part if no field outside the part declares it.
-ANY = -1
+ANY_SIZE = -1
 
 
 class LayoutLookup(Protocol):
@@ -257,7 +257,7 @@ class _PartWalk:
             self._room = room
         else:
             self._room = min(room, rule.within)
-        self._announced = np.full(len(starts), ANY if rule.size is None else rule.size)
+        self._announced = np.full(len(starts), ANY_SIZE if rule.size is None else rule.size)
         self._status = np.zeros(len(starts), np.uint8)
         self._errors = list[PluginError]()
 
@@ -377,7 +377,7 @@ class _PartWalk:
         announced = self._announced[which]
         wrong = (ends - self._starts[which] > self._room) | (layout.size == 0)
         cut_off = ends > (len(self._buffer) if self._stops is None else self._stops[which])
-        other = (announced != ANY) & (announced != layout.size)
+        other = (announced != ANY_SIZE) & (announced != layout.size)
         if not (np.count_nonzero(wrong) or np.count_nonzero(cut_off) or np.count_nonzero(other)):
             return which
         self._status[which] = np.where(
@@ -393,7 +393,7 @@ class _PartWalk:
         self._ends[which] = offsets + layout.size
         if kind.node.until is not None:
             is_last = self._evaluate_all(kind, layout, kind.node.until, offsets)
-            self._announced[which] = np.where(is_last == 0, ANY, 0)
+            self._announced[which] = np.where(is_last == 0, ANY_SIZE, 0)
             self._status[which[is_last < 0]] = FAILED
             return
         if formula is None:

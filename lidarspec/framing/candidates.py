@@ -27,7 +27,7 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.arrays import repeat
 from lidarspec.frames.layout import Marks, Sums, merge_constants
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
+from lidarspec.framing.results import CONSTANT, COUNTERS_BY_STATUS, PLUGIN, SHORT, VALID, Frames
 from lidarspec.framing.weak_frames import WeakRuns, find_runs
 
 #: The maximum number of candidates of one type in a piece. A piece with more candidates is
@@ -94,7 +94,7 @@ class PieceResult:
             errors: the exceptions that plugin code has raised.
         """
         for reason, number in enumerate(numbers):
-            name = COUNTED.get(reason)
+            name = COUNTERS_BY_STATUS.get(reason)
             if number and name:
                 self.rejected[name] = self.rejected.get(name, 0) + number
                 if reason == PLUGIN:

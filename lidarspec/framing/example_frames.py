@@ -44,16 +44,16 @@ from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
 #: The number of attempts with random frames, for a sensor without a `sweep` and for a sensor with
 #: one. If no random frame is plausible, the `sweep` is used.
-TRIES = 40
-TRIES_BEFORE_SWEEP = 8
-#: The first attempt makes one random frame. Each further attempt makes `GROWTH` times as many
+MAX_TRIES = 40
+MAX_TRIES_BEFORE_SWEEP = 8
+#: The first attempt makes one random frame. Each further attempt makes `BATCH_GROWTH` times as many
 #: frames as the previous one, at most `LARGEST_BATCH`.
-GROWTH = 4
+BATCH_GROWTH = 4
 LARGEST_BATCH = 64
 #: The maximum size of a batch in bytes, unless it has only one frame.
 BATCH_BYTES = 1 << 22
 #: The number of random headers that are tried.
-HEADERS = 400
+MAX_HEADERS = 400
 #: Numbers up to these limits are drawn more often, because most counts and keys are low.
 LOW_NUMBERS = (8, 40)
 #: The probability of drawing a label or the key of a switch for a header field, and the maximum
@@ -101,7 +101,7 @@ def random_row(
     frame: str,
     source: random.Random,
     drawn: Drawn = NOTHING,
-    tries: int = TRIES,
+    tries: int = MAX_TRIES,
 ) -> tuple[Layout, NDArray[np.uint8]]:
     """Return the layout of a random header, and a valid struct with it, (size,).
 
@@ -116,10 +116,12 @@ def random_row(
     engine = get_codec(sensor.frames[frame])
     random_tries = tries
     if sensor.simulation_of(frame).sweep is not None:
-        random_tries = min(tries, TRIES_BEFORE_SWEEP)
+        random_tries = min(tries, MAX_TRIES_BEFORE_SWEEP)
     for attempt in range(random_tries):
         layout, chosen = make_random_header(engine, source, drawn)
-        number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
+        number = min(
+            BATCH_GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1)
+        )
         rows = _make_random_rows(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
         rows = _fill_headers(rows, layout, chosen)
@@ -144,7 +146,7 @@ def make_random_header(
         SpecError: if hundreds of random headers lead to no layout.
     """
     keys = sorted(switch_keys(engine.frame.tree))
-    for _ in range(HEADERS):
+    for _ in range(MAX_HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _draw_header(engine.frame, source, drawn, keys)
     raise SpecError("no example found: no random header leads to a frame within max_length")
@@ -232,7 +234,7 @@ def make_of_values(
     frame: str,
     source: random.Random,
     drawn: Drawn,
-    tries: int = LARGEST_BATCH * TRIES,
+    tries: int = LARGEST_BATCH * MAX_TRIES,
 ) -> bytes:
     """Return a valid frame after drawing its values one by one.
 

@@ -38,7 +38,7 @@ from lidarspec.spec.description import Frame
 
 #: The number of bytes of candidates that are checked together, so that memory is limited for any
 #: input.
-BLOCK = 1 << 19
+MAX_BATCH_BYTES = 1 << 19
 
 
 class CompiledCodec(Codec):
@@ -229,7 +229,7 @@ class CompiledCodec(Codec):
         own = offsets if count == number else offsets[whole]
         gathered = gathered and (count == number or bool(whole[:count].all()))
         check = self.make_checker(layout)
-        step = max(BLOCK // layout.size, 1)
+        step = max(MAX_BATCH_BYTES // layout.size, 1)
         kept = None
         if count <= step or not gathered:
             rows = gather_rows(buffer, own, layout.size, gathered=gathered)

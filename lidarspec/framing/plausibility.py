@@ -55,11 +55,11 @@ from lidarspec.spec.tree import FieldInfo
 
 #: The maximum number of allowed values that bits are compared with. If more values are allowed, a
 #: table is used.
-ALLOWED = 2
+MAX_COMPARED_VALUES = 2
 
 #: The status of a frame for each status of its parts: `parts.FOUND`, `CUT_OFF`, `LENGTH`,
 #: `CONSTANT`, `FAILED`.
-OF_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
+STATUS_BY_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
@@ -188,7 +188,7 @@ def _check_parts(
 ) -> NDArray[np.uint8]:
     """Check the parts of each frame, and return its status, (n,)."""
     buffer, walked = region.find_parts(rows)
-    status = OF_PARTS[walked.status]
+    status = STATUS_BY_PARTS[walked.status]
     errors += walked.errors
     for piece in (piece for pieces in walked.rounds for piece in pieces):
         parts = gather_rows(buffer, piece.offsets, piece.layout.size)
@@ -466,7 +466,7 @@ def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
         if bit < len(listed) and (listed != listed[values ^ bit]).any()
     )
     allowed = np.unique(values[listed] & mask).tolist()
-    if 0 < len(allowed) <= ALLOWED:
+    if 0 < len(allowed) <= MAX_COMPARED_VALUES:
         return (mask, tuple(allowed))
     return None
 

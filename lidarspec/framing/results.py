@@ -42,10 +42,10 @@ MAX_UNSORTED_LAYOUTS = 16
 MAX_UNCOUNTED_LAYOUTS = 4
 
 #: The number of bytes that the repr of a frame shows.
-REPR_BYTES = 8
+MAX_REPR_BYTES = 8
 
 #: The counter for each status of a rejected candidate.
-COUNTED = {
+COUNTERS_BY_STATUS = {
     SHORT: "bad_length",
     LENGTH: "bad_length",
     CHECKSUM: "bad_checksum",
@@ -189,7 +189,7 @@ class Found:
     gap: int = 0
 
     def __repr__(self) -> str:
-        begin = f"{self.data[:REPR_BYTES].hex(' ')}{' ...' * (len(self.data) > REPR_BYTES)}"
+        begin = f"{self.data[:MAX_REPR_BYTES].hex(' ')}{' ...' * (len(self.data) > MAX_REPR_BYTES)}"
         return f"Found({self.frame} at byte {self.offset}, {len(self.data)} bytes: {begin})"
 
 
@@ -336,7 +336,7 @@ class Frames:
             places = starts
         else:
             places = _select(self.places, which)
-        return self._with(**chosen, rows=rows, _starts=starts, places=places)
+        return self._replace(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
         """Return pairs of a layout and the indices of its frames, (k,).
@@ -372,10 +372,10 @@ class Frames:
         Gathered rows replace the buffer, so that the memory of the buffer can be freed.
         """
         if self.rows is None or isinstance(self._starts, range):
-            return self._with(names=names, places=places, gaps=gaps, at=at)
+            return self._replace(names=names, places=places, gaps=gaps, at=at)
         number, size = self.rows.shape
         starts = range(0, number * size, size)
-        return self._with(
+        return self._replace(
             names=names,
             places=places,
             gaps=gaps,
@@ -386,9 +386,9 @@ class Frames:
 
     def with_arrivals(self, at: NDArray[np.int64]) -> Frames:
         """Return these frames with other arrival times, (n,) ns."""
-        return self._with(at=at)
+        return self._replace(at=at)
 
-    def _with(self, **changes: Any) -> Frames:
+    def _replace(self, **changes: Any) -> Frames:
         changed = object.__new__(Frames)
         vars(changed).update(vars(self), **changes)
         for name in ("starts", "offsets", "is_sound"):

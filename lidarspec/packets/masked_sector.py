@@ -28,17 +28,17 @@ Angles = NDArray[np.float64]
 #: A whole turn in each unit of angles.
 FULL_TURNS = {"deg": 360.0, "rad": 2 * np.pi}
 #: The number of equal parts of a turn. A part is marked if a packet has begun in it.
-BINS = 360
+ANGLE_BINS = 360
 #: The minimum width of a masked sector, in turns.
-MIN_WIDTH = 1 / 36
+MIN_WIDTH_TURNS = 1 / 36
 #: The minimum width of a masked sector, in steps from packet to packet.
 MIN_WIDTH_STEPS = 4
 #: The variation of the edges of a gap, in steps from packet to packet.
 EDGE_STEPS = 1.25
 #: A step back by less than this, in turns, is jitter of the angle.
-JITTER = 1 / 200
+MAX_JITTER_TURNS = 1 / 200
 #: Two gaps belong to one sector if they overlap by more than this share of the wider gap.
-COMMON_SHARE = 0.5
+MIN_COMMON_SHARE = 0.5
 #: The number of earlier gaps that a new gap is compared with.
 REMEMBERED_GAPS = 16
 #: The number of packets in the gap of a masked sector may vary by this number, because packets do
@@ -92,10 +92,10 @@ class Sector:
 def forward_step(step: float, direction: int) -> float:
     """Return a step, measured in the direction of rotation, in turns from 0 to 1.
 
-    A step back by less than `JITTER` counts as 0.
+    A step back by less than `MAX_JITTER_TURNS` counts as 0.
     """
     ahead = (direction * step) % 1
-    if ahead > 1 - JITTER:
+    if ahead > 1 - MAX_JITTER_TURNS:
         return 0.0
     return ahead
 
@@ -177,13 +177,13 @@ class SectorFinder:
     def __init__(self, direction: int) -> None:
         self.direction = direction
         self.sector: Sector | None = None
-        self._seen = np.zeros(BINS, np.bool_)
+        self._seen = np.zeros(ANGLE_BINS, np.bool_)
         self._gaps = list[Sector]()
 
     def add_angles(self, angles: Angles) -> None:
         """Record that packets came from some angles."""
         if self.sector is None:
-            self._seen[(angles * BINS).astype(np.intp) % BINS] = True
+            self._seen[(angles * ANGLE_BINS).astype(np.intp) % ANGLE_BINS] = True
 
     def add_gap(self, start: float, stop: float, step: float) -> list[int]:
         """Compare a gap with earlier gaps, and set `sector` if it recurs.
@@ -201,7 +201,7 @@ class SectorFinder:
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
             common = gap.common(other)
-            is_same = common is not None and common.width > COMMON_SHARE * max(
+            is_same = common is not None and common.width > MIN_COMMON_SHARE * max(
                 gap.width, other.width
             )
             if common is not None and is_same and self._is_unseen(common, step):
@@ -224,13 +224,13 @@ class SectorFinder:
 
         False if the sector is so narrow that packets need not begin in it.
         """
-        edge = EDGE_STEPS * step + 1 / BINS
+        edge = EDGE_STEPS * step + 1 / ANGLE_BINS
         inner = sector.width - 2 * edge
-        if inner < step + 1 / BINS:
+        if inner < step + 1 / ANGLE_BINS:
             return False
-        count = round(inner * BINS)
-        angles = sector.start + self.direction * (edge + np.arange(count + 1) / BINS)
-        return not self._seen[(angles * BINS).astype(np.intp) % BINS].any()
+        count = round(inner * ANGLE_BINS)
+        angles = sector.start + self.direction * (edge + np.arange(count + 1) / ANGLE_BINS)
+        return not self._seen[(angles * ANGLE_BINS).astype(np.intp) % ANGLE_BINS].any()
 
 
 class GapLoss(Protocol):
@@ -333,7 +333,7 @@ class MaskedGaps:
             return 0
         width = forward_step(stop - start, finder.direction)
         step = width / (loss.missing + 1)
-        if width < max(MIN_WIDTH, MIN_WIDTH_STEPS * step):
+        if width < max(MIN_WIDTH_TURNS, MIN_WIDTH_STEPS * step):
             return 0
         self._record_angles_before(row)
         ago = finder.add_gap(start, stop, step)

@@ -74,7 +74,7 @@ class BatchColumns(ColumnSource):
         self._shares = shares
         self._plan = shares[0].plan
         self._turn = vendor_turn(packets.sensor)
-        self.is_level = self._turn is None and all(share.plan.level for share in shares)
+        self.is_level = self._turn is None and all(share.plan.is_level for share in shares)
         self._main_columns = [
             name
             for name in COMPILED_TOGETHER
@@ -190,7 +190,7 @@ class BatchColumns(ColumnSource):
 
     def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
         first, last = self._packet_range(start, stop)
-        values = [share.plain(name, first, last) for share in self._shares]
+        values = [share.compute_plainly(name, first, last) for share in self._shares]
         column = self._flatten(values, np.result_type(*values), start, stop)
         if name in self._plan.extra:
             return self._plan.extra[name].column(column)
@@ -247,7 +247,7 @@ class BatchColumns(ColumnSource):
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(
-            share.plain("time", first, last) + add_axes(offsets, len(share.plan.shape))
+            share.compute_plainly("time", first, last) + add_axes(offsets, len(share.plan.shape))
         )
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -256,9 +256,9 @@ class BatchColumns(ColumnSource):
         share = self._shares[0]
         packets, places = np.divmod(indices, self._plan.width)
         if isinstance(self._plan.parts["time"], Node):
-            few = share.take(packets).plain("time")
+            few = share.take(packets).compute_plainly("time")
         else:
-            few = share.plain("time")[packets]
+            few = share.compute_plainly("time")[packets]
         offsets = seconds_since(self._packets.time_ns[packets], self.base)
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 

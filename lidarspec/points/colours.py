@@ -60,7 +60,9 @@ def colour(share: float, theme: Theme) -> Rgb:
     scale = SCALES[theme]
     lightness = _interpolate(scale.lightness, share)
     hue = math.radians(_interpolate(scale.hue, share))
-    red, green, blue = _srgb(lightness, scale.chroma * math.cos(hue), scale.chroma * math.sin(hue))
+    red, green, blue = _to_srgb(
+        lightness, scale.chroma * math.cos(hue), scale.chroma * math.sin(hue)
+    )
     return red, green, blue
 
 
@@ -79,7 +81,7 @@ def _interpolate(ends: tuple[float, float], share: float) -> float:
     return ends[0] + (ends[1] - ends[0]) * share
 
 
-def _srgb(lightness: float, a: float, b: float) -> list[int]:
+def _to_srgb(lightness: float, a: float, b: float) -> list[int]:
     """Return a colour of OKLab as red, green and blue in sRGB, from 0 to 255."""
     cones = [(row[0] * lightness + row[1] * a + row[2] * b) ** 3 for row in _CONES]
     parts = []

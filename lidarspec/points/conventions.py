@@ -40,7 +40,7 @@ UNITS: Mapping[str, str] = {
 REP_103 = ("forward", "left", "up")
 
 #: The largest float32 below pi, so that azimuths are in [-pi, pi) in float32 and in float64.
-_PI = np.nextafter(np.float32(np.pi), np.float32(0))
+_BELOW_PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
 #: The largest coordinate that float32 can represent, metres.
 MAX_COORDINATE_M = float(np.finfo(np.float32).max)
@@ -328,4 +328,4 @@ def narrow_angle(angle: NDArray[np.float64]) -> Floats:
     if far.any():
         # exact for any number of turns, but slow
         turned[far] = np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi
-    return np.clip(turned.astype(np.float32), -_PI, _PI)
+    return np.clip(turned.astype(np.float32), -_BELOW_PI, _BELOW_PI)

@@ -86,7 +86,7 @@ def _evaluate_by_plans(
     try:
         remembered = {
             node.number: whole.column(node)
-            for node in plans[0].eager
+            for node in plans[0].eager_nodes
             if node.kind in STATEFUL_KINDS
         }
         shares = [
@@ -122,7 +122,7 @@ def _make_group(
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
         return GroupPoints(plan, group, whole, batch)
-    return GroupPoints.part(plan, batch, group, remembered)
+    return GroupPoints.make(plan, batch, group, remembered)
 
 
 def _is_valid(share: GroupPoints) -> bool:

@@ -132,7 +132,7 @@ class GroupPoints:
         maker.run(rows, values, columns)
         return columns
 
-    def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+    def compute_plainly(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return a part of the result of `points`, computed by the reference evaluator.
 
         The shape is (stop - first, *plan.shape); a `stop` of None means all packets. A column in
@@ -158,7 +158,7 @@ class GroupPoints:
         )
 
     @classmethod
-    def part(
+    def make(
         cls, plan: Plan, batch: Batch, group: LayoutRows, remembered: Mapping[int, Column]
     ) -> GroupPoints:
         """Return a group for some packets of a batch.
@@ -186,10 +186,10 @@ class GroupPoints:
         """
         remembered = {
             node.number: self.plain_values.column(node)
-            for node in self.plan.eager
+            for node in self.plan.eager_nodes
             if node.kind in STATEFUL_KINDS
         }
-        return GroupPoints.part(
+        return GroupPoints.make(
             self.plan,
             self.batch,
             LayoutRows(self.group.layout, which, self.group.rows[which]),

@@ -181,7 +181,7 @@ class Plan:
         return math.prod(self.shape)
 
     @cached_property
-    def level(self) -> bool:
+    def is_level(self) -> bool:
         """Whether all points are in the horizontal plane through the sensor."""
         upright = [self.parts[name] for name in (["z"] if self.exact else ["elevation", "oz"])]
         return all(not isinstance(part, Node) and is_zero(part) for part in upright)
@@ -238,7 +238,7 @@ class Plan:
         )
 
     @cached_property
-    def eager(self) -> list[Node]:
+    def eager_nodes(self) -> list[Node]:
         """The nodes to compute for every batch, in order.
 
         They are nodes that keep values between batches, nodes that are checked for each batch, and
@@ -300,7 +300,7 @@ class Plan:
                     )
         return returned_range(measured)
 
-    def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
+    def has_finite_directions(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Return whether all azimuths and elevations of a batch are finite.
 
         If so, the coordinates of a point are either all nan or all finite.
@@ -308,7 +308,7 @@ class Plan:
         Args:
             values: a function that returns the value of a node for the batch.
         """
-        if not self._may_be_safe:
+        if not self._may_have_finite_directions:
             return False
         for term in self._directions:
             if term.low is not None and not np.isfinite(values(term.low)).all():
@@ -320,10 +320,10 @@ class Plan:
         return True
 
     @cached_property
-    def _may_be_safe(self) -> bool:
+    def _may_have_finite_directions(self) -> bool:
         """Whether the parts of azimuth and elevation that are known in advance are finite.
 
-        `safe` checks the parts that are known only with a batch.
+        `has_finite_directions` checks the parts that are known only with a batch.
         """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
@@ -335,10 +335,10 @@ class Plan:
 
     @cached_property
     def _directions(self) -> list[graph.Term]:
-        return [term for node in self.directed for term in graph.split_sum(node, self.width)]
+        return [term for node in self.directions for term in graph.split_sum(node, self.width)]
 
     @property
-    def directed(self) -> list[Node]:
+    def directions(self) -> list[Node]:
         """Azimuth and elevation, if they depend on data."""
         return [part for part in self._directions_given if isinstance(part, Node)]
 

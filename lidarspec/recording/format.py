@@ -333,7 +333,7 @@ class Recording(ClosingContext):
         Records without a time are ignored.
         """
         self._move(start)
-        while self.offset < stop and self._holds(1):
+        while self.offset < stop and self._read_at_least(1):
             size = self._find_valid_length()
             place = self._place
             if size > 0:
@@ -361,7 +361,7 @@ class Recording(ClosingContext):
                 else:
                     seen = "it is empty"
                 raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
-            pairs = self._pairs()
+            pairs = self._iter_records()
             first = next(pairs, None)
         if first is not None and first[0] == HEADER:
             self.header = read_header(first[1].data)
@@ -383,9 +383,9 @@ class Recording(ClosingContext):
         with system_errors(self.path):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
-    def _pairs(self) -> Iterator[tuple[int, Record]]:
+    def _iter_records(self) -> Iterator[tuple[int, Record]]:
         """Yield (kind, record) of every valid record."""
-        while self._holds(1):
+        while self._read_at_least(1):
             if (size := self._find_valid_length()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
                 self._skip(size)
@@ -400,9 +400,9 @@ class Recording(ClosingContext):
 
     def _find_valid_length(self) -> int:
         """Return the length of the current record; 0 if it is damaged or incomplete."""
-        self._holds(_HEAD.size)
+        self._read_at_least(_HEAD.size)
         size = size_at(self._window, self._place)
-        self.is_cut = size == 0 or (size > 0 and not self._holds(size))
+        self.is_cut = size == 0 or (size > 0 and not self._read_at_least(size))
         if size < 0 or self.is_cut:
             return 0
         end = self._place + size - _CRC.size
@@ -414,7 +414,7 @@ class Recording(ClosingContext):
             return size
         return 0
 
-    def _holds(self, number: int) -> bool:
+    def _read_at_least(self, number: int) -> bool:
         """Read until `number` bytes are in memory; return False if the file is too short."""
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
@@ -436,7 +436,7 @@ class Recording(ClosingContext):
             left = len(self._window) - self._place
             keep = min(len(MARK) - 1, left)  # possible beginning of a mark
             self._skip(left - keep)
-            if not self._holds(keep + 1):
+            if not self._read_at_least(keep + 1):
                 self._skip(keep)
                 return self.offset - before
         self._skip(position - self._place)

@@ -49,13 +49,13 @@ class RecordingSwitch:
         The file is named after the sensor and the time.
         """
         with self._changing:
-            self._change(on=self._recorder is None)
+            self._start_or_end(on=self._recorder is None)
 
     def set(self, *, on: bool) -> None:
         """Start or end a file. Does nothing if the recorder is already on or off."""
         with self._changing:
             if on == (self._recorder is None):
-                self._change(on=on)
+                self._start_or_end(on=on)
 
     @property
     def recording(self) -> tuple[str, int] | None:
@@ -91,7 +91,7 @@ class RecordingSwitch:
         with self._changing:
             self._end()
 
-    def _change(self, *, on: bool) -> None:
+    def _start_or_end(self, *, on: bool) -> None:
         self.trouble = ""
         try:
             if on:

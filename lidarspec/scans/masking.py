@@ -13,9 +13,9 @@ import copy
 import numpy as np
 
 from lidarspec.packets.masked_sector import (
-    JITTER,
-    MIN_WIDTH,
+    MAX_JITTER_TURNS,
     MIN_WIDTH_STEPS,
+    MIN_WIDTH_TURNS,
     VARYING_PACKETS,
     AngleReader,
     Angles,
@@ -145,7 +145,7 @@ class Masking:
         steps = self._compute_steps(angles, self._angle)
         smallest = np.minimum.accumulate(np.where(steps > 0, steps, np.inf))
         step_before = np.minimum(np.append(np.inf, smallest[:-1]), self._smallest_step)
-        limits = np.maximum(step_before * MIN_WIDTH_STEPS, MIN_WIDTH)
+        limits = np.maximum(step_before * MIN_WIDTH_STEPS, MIN_WIDTH_TURNS)
         turned = self._turned + np.cumsum(steps)
         leaps = np.flatnonzero(steps > limits)
         turns = np.flatnonzero(np.floor(turned) > np.floor(np.append(self._turned, turned[:-1])))
@@ -154,7 +154,7 @@ class Masking:
         for row in sorted({*leaps.tolist(), *turns.tolist()}):
             self._finder.add_angles(angles[seen:row])
             seen = row
-            step = min(float(step_before[row]), MIN_WIDTH)
+            step = min(float(step_before[row]), MIN_WIDTH_TURNS)
             if steps[row] > limits[row]:
                 start = before if row == 0 else angles[row - 1]
                 self._finder.add_gap(float(start), float(angles[row]), step)
@@ -179,7 +179,7 @@ class Masking:
         assert self._finder is not None
         steps = np.diff(angles, prepend=angles[0] if before is None else before)
         ahead = (self._finder.direction * steps) % 1
-        ahead[ahead > 1 - JITTER] = 0
+        ahead[ahead > 1 - MAX_JITTER_TURNS] = 0
         return ahead
 
     def _store_last(self, packets: Packets) -> Packets:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.packets.masked_sector import JITTER
+from lidarspec.packets.masked_sector import MAX_JITTER_TURNS
 
 Floats = NDArray[np.float64]
 
@@ -214,7 +214,7 @@ class PassDetector:
         before = previous_values(angles, self._angle)
         self._angle = angles.item(-1)
         steps = (self._direction * (angles - before)) % 1
-        steps[steps > 1 - JITTER] = 0
+        steps[steps > 1 - MAX_JITTER_TURNS] = 0
         behind = (self._direction * (before - self._at)) % 1
         turned = self._turned + np.cumsum(steps)
         rows = list[int]()

@@ -602,11 +602,11 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
         name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
     }
     if plan.exact:
-        directed = []
+        directions = []
     else:
-        directed = [*plan.directed, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
+        directions = [*plan.directions, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
-    if not all(is_number(value, plan.layout.leaves) for value in directed):
+    if not all(is_number(value, plan.layout.leaves) for value in directions):
         # a nan in one coordinate makes all of them nan
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:

@@ -45,7 +45,7 @@ def describe(plan: Plan) -> list[str]:
     names = tuple(
         name
         for name in ("x", "y", "z", "intensity")
-        if name in plan.expressions and not (name == "z" and plan.level)
+        if name in plan.expressions and not (name == "z" and plan.is_level)
     )
     tables: dict[Any, NDArray[Any]] = {}
     compiler = _compile(plan, names, tables)
@@ -54,7 +54,7 @@ def describe(plan: Plan) -> list[str]:
         f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True)
     )
     lines = [f"{plan.width} points per packet{': ' if axes else ''}{axes}"]
-    plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager]
+    plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager_nodes]
     lines.append(f"per packet or block, by the reference evaluator: {len(plainly)} values")
     lines += [f"  {node.kind} {node.path}".rstrip() for node in plainly if node.kind != "call"]
     lines.append(f"per chunk of {program.chunk} packets, {len(tables)} tables:")

@@ -50,7 +50,7 @@ class Compiler:
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
-        self.program = Program(plan.width, plan.safe)
+        self.program = Program(plan.width, plan.has_finite_directions)
         self.low = list[Node]()
         self._layout = plan.layout
         self._shape = plan.shape
