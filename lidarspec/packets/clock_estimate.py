@@ -30,7 +30,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -165,14 +165,11 @@ class DeviceClock:
         jumps = []
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
         delays = np.asarray(host_ns, np.int64) - device
-        edges = np.flatnonzero(np.diff(device // PART_NS)) + 1
-        for times, late in zip(np.split(device, edges), np.split(delays, edges), strict=True):
-            if len(late):
-                jump = self._add_sample(
-                    ClockSample(times.item(late.argmin()), late.item(late.argmin()))
-                )
-                if jump is not None:
-                    jumps.append(jump)
+        for part in split_runs(device // PART_NS):
+            fastest = part.start + int(delays[part].argmin())
+            jump = self._add_sample(ClockSample(device.item(fastest), delays.item(fastest)))
+            if jump is not None:
+                jumps.append(jump)
         return jumps
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
@@ -204,10 +201,7 @@ class DeviceClock:
             device, host: as for `observe`.
         """
         stamps = np.empty(len(device), np.int64)
-        edges = np.flatnonzero(np.diff(device // PART_NS)) + 1
-        bounds = [0, *edges.tolist(), len(device)]
-        for start, stop in pairwise(bounds):
-            part = slice(start, stop)
+        for part in split_runs(device // PART_NS):
             if self._is_regular(device[part], host[part]):
                 stamps[part] = self._stamp_part(device[part], host[part])
             else:
@@ -375,6 +369,21 @@ def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
         for index in hull
     )
     return ClockLine(last.device, last.delay + round(height), slope)
+
+
+def split_runs(*columns: NDArray[Any]) -> list[slice]:
+    """Return slices of consecutive rows in which no column changes.
+
+    Args:
+        columns: one or more arrays, (n,) each.
+    """
+    count = len(columns[0])
+    is_start = np.zeros(count, np.bool_)
+    is_start[:1] = True
+    for column in columns:
+        is_start[1:] |= column[1:] != column[:-1]
+    bounds = [*np.flatnonzero(is_start).tolist(), count]
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
 def lower_hull(samples: Sequence[ClockSample]) -> list[int]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
 from lidarspec.leap_seconds import read_leap_seconds
-from lidarspec.packets.clock_estimate import ClockJump, DeviceClock
+from lidarspec.packets.clock_estimate import ClockJump, DeviceClock, split_runs
 from lidarspec.packets.clock_findings import ClockFinding
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.clocks import clock_ns
@@ -174,7 +174,7 @@ class ClockMonitor:
         self._device_ns = packets.time_ns.item(-1)
         known = packets.host_ns > 0
         if known.any():
-            for piece in _split(packets.host_ns[known]):
+            for piece in split_runs(packets.host_ns[known] // PIECE_NS):
                 which = np.flatnonzero(known)[piece]
                 jumps = self._observe(
                     packets.time_ns[which], packets.host_ns[which], readings[which]
@@ -373,14 +373,6 @@ class ClockMonitor:
         if abs(error_s) > WRONG_DATE_S:
             return ClockFinding("wrong_date", value=error_s)
         return ClockFinding("offset", value=error_s)
-
-
-def _split(host: Integers) -> list[slice]:
-    """Return slices of packets, one for each piece of time in which packets arrived."""
-    edges = np.flatnonzero(np.diff(host // PIECE_NS)) + 1
-    starts = [0, *edges.tolist()]
-    ends = [*edges.tolist(), len(host)]
-    return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
 
 
 def _find_main_clock(sensor: SensorDescription) -> Clock | None:

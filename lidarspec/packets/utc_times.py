@@ -15,14 +15,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
 from lidarspec.leap_seconds import TAI_MINUS_GPS_S, read_leap_seconds
-from lidarspec.packets.clock_estimate import DeviceClock
+from lidarspec.packets.clock_estimate import DeviceClock, split_runs
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS, FIRST_DATE_NS, HOUR_S, Clock, ClockState
@@ -183,7 +182,8 @@ class UtcTimes:
         """
         status = self._fill_status(status)
         utc_ns = np.empty(len(times), np.int64)
-        for part in _split_runs(status, times >= FIRST_DATE_NS):
+        known_status = np.nan_to_num(status)
+        for part in split_runs(known_status, np.isnan(status), times >= FIRST_DATE_NS):
             source = self._find_source(times.item(part.start), status.item(part.start))
             if source.kind != "clock" and not host[part].all():
                 raise self._explain_unknown(source)
@@ -262,11 +262,3 @@ class UtcTimes:
             " drive.lsr"
         )
         return suggest(error, "repeat with --time sensor")
-
-
-def _split_runs(status: NDArray[np.float64], has_date: NDArray[np.bool_]) -> list[slice]:
-    """Return slices of packets with the same status, with or without a date."""
-    is_known = ~np.isnan(status)
-    changes = (np.diff(np.where(is_known, status, 0)) != 0) | np.diff(is_known) | np.diff(has_date)
-    edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(status)]
-    return [slice(start, stop) for start, stop in pairwise(edges) if stop > start]

@@ -29,6 +29,7 @@ from lidarspec.packets.utc_times import UtcTimes
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud
 from lidarspec.points.firings import RETURNS, Returns, choose_returns, take_returns
 from lidarspec.scans.scan import Scan
+from lidarspec.spec.timing import FIRST_DATE_NS
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: A time, as seconds from the first scan or as a date.
@@ -42,8 +43,6 @@ LEAD_S = 5.0
 MAX_CLOCK_DRIFT = 1e-3
 #: The shortest time that is skipped by seeking.
 MIN_SKIP_S = 5.0
-#: Later times are dates; earlier times count from the start of the sensor.
-MIN_DATE_NS = 10**18
 
 
 @dataclass(frozen=True)
@@ -194,7 +193,7 @@ class TimeSlice:
         first = self.first or 0
         last = self.last or 0
         dates = ""
-        if first > MIN_DATE_NS:
+        if first > FIRST_DATE_NS:
             dates = f" ({format_date(first)} to {format_date(last)})"
         text = (
             f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}; the"

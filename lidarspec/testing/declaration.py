@@ -28,6 +28,7 @@ from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
+from lidarspec.spec.timing import DAY_S
 from lidarspec.spec.tree import NAME_IS_COMPARED, Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, find_fields, trace_points
@@ -65,7 +66,7 @@ WEAK_BITS_IN_DATAGRAMS = 8
 #: Maximum ratio of `max_length` to the length of the longest random frame.
 MAX_LENGTH_RATIO = 8
 #: A clock with at least this period in seconds need not declare `wraps_at`.
-LONG_WRAP_S = 7 * 86_400
+LONG_WRAP_S = 7 * DAY_S
 #: Column of points -> possible units of its source fields.
 COLUMN_UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
 #: Pattern of the names of fields with the intensity of a return.
