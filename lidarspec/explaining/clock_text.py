@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.scans.selection import format_date
-from lidarspec.spec.timing import EPOCHS
+from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS
 
 
 def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
@@ -48,7 +48,10 @@ def describe_offset(report: ClockReport) -> str:
     The difference between the time scales of sensor and host is subtracted from the offset.
     """
     if math.isnan(report.error_s):
-        return f"{report.offset_s:+.3f} s to the host; the clock starts at an arbitrary time"
+        reason = "the clock starts at an arbitrary time"
+        if report.epoch in DATED_EPOCHS:
+            reason = "the clock has no valid date"
+        return f"{report.offset_s:+.3f} s to the host; {reason}"
     text = f"{report.error_s * 1e3:+.2f} ms"
     if abs(report.error_s) >= 1:
         text = f"{report.error_s:+.3f} s"

@@ -28,6 +28,9 @@ class FindingType(NamedTuple):
 
 
 CHECK_MASTER = "check the antenna and the cable of the time source, or its PTP domain and profile"
+CHECK_NMEA = "check that each NMEA sentence is sent after the pulse to which it belongs"
+CONNECT_SOURCE = "connect a time source (PTP, or GPS with PPS), and select it in the sensor"
+WRONG_SENTENCE = "the sensor probably paired its PPS pulse with the wrong NMEA sentence"
 #: The codes, the most serious first: states that are faults, events that were faults, all others.
 FINDING_TYPES = MappingProxyType(
     {
@@ -48,14 +51,10 @@ FINDING_TYPES = MappingProxyType(
             " already UTC",
             "let the grandmaster send TAI (ptpTimescale), with its currentUtcOffset",
         ),
-        "second_off": FindingType(
-            "{value:+.3f} s off: the sensor probably paired its PPS pulse with the wrong NMEA"
-            " sentence",
-            "check that each NMEA sentence is sent after the pulse to which it belongs",
-        ),
+        "second_off": FindingType("{value:+.3f} s off: " + WRONG_SENTENCE, CHECK_NMEA),
         "wrong_date": FindingType(
             "the date is {days:.0f} days off: the sensor's clock was probably never set",
-            "connect a time source (PTP, or GPS with PPS), and select it in the sensor",
+            CONNECT_SOURCE,
         ),
         "offset": FindingType(
             "{value:+.3f} s off the clock of this computer",
@@ -67,8 +66,7 @@ FINDING_TYPES = MappingProxyType(
             "synchronize the sensor by PTP or PPS, or repeat with --time host",
         ),
         "unsynchronized": FindingType(
-            "counts from power-up, expected {epoch}",
-            "connect a source of time (PTP, GPS and PPS), and select it in the sensor",
+            "the clock has no valid date, expected {epoch}", CONNECT_SOURCE
         ),
         "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
         "restart": FindingType("restarted, and its time began again", "check its power supply"),
@@ -76,11 +74,7 @@ FINDING_TYPES = MappingProxyType(
             "stepped by {value:+.3f} s at a leap second",
             "use --time host for the data around the leap second",
         ),
-        "second_step": FindingType(
-            "stepped by {value:+.3f} s: the sensor probably paired its PPS pulse with the wrong"
-            " NMEA sentence",
-            "check that the NMEA sentence follows the pulse that it belongs to",
-        ),
+        "second_step": FindingType("stepped by {value:+.3f} s: " + WRONG_SENTENCE, CHECK_NMEA),
         "jump": FindingType(
             "stepped by {value:+.3f} s", "use --time host for the data around this time"
         ),
@@ -120,7 +114,7 @@ class ClockFinding:
 
     @property
     def text(self) -> str:
-        """The finding as a short text, to be printed after the name of the sensor."""
+        """The finding as a short text, such as "runs on TAI: 37 s ahead of UTC"."""
         return FINDING_TYPES[self.code].text.format(
             value=self.value,
             behind=-self.value,

@@ -212,6 +212,15 @@ def test_impossible_times_do_not_raise(seed: int) -> None:
     assert all("{" not in text for _, text in iter_clock_rows(report))
 
 
+def test_a_clock_without_its_date_is_described_as_such() -> None:
+    """A sensor that sends year, month and day begins at 2000-01-01, not at 0."""
+    run = make_run(2, ahead_s=-8.4e8)
+    report = watch(run.packets(SYNCED.configure(epoch="utc")), run.began_s).monitor.report()
+    rows = dict(iter_clock_rows(report))
+    assert rows["offset"] == "-840000000.000 s to the host; the clock has no valid date"
+    assert rows["verdict"] == "the clock has no valid date, expected UTC"
+
+
 @pytest.mark.slow
 def test_nothing_is_named_in_an_hour_without_faults() -> None:
     run = make_run(3600, ppm=50)
