@@ -163,8 +163,8 @@ class RecordingTransport(Transport):
         if name == "clock" and not self._has_clock_warning:
             self._has_clock_warning = True
             text = (
-                "the computer's clock was changed during the recording; the arrival times do not"
-                " contain this change"
+                "the clock of the computer was stepped during the recording; arrival times continue"
+                " without this step"
             )
             self.warnings.append(f"{self._recording.path}: {text}")
         return is_interruption

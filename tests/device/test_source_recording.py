@@ -151,8 +151,8 @@ def test_a_clock_change_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
         assert sum(map(len, device.packets())) == 4
         (said,) = (warning for warning in device.warnings if "clock" in warning)
         assert said == (
-            f"{path}: the computer's clock was changed during the recording; the arrival"
-            " times do not contain this change"
+            f"{path}: the clock of the computer was stepped during the recording; arrival"
+            " times continue without this step"
         )
 
 
