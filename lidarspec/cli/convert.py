@@ -168,8 +168,8 @@ def convert(
 ) -> None:
     """Write the points of a recording or capture to a file of another format.
 
-    The suffix of OUT selects the format. .csv and .npz contain those of the columns x, y, z, range,
-    azimuth, elevation, intensity, time, ring, return_index and column that the sensor has, its
+    The suffix of OUT selects the format. .csv and .npz contain the columns x, y, z, range, azimuth,
+    elevation, intensity, time, ring, return_index and column, as far as the sensor has them, its
     further columns, and the number of the scan. Units are metres, radians, and seconds since the
     scan's stamp. .npy, .ply, .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring,
     time and the further columns; if several scans share a file, also the number of the scan. .bin

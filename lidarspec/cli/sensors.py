@@ -283,7 +283,7 @@ def trust(folder: str) -> None:
     own folders, with files that you know. The decision is stored in your settings, and applies to
     all later runs. LIDARSPEC_TRUST=FOLDER trusts a folder for a single run.
     """
-    say(f"{trusted(folder)}: its {FILE} is now trusted, as {user_folder() / TRUSTED} records")
+    say(f"{trusted(folder)}: its {FILE} is now trusted (stored in {user_folder() / TRUSTED})")
 
 
 def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:

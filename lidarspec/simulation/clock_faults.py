@@ -179,7 +179,7 @@ class ClockTimeline:
         Args:
             readings: the readings without faults, (n,) ns.
             times: the time of each reading since power-on, (n,) ns.
-            power_on_reading: the reading after a restart, ns.
+            power_on_reading: the reading with which the clock starts after a restart, ns.
         """
         faults = self.faults
         shifted: Times = readings

@@ -119,8 +119,8 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     is_started = any(command.starts for command in sensor.commands.values())
     if not is_started and not device.commands_received:
         return UsageError(
-            f"nothing was written: the simulated {sensor.id} sends only replies to commands;"
-            " without --to, it replies to them"
+            f"nothing was written, because the simulated {sensor.id} sends only replies to"
+            " commands: run sim without --to, and send commands to it"
         )
     recognized = ", ".join(device.commands_received) or "no command"
     missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
