@@ -22,30 +22,29 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: Waiting records are written when they have this size together. The next constant is the maximum
-#: time between two writes.
+#: records are written when they have this size. The next constant is the maximum time between
+#: writes.
 FLUSH_BYTES = 1 << 16
 FLUSH_PERIOD_S = 0.2
-#: The time between two calls of fsync.
+#: time between two calls of fsync.
 SYNC_PERIOD_S = 1.0
-#: The maximum size of the records that wait for a slow disk. Further records are dropped and
-#: counted.
+#: maximum size of the records that wait for a slow disk. Further records are dropped and counted.
 MAX_WAITING_BYTES = 1 << 26
-#: The maximum time that `sync` and `close` wait for the disk.
+#: maximum time that `sync` and `close` wait for the disk.
 DISK_TIMEOUT_S = 60.0
 
-#: A function that returns the length of the record at an offset, given bytes and the offset. It
-#: returns 0 or less if the record is not complete.
+#: Takes bytes and an offset, and returns the length of the record at this offset; 0 or less if the
+#: record is not complete.
 Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
-    """A new file. Until `settle` is called, an existing file with its path is kept.
+    """A new file. An existing file with the same path is kept until `settle`.
 
     Args:
         path: the path of the file.
-        size_at: a function that returns the length of a record; None if the file has no records.
-            After a partial write, the file is truncated after the last complete record.
+        size_at: returns the length of a record. After a partial write, the file is truncated after
+            the last complete record. None if records have no borders.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -136,7 +135,7 @@ class RecordFile:
 
 
 class TrafficLog(Protocol):
-    """The interface of recorders, which record the data that is received and sent.
+    """Interface of recorders: records the data that is received and sent.
 
     Attributes:
         error: the error that ended the recording; None if there is no error.
@@ -149,7 +148,7 @@ class TrafficLog(Protocol):
         """Record received or sent data with its time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the connection, such as "disconnect" or "reconnect".
+        """Record an event of the line, such as "disconnect" or "reconnect".
 
         Args:
             at: the time, ns since 1970; by default now.
@@ -172,7 +171,7 @@ class BackgroundWriter:
 
     Args:
         path: the path of the file.
-        size_at: a function that returns the length of a record, as in `RecordFile`.
+        size_at: returns the length of a record, as in `RecordFile`.
         overwrite: whether an existing file may be replaced.
 
     Attributes:
@@ -231,7 +230,7 @@ class BackgroundWriter:
         self._raise_failure()
 
     def wait_for_room(self) -> None:
-        """Wait until more records can be added. Call this for sources that can wait.
+        """Wait until more records can be added; for sources that can wait.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.

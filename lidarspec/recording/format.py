@@ -5,25 +5,26 @@ A recording is a sequence of independent records. The first is the header, in JS
     offset  size  of a record, little-endian
     0       4     mark b"\xb5LS\x1e"
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
-    5       1     flags: 1 if the data is a datagram, 2 if the line was interrupted
-                  before it, 4 if the line was silent before it
-    6       1     a, the size of the addresses
-    7       2     n, the size of the data
-    9       8     arrival time, ns since 1970, signed; the lowest number if unknown
-    17      a     sender, then receiver: each is a length byte, an address of this
-                  length, and, if the length is not 0, the port in 2 bytes
+    5       1     flags: 1 a datagram, 2 the line was interrupted before it,
+                  4 the line was silent before it
+    6       1     a, bytes of addresses
+    7       2     n, bytes of data
+    9       8     arrival time, ns since 1970, signed; the lowest number: unknown
+    17      a     sender, receiver: each a length byte, that many bytes of address,
+                  and, if there are any, the port in 2 bytes
     17+a    n     data
     17+a+n  4     CRC-32 (zlib) of everything before
 
 An event is a JSON object. Its entry "event" is "disconnect", "reconnect", "dropped" or "clock". For
 "dropped", the entry "records" is the number of dropped records. "clock" means that the wall clock
-was set. Its entry "ahead_ns" is the wall clock minus the arrival times, which continue without a
-jump. Readers skip unknown kinds of records.
+was set; "ahead_ns" is the wall clock minus the arrival times, which continue without a jump.
+Readers skip unknown kinds of records.
 
 Theory of operation: A length field has one or two bytes, so no record is longer than 66 kB. A
-record is used only if its checksum is valid. The reader keeps only one record and the rest of the
-last block in memory. It stops at the first damaged record, or continues with the next valid record
-(`salvage`). If the recording process is killed, the file ends with at most one incomplete record.
+record is used only if its checksum is valid. The reader keeps a part of the file in memory: one
+record and the rest of the last block. It stops at the first damaged record, or continues with the
+next valid record (`salvage`). If the recording process is killed, the file ends with at most one
+incomplete record.
 
 `Recording.seek` finds a time by bisection, without an index that a crash could destroy. This is
 possible because arrival times never decrease, and because a record can be found from any offset: it
@@ -62,7 +63,7 @@ HEADER, RECEIVED, SENT, EVENT = range(4)
 DATAGRAM = 1
 GAP = 2
 QUIET = 4
-#: The maximum number of data bytes in a record.
+#: maximum number of data bytes in a record.
 MAX_DATA_BYTES = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
 _CRC = struct.Struct("<I")
@@ -84,9 +85,8 @@ class Header:
         source: the SOURCE that was recorded.
         datagrams: whether the data consists of datagrams.
         baud: baud rate of a serial port; None for other sources.
-        versions: the versions of lidarspec and of the sensor's plugin, by the name of the
-            distribution.
-        created: the date and time with the time zone, in ISO 8601.
+        versions: name of a distribution -> its version, for lidarspec and the sensor's plugin.
+        created: date and time with the time zone, ISO 8601.
         wall_ns: wall clock of the recording computer at the start, ns since 1970.
         monotonic_ns: monotonic clock of the recording computer at the start, ns.
         version: version of the format.
@@ -116,8 +116,8 @@ class Header:
             folder: folder of the recording. Only files in this folder are opened for options.
 
         Raises:
-            UsageError: if the header names no sensor. Also if a recorded option cannot be used, so
-                that the caller must pass it; an example is a file in another folder.
+            UsageError: if the header names no sensor, or if the caller must pass an option again,
+                such as a file in another folder.
             UnknownSensor: if the sensor is not installed.
         """
         if not self.sensor:
@@ -180,8 +180,7 @@ class Record:
     """One record of a recording.
 
     Attributes:
-        direction: "in" for received data, "out" for sent data, "event" for an event of the
-            connection.
+        direction: "in" for received data, "out" for sent data, "event" for an event of the line.
         data: the bytes; JSON for an event.
         at: arrival time, ns since 1970; None if unknown.
         sender: address and port of the sender of a datagram; None if unknown.
@@ -256,15 +255,15 @@ class Recording(ClosingContext):
     Args:
         path: the file; "-" is standard input.
         file: the open or decompressed file; it is closed with the recording.
-        salvage: True to continue with the next valid record after damage, even if the header is
-            damaged; False to end at the first damage.
+        salvage: whether to continue with the next valid record after damage, even if the header is
+            damaged, instead of ending there.
 
     Attributes:
         header: the header.
         records: number of valid records so far, including the header and events.
         damaged: number of damaged parts so far, including an incomplete record at the end.
-        leftover: the number of bytes in damaged parts; without `salvage`, the number of all bytes
-            after the last valid record.
+        leftover: number of bytes in damaged parts; without `salvage`, of all bytes after the last
+            valid record.
         is_cut: whether the last damaged part is an incomplete record at the end of the file.
         offset: file offset of the next record, or of the damage that ended the reading.
 
@@ -309,8 +308,8 @@ class Recording(ClosingContext):
             at: ns since 1970.
 
         Returns:
-            False if the position is unchanged. This is the case if this record is not further
-            ahead, if arrival times are unknown, or if the file is a pipe.
+            False if the position is unchanged, because this record is not further ahead, arrival
+            times are unknown, or the file is a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -333,7 +332,7 @@ class Recording(ClosingContext):
         Records without a time are ignored.
         """
         self._move(start)
-        while self.offset < stop and self._read_at_least(1):
+        while self.offset < stop and self._holds(1):
             size = self._find_valid_length()
             place = self._place
             if size > 0:
@@ -361,7 +360,7 @@ class Recording(ClosingContext):
                 else:
                     seen = "it is empty"
                 raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
-            pairs = self._iter_records()
+            pairs = self._pairs()
             first = next(pairs, None)
         if first is not None and first[0] == HEADER:
             self.header = read_header(first[1].data)
@@ -383,9 +382,9 @@ class Recording(ClosingContext):
         with system_errors(self.path):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
-    def _iter_records(self) -> Iterator[tuple[int, Record]]:
+    def _pairs(self) -> Iterator[tuple[int, Record]]:
         """Yield (kind, record) of every valid record."""
-        while self._read_at_least(1):
+        while self._holds(1):
             if (size := self._find_valid_length()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
                 self._skip(size)
@@ -400,9 +399,9 @@ class Recording(ClosingContext):
 
     def _find_valid_length(self) -> int:
         """Return the length of the current record; 0 if it is damaged or incomplete."""
-        self._read_at_least(_HEAD.size)
+        self._holds(_HEAD.size)
         size = size_at(self._window, self._place)
-        self.is_cut = size == 0 or (size > 0 and not self._read_at_least(size))
+        self.is_cut = size == 0 or (size > 0 and not self._holds(size))
         if size < 0 or self.is_cut:
             return 0
         end = self._place + size - _CRC.size
@@ -414,7 +413,7 @@ class Recording(ClosingContext):
             return size
         return 0
 
-    def _read_at_least(self, number: int) -> bool:
+    def _holds(self, number: int) -> bool:
         """Read until `number` bytes are in memory; return False if the file is too short."""
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
@@ -436,7 +435,7 @@ class Recording(ClosingContext):
             left = len(self._window) - self._place
             keep = min(len(MARK) - 1, left)  # possible beginning of a mark
             self._skip(left - keep)
-            if not self._read_at_least(keep + 1):
+            if not self._holds(keep + 1):
                 self._skip(keep)
                 return self.offset - before
         self._skip(position - self._place)

@@ -24,8 +24,8 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: a description of the error of the last switching; "" without an error.
-        written: the path and the number of data bytes of each closed file.
+        trouble: description of the error when it was last switched; "" for no error.
+        written: (path, number of data bytes) of each closed file.
     """
 
     def __init__(self, source: str, folder: Path) -> None:
@@ -49,17 +49,17 @@ class RecordingSwitch:
         The file is named after the sensor and the time.
         """
         with self._changing:
-            self._start_or_end(on=self._recorder is None)
+            self._change(on=self._recorder is None)
 
     def set(self, *, on: bool) -> None:
         """Start or end a file. Does nothing if the recorder is already on or off."""
         with self._changing:
             if on == (self._recorder is None):
-                self._start_or_end(on=on)
+                self._change(on=on)
 
     @property
     def recording(self) -> tuple[str, int] | None:
-        """The name and the number of data bytes of the current file; None without a file."""
+        """(name, number of data bytes) of the current file; None if there is no file."""
         current = self._recorder
         if current is None:
             return None
@@ -91,7 +91,7 @@ class RecordingSwitch:
         with self._changing:
             self._end()
 
-    def _start_or_end(self, *, on: bool) -> None:
+    def _change(self, *, on: bool) -> None:
         self.trouble = ""
         try:
             if on:

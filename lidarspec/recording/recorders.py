@@ -43,7 +43,7 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")
-#: The maximum size of a packet with bytes that are not in a frame.
+#: maximum size of a packet with bytes that are not in a frame.
 MAX_GAP_BYTES = 1 << 16
 
 
@@ -52,14 +52,14 @@ class RecorderFactory:
     """Makes a recorder when the sensor of a source is known.
 
     Attributes:
-        make: a function that returns the recorder, given the open transport, and the sensor with
-            the options that the sensor reported.
+        make: takes the open transport, and the sensor with the options that it reported, and
+            returns the recorder.
     """
 
     make: Callable[[Transport, Sensor | str | None], TrafficLog]
 
 
-#: The target of a recording: a file, a recorder, or a function that makes the recorder when the
+#: the target of a recording: a file, a recorder, or a function that makes the recorder when the
 #: source is open.
 RecordTo = str | Path | BackgroundWriter | Callable[[Transport], TrafficLog] | RecorderFactory
 
@@ -132,7 +132,7 @@ class Recorder(BackgroundWriter):
             self._put(record, len(data))
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the connection, such as "disconnect" or "reconnect".
+        """Record an event of the line, such as "disconnect" or "reconnect".
 
         Args:
             at: the time, ns since 1970; by default now.
@@ -148,7 +148,7 @@ class PcapRecorder(BackgroundWriter):
 
     Args:
         path: the file.
-        port: the destination port to write for datagrams with an unknown destination.
+        port: the destination port of datagrams with an unknown destination.
         overwrite: whether an existing file may be replaced.
     """
 
@@ -175,10 +175,10 @@ class PcapRecorder(BackgroundWriter):
 
 
 class FrameRecorder(BackgroundWriter):
-    """Writes a byte stream as a capture with a packet for each frame.
+    """Writes a byte stream as a capture with a packet for each frame, link type USER0.
 
-    The link type is USER0. Bytes outside frames become packets as well, so that the file contains
-    all received bytes in order.
+    Bytes outside frames become packets as well, so that the file contains all received bytes in
+    order.
 
     Args:
         path: the file.
@@ -205,7 +205,7 @@ class FrameRecorder(BackgroundWriter):
             self._cut(self._decoder.feed(chunk.data, self._at))
 
     def _cut(self, frames: list[Found]) -> None:
-        """Write frames, and the bytes before them that are not in a frame.
+        """Write frames, and the bytes outside frames before them.
 
         Bytes that may become a part of a later frame are kept.
         """
@@ -313,9 +313,9 @@ def open_recorder(
 def get_recorder(
     target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
 ) -> tuple[TrafficLog, bool]:
-    """Return the recorder for a target, and whether this function made the recorder.
+    """Return the recorder for a target, and whether this function made it.
 
-    If so, the caller must close it.
+    The caller must close a recorder that this function made.
     """
     if isinstance(target, BackgroundWriter):
         return target, False
