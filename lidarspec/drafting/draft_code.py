@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from lidarspec.drafting.checksum_search import format_class, needs_class
 from lidarspec.drafting.draft import Draft, RepeatedBlocks
 from lidarspec.drafting.periods import (
-    CIRCLES,
     FEW_FRAMES,
+    FULL_CIRCLES,
     RisingField,
     find_runs,
     share_between,
@@ -281,7 +281,7 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
     code = _format_integer(rising.size, rising.order)
     evidence = [rising.describe_evidence(container)]
     if rising.kind == "angle":
-        code = f'Scaled({code}, {CIRCLES[rising.circle][0]:g}, "deg")'
+        code = f'Scaled({code}, {FULL_CIRCLES[rising.circle][0]:g}, "deg")'
     if container == "frame":
         start_field = _find_start_field(draft, rising)
         if start_field is not None:

@@ -29,7 +29,7 @@ from lidarspec.spec.checksums import ByteOrder
 Kind = Literal["counter", "angle", "rising"]
 
 #: For each full circle in raw units, the raw unit in degrees and its description.
-CIRCLES = {
+FULL_CIRCLES = {
     360: (1.0, "whole degrees"),
     3_600: (0.1, "tenths of a degree"),
     5_760: (1 / 16, "sixteenths of a degree"),
@@ -144,7 +144,7 @@ class RisingField:
         of_steps = f"in {self.right} of {self.total} steps"
         text = f"rises by {step} from {container} to {container}, {of_steps}"
         if self.kind == "angle":
-            return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
+            return f"{text}, wraps at {self.circle}: {FULL_CIRCLES[self.circle][1]}?"
         if not self.wraps:
             return f"{text}; no wrap found"
         if self.kind == "counter":
@@ -284,7 +284,7 @@ def _iter_rising(
     if len(rows) >= FEW_FRAMES and not _includes_low_byte(field_values):
         return
     regular = forward[within]
-    kind: Kind = "angle" if circle in CIRCLES else "rising"
+    kind: Kind = "angle" if circle in FULL_CIRCLES else "rising"
     spread = (int(regular.min()), usual, int(regular.max()))
     right = int(within.sum()) + len(steps) - len(moved)
     yield RisingField(offset, size, order, kind, circle, spread, right, len(steps), wraps)
@@ -320,7 +320,7 @@ def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """
     near = [
         circle
-        for circle in CIRCLES
+        for circle in FULL_CIRCLES
         if highest < circle <= highest + 3 * usual and abs(fallen - circle) <= 3 * usual
     ]
     return min(near, key=lambda circle: abs(fallen - circle), default=fallen)

@@ -21,7 +21,7 @@ from lidarspec.spec.timing import ClockStatus, PacketCounter, Split
 from lidarspec.spec.wire_forms import WireForm
 
 #: The version of the format. The number changes if a key is removed, or if its meaning changes.
-VERSION = 1
+FORMAT_VERSION = 1
 
 
 def to_text(sensor: Sensor) -> str:
@@ -40,7 +40,7 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
         ExportError: if a frame contains Python code that data cannot represent.
     """
     return {
-        "lidarspec": VERSION,
+        "lidarspec": FORMAT_VERSION,
         **facts(
             sensor,
             "id",

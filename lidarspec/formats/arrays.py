@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.formats.common import ColumnSpool, select_points, to_image
-from lidarspec.formats.point_rows import NAMES, PointRows, write_rows
+from lidarspec.formats.point_rows import COLUMN_NAMES, PointRows, write_rows
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import units_of
 from lidarspec.points.table_types import structured_type
@@ -122,7 +122,7 @@ def write_npy(
 
 def _make_structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
     return structured_type(
-        {name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES}
+        {name: np.dtype(dtype) for name, dtype in types.items() if name not in COLUMN_NAMES}
     )
 
 

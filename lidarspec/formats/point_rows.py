@@ -20,7 +20,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import iter_released
 
 #: The first columns of a row; additional columns follow.
-NAMES = STRUCTURED.names or ()
+COLUMN_NAMES = STRUCTURED.names or ()
 #: The number of characters that are reserved for a number in a header.
 RESERVED_DIGITS = 20
 #: The number of bytes per write. This fits into the processor's cache, so copying is three times as
@@ -69,10 +69,10 @@ class PointRows:
         if first:
             cloud = first[0].points
             columns = self._select_columns(
-                first[0], 0, (*NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else []))
+                first[0], 0, (*COLUMN_NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else []))
             )
             types |= {
-                name: STRUCTURED[name] if name in NAMES else column.dtype
+                name: STRUCTURED[name] if name in COLUMN_NAMES else column.dtype
                 for name, column in columns.items()
             }
             if is_image and every_point and len(first) == 1 and cloud.shape:

@@ -37,9 +37,9 @@ FLUSH_POINTS = 1 << 13
 MAX_PIPE_READ_BYTES = 1 << 16
 #: The names of the timelines: for the time of the sensor's clock, the arrival time, and the number
 #: of the scan.
-SENSOR = "sensor_time"
-HOST = "host_time"
-NUMBER = "scan"
+SENSOR_TIMELINE = "sensor_time"
+HOST_TIMELINE = "host_time"
+NUMBER_TIMELINE = "scan"
 
 
 class RerunRecording:
@@ -193,11 +193,11 @@ class RerunRecording:
         self.stream.log(f"{self._home}/about", rerun.TextDocument(text), static=True)
 
     def _set_times(self, scan: Scan) -> None:
-        self.stream.set_time(NUMBER, sequence=self._number)
+        self.stream.set_time(NUMBER_TIMELINE, sequence=self._number)
         self._number += 1
-        self.stream.set_time(SENSOR, timestamp=np.datetime64(scan.stamp_ns, "ns"))
+        self.stream.set_time(SENSOR_TIMELINE, timestamp=np.datetime64(scan.stamp_ns, "ns"))
         if scan.host_ns:
-            self.stream.set_time(HOST, timestamp=np.datetime64(scan.host_ns, "ns"))
+            self.stream.set_time(HOST_TIMELINE, timestamp=np.datetime64(scan.host_ns, "ns"))
 
     def _make_layout(self) -> Any:
         """Return the layout of the viewer: points, statistics and facts.
@@ -217,7 +217,9 @@ class RerunRecording:
             views.Spatial3DView(origin="/", name=self._home[1:]), side, column_shares=[3, 1]
         )
         return views.Blueprint(
-            window, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True
+            window,
+            views.TimePanel(timeline=SENSOR_TIMELINE, state="collapsed"),
+            collapse_panels=True,
         )
 
 

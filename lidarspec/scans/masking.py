@@ -29,7 +29,7 @@ from lidarspec.spec.sensor import SensorDescription
 #: A leap has to recur within this number of revolutions.
 MAX_TURNS = 4
 #: The maximum number of packets that are held.
-MAX_HELD = 1 << 15
+MAX_HELD_PACKETS = 1 << 15
 
 
 class Masking:
@@ -117,7 +117,7 @@ class Masking:
         if self._is_holding:
             times = held.time_ns
             is_late = abs(int(times[-1]) - int(times[0])) > self._longest_ns
-            if is_late or len(held) > MAX_HELD:
+            if is_late or len(held) > MAX_HELD_PACKETS:
                 self._is_settled = True
                 return self._release(None)
             return []
