@@ -483,9 +483,9 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
     """Split frames that are groups of shorter frames; return other frames unchanged.
 
-    Groups repeat if, for example, an index in the frames counts from 0 to 5, or the data is
-    simulated. The parts of a group are frames if their sync bytes are not all equal, or if they
-    have a counter.
+    A group of frames can repeat, for example because an index in the frames counts from 0 to 5, or
+    because the data is simulated. The parts of a group are frames if their sync bytes are not all
+    equal, or if they have a counter.
     """
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):

@@ -25,9 +25,9 @@ from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: The number of values in a Zarr chunk of a column of points.
+#: The number of values in a Zarr chunk of a column with one value per point.
 POINT_CHUNK = 1 << 18
-#: The number of values in a Zarr chunk of a column of scans.
+#: The number of values in a Zarr chunk of a column with one value per scan.
 SCAN_CHUNK = 1 << 12
 #: The type and unit of each column with one value per scan. Units are in the form that xarray
 #: reads.
@@ -162,7 +162,7 @@ class _ZarrColumn:
     def add(self, values: NDArray[Any] | None, length: int) -> None:
         """Append values.
 
-        If `values` is None, `length` values of nan are appended, or of 0 for integers.
+        If `values` is None, nan is appended `length` times, or 0 for integers.
         """
         dtype = self._array.dtype
         self._waiting.append(

@@ -297,13 +297,16 @@ def frame_coder(frame: Frame) -> Coder:
 
 
 def list_runs(layout: Layout) -> Sequence[Run]:
-    """Return the runs of fields in a struct with this layout."""
+    """Return the fields of a struct with this layout, as runs for a wire form.
+
+    A run is one text field, or several consecutive numbers.
+    """
     return list_runs_between(tuple(layout.leaves.values()), 0, layout.size)
 
 
 @functools.lru_cache(maxsize=1024)
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
-    """Return the runs of fields between two offsets of a struct.
+    """Return the fields between two offsets of a struct, as runs for a wire form.
 
     Bytes between fields, such as constants without a name, are treated as a text field.
     """

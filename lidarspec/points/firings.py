@@ -84,9 +84,9 @@ def choose_returns(
 
     Args:
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
-        names: the names of the returns, by return index (`Sensor.returns`). Without names the first
-            return has the lowest index. If no return has the name `which`, the first is the nearest
-            and the last the farthest.
+        names: the names of the returns, by return index (`Sensor.returns`). Without names, the
+            returns are in the order of their index. With names of which none is `which`, they are
+            in the order of their range.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.
