@@ -1,28 +1,28 @@
-"""A test kit for authors of sensors: a class for pytest, and `lidarspec check`.
+"""A test kit for authors of plugins: a class for pytest, and `lidarspec check`.
 
     from lidarspec.testing import SensorConformance
 
     class TestMine(SensorConformance):
         sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
 
-In: a sensor. Out: passed tests, or findings with location, reason and remedy. Modules in reading
-order:
+The input is a sensor. The result is passed tests, or findings with location, reason and remedy.
+Modules in reading order:
 
 * `properties`: the table of properties that every sensor must have.
-* `conformance`: everything that `check` checks, as one test for pytest.
-* `findings`: the rules, and the exception of a property that does not hold.
+* `conformance`: one test for pytest that does all checks of `lidarspec check`.
+* `findings`: the rules, and the exception that reports a violated property.
 * `sensor_under_test`: a sensor under test, with its examples.
 * `declaration`: checks of the declaration alone.
 * `frames`: checks of single frames, valid and damaged.
-* `consistency`: agreement of angles, clock and times of points.
-* `geometry`: directions and positions of points.
-* `commands`: requests, replies, and the replies of the simulated sensor.
-* `streams`: streams of frames, decoded twice and in batches.
+* `consistency`: checks that angles, clock and times of points agree.
+* `geometry`: checks of the directions and positions of points.
+* `commands`: checks of commands, their replies, and the replies of the simulated sensor.
+* `streams`: checks that decoding a stream loses no frame and gives the same result every time.
 * `cloud_assertions`: assertions about point clouds.
 * `vectors`: golden frames from a manual or capture.
 * `strategies`: Hypothesis strategies for authors.
-* `value_ranges`: the values that are valid together in one layout.
-* `check`: all checks without pytest, for a name, file, distribution or folder.
+* `value_ranges`: finds values of fields that together make a valid frame.
+* `check`: does all checks without pytest, for a sensor, file, distribution or folder.
 * `pytest_plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
 

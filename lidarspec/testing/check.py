@@ -35,7 +35,8 @@ from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"
-#: Rules about the hooks of a plugin. The path of an error with such a rule is the plugin's name.
+#: Rules about the hooks of a plugin. A finding with one of these rules has the plugin's name as its
+#: path.
 HOOK_RULES = frozenset({"LS002", "LS003", "LS004"})
 
 
@@ -168,7 +169,7 @@ def _find_vectors(files: Iterable[Path]) -> Path | None:
 
 
 def _find_entry_points(distribution: str) -> list[EntryPoint]:
-    """Return the entry points of a distribution, of modules with hooks and of sensors."""
+    """Return a distribution's entry points for modules with hooks and for sensors."""
     entries = [*entry_points(GROUP), *entry_points(SENSORS)]
     return [
         entry for entry in entries if _normalize(entry.distribution) == _normalize(distribution)
@@ -206,7 +207,7 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
 def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
     """Return a finding for each id or alias that several plugins use.
 
-    The finding names the plugin whose sensor has the id.
+    The path of the finding names the plugin whose sensor was not registered for this reason.
     """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
@@ -221,7 +222,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
 
 
 def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """Return a finding for each sensor of a file with the id of an installed one."""
+    """Return a finding for each sensor of a file that has an installed sensor's id."""
     return [
         Finding(
             "LS005",
@@ -266,7 +267,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
 
 
 def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
-    """Return the finding for an error while loading a plugin."""
+    """Return the finding for an error that loading a plugin has raised."""
     if isinstance(error, SpecError) and error.__cause__ is not None:
         cause = error.__cause__
     else:
@@ -297,7 +298,7 @@ def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
 
 
 def _loading_rule(error: BaseException, cause: BaseException) -> str:
-    """Return the code of the rule that an error while loading violates."""
+    """Return the code of the rule that is violated if loading raises this error."""
     functions = [location.name for location in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
@@ -344,7 +345,7 @@ Location = tuple[str, int]
 
 
 class SourceTexts:
-    """The locations (file, line) of declarations in the source of some modules.
+    """Finds the file and line of declarations in the source of some modules.
 
     Fields are found by the names in their paths, all other declarations by kind and name.
     """
@@ -361,7 +362,7 @@ class SourceTexts:
                 self._others.setdefault((kind, name), (file, line))
 
     def locate(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
-        """Return a copy of the finding with file and line; the same if they are not found."""
+        """Return the finding, with its file and line if they can be found."""
         if finding.file:
             return finding
         location = self._find_location(finding.path, sensor) or (
@@ -414,7 +415,7 @@ def _find_function(frame: str, name: str, sensor: Sensor | None) -> Location | N
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield (kind, name, line) of each key and of each possible frame type and sensor."""
+    """Yield (kind, name, line) of dict keys and of possible frame types and sensors."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):
@@ -532,7 +533,7 @@ def _list_tests(node: ast.AST) -> list[ast.expr]:
 
 
 def _is_expression(test: ast.expr, names: set[str]) -> bool:
-    """Return whether a condition is an expression of construct, which is always true."""
+    """Return whether a condition is a construct expression, and thus always true."""
     return not isinstance(test, ast.BoolOp | ast.Call) and bool(_collect_names(test) & names)
 
 
@@ -566,11 +567,12 @@ def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
 
 #: Rules whose violation makes it impossible to test properties.
 FATAL_RULES = frozenset({"LS213", "LS114", "LS115", "LS301"})
-#: Name, in a report, of all properties that are skipped after a violation of `FATAL_RULES`.
+#: Key in `Report.skipped` for all properties that are skipped after a violation of `FATAL_RULES`.
 REMAINING_PROPERTIES = "all other properties"
 
 
-#: Called with the current step, the number of finished properties and their total.
+#: Called with the name of the current step, the number of finished properties and the total number
+#: of properties.
 Watch = Callable[[str, int, int], None]
 
 
@@ -584,7 +586,8 @@ class Report:
         held: number of properties that hold.
         skipped: property -> the reason why it does not apply.
         measured: measured values of frames, by description.
-        picture: measured values of points, by description, to compare with the manual.
+        picture: measured values of points, by description; the author compares them with the
+            manual.
     """
 
     name: str

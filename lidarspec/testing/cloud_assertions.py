@@ -15,7 +15,8 @@ from lidarspec.points.cloud import PointCloud
 
 #: Tolerance of coordinates and angles, in units in the last place at the size of the range.
 ULPS = 4
-#: Tolerance of times of points in seconds: batches count from different packets.
+#: Tolerance of times of points in seconds. It is needed because the times in two batches may count
+#: from different packets.
 TIME_TOLERANCE_S = 1e-6
 #: Tolerance of the stamp of a cloud in nanoseconds.
 STAMP_TOLERANCE_NS = 1000
@@ -41,8 +42,8 @@ def assert_well_formed(cloud: PointCloud) -> None:
 def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
     """Fail unless both clouds have the same columns, masks, positions and times.
 
-    Coordinates are compared at the size of the range, azimuths on the circle, times to a
-    microsecond. All other columns have to be equal.
+    The tolerance of coordinates grows with the range. Azimuths that differ by a full circle are
+    equal. Times may differ by a microsecond. All other columns have to be equal.
 
     Args:
         ulps: tolerance of coordinates and angles in units in the last place.
@@ -73,7 +74,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
 
 
 def _reach(cloud: PointCloud) -> NDArray[np.float32]:
-    """Return the largest absolute coordinate of each point, (n,), at least 1 m."""
+    """Return each point's range or largest absolute coordinate, (n,), at least 1 m."""
     lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
     with np.errstate(invalid="ignore"):
         size = np.nanmax(np.abs(lengths), axis=0, initial=0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Checks of commands: frames, ranges of arguments, and simulated replies."""
+"""Checks of commands: their frames, ranges of arguments, and simulated replies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STEP_NS = 20_000_000
 
 
 def arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, Any]:
-    """Return a value for each argument of a command.
+    """Return a valid value for each argument of a command, by name.
 
     Args:
         share: position of a number between its lowest and its highest value, or length of a text
@@ -130,7 +130,7 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
 def an_exchange_holds(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, path: str
 ) -> None:
-    """Check that a command has these bytes, and that `answer` is a reply to it.
+    """Check that a command is built as `data`, and that `answer` is a reply to it.
 
     Raises:
         ViolationError: if the bytes differ, or the reply does not match.
@@ -160,7 +160,7 @@ def an_exchange_holds(
 
 
 def replies_can_match(subject: SensorUnderTest, name: str) -> None:
-    """Check that each field that identifies a reply exists in a reply of the command."""
+    """Check that the fields that identify a reply exist in a reply of the command."""
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
@@ -203,7 +203,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
 
 
 def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
-    """Check that the sensor can be configured with what it learns from a reply."""
+    """Check that the options that are read from a reply are valid for `configure`."""
     sensor = subject.sensor
     try:
         if values := learn_options(sensor, reply):
@@ -254,7 +254,7 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
 def _exchange(
     device: SimulatedDevice, session: Session, pending: PendingReply, name: str, now: int
 ) -> int:
-    """Simulate a device until a command is finished; return the time of its end in ns."""
+    """Simulate a device until it has replied to a command; return that time in ns."""
     sensor = session.sensor
     link = sensor.commands[name].link
     decoder = sensor.decoder(stream=not is_datagram(sensor.links[link]))

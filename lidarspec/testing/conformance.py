@@ -30,8 +30,8 @@ def assert_conformance(
 ) -> list[Report]:
     """Fail with every finding of `lidarspec check`; return the reports.
 
-    Findings of LS005 are not included: that another installed plugin uses the same id is a fault of
-    the environment.
+    Findings of rule LS005 are not included. They report that another installed plugin uses the same
+    id, which is a fault of the environment, not of the sensor.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
@@ -66,7 +66,7 @@ def assert_conformance(
 
 
 class SensorConformance:
-    """Base class of a test that a sensor conforms.
+    """Base class of a test that a sensor passes all checks.
 
     Attributes:
         sensor: an id, a `Sensor`, or a file that describes one.

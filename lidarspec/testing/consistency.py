@@ -1,7 +1,7 @@
 """Checks that the parts of a declaration agree: angles, points, clock and times.
 
-Packets are made from the sensor's `sweep`. Some have a large index, because the first packets
-seldom cross the full circle, and seldom reach the time at which the clock wraps.
+Packets are made from the sensor's `sweep`. Some of them come late in the sweep, because the first
+packets seldom cross the full circle, and seldom reach the time at which the clock wraps.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
 #: Number of packets for the check that times of points agree with the clock.
 TIMED_PACKETS = 64
-#: Maximum number of clock steps by which the times of points may exceed those of their packets.
+#: The points of n packets may cover at most n plus this number of times between two packets.
 MAX_SPREAD_STEPS = 30
-#: Number of different shifts of a packet's angles; they divide the full circle evenly.
+#: Number of angles by which a packet is turned; these angles divide the full circle evenly.
 SHIFT_COUNT = 24
 
 
@@ -56,8 +56,8 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     """Check that the times of points agree with the clock.
 
-    The points of n packets may cover at most n + `MAX_SPREAD_STEPS` steps of the clock from packet
-    to packet.
+    A step is the mean time between two packets by the clock. The times of the points of n packets
+    may cover at most n + `MAX_SPREAD_STEPS` steps.
     """
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:

@@ -50,22 +50,23 @@ MEASURE_NAMES = frozenset(
 )
 #: Maximum share of payload offsets at which a sync pattern may match by chance.
 MAX_SYNC_SHARE = 1 / 200
-#: Number of examples whose lengths are measured before that of a simulated frame.
+#: Number of examples whose lengths are measured before the length of a simulated frame.
 FIRST_MEASURED_EXAMPLES = 3
-#: Total number of examples whose lengths are measured.
+#: Maximum number of examples whose lengths are measured.
 MEASURED_EXAMPLES = 12
 #: Default number of example payloads in which the sync pattern is counted.
 SYNC_EXAMPLES = 12
 #: A frame with at most this many bits of constants and checksums is weak: in a few megabytes of
 #: random bytes, one such frame is found by chance.
 WEAK_BITS = 24
-#: The same limit for a frame without points: a false frame does not damage a point cloud.
+#: The same limit for a frame without points. It is lower, because a false frame without points does
+#: not damage a point cloud.
 WEAK_BITS_WITHOUT_POINTS = 16
-#: The same limit for frames in datagrams: UDP has its own checksum.
+#: The same limit for frames in datagrams. It is the lowest, because UDP has its own checksum.
 WEAK_BITS_IN_DATAGRAMS = 8
 #: Maximum ratio of `max_length` to the length of the longest random frame.
 MAX_LENGTH_RATIO = 8
-#: A clock with at least this period in seconds need not declare `wraps_at`.
+#: A clock that wraps after at least this time in seconds need not declare `wraps_at`.
 LONG_WRAP_S = 7 * DAY_S
 #: Column of points -> possible units of its source fields.
 COLUMN_UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
@@ -218,7 +219,7 @@ def _check_options(sensor: Sensor) -> Findings:
 
 
 def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
-    """Return whether `configure` returns equal sensors for several values it accepts."""
+    """Return whether `configure` returns equal sensors for all values that it accepts."""
     accepted = 0
     for value in values:
         try:
@@ -277,7 +278,7 @@ def _is_reply(sensor: Sensor, name: str) -> bool:
 def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     """Yield a finding if `max_length` is much larger than random frames.
 
-    With too large a `max_length`, the decoder waits too long for the end of a frame with a corrupt
+    If `max_length` is too large, the decoder waits too long for the end of a frame with a corrupt
     length.
     """
     if get_codec(frame).schema.endings:
@@ -342,9 +343,9 @@ def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
 
 
 def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    """Yield findings for fields without a unit that are named like measured values.
+    """Yield findings for fields that are named like measured values but have no unit.
 
-    `Scaled(..., "")` declares that a field is a pure number.
+    Fields that are declared as pure numbers, by `Scaled(..., "")`, give no finding.
     """
     pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
     for path, info in get_codec(frame).schema.all_fields.items():
@@ -364,7 +365,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
 
 def _find_multiplied(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields by which a field in metres is multiplied to give ranges."""
+    """Return the fields that `range` is calculated from, if one of them is in metres."""
     try:
         infos = [
             field_of(subject, name, node)
@@ -488,7 +489,7 @@ def _check_sync(
 def _check_strength(
     subject: SensorUnderTest, name: str, frame: Frame, layouts: list[Layout]
 ) -> Findings:
-    """Yield a finding if a frame has too few constants and checksums to be recognized."""
+    """Yield a finding if a frame has too few constants and checksums."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [

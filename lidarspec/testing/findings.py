@@ -16,7 +16,7 @@ from lidarspec.sensor_operations import Sensor
 
 
 class Rule(NamedTuple):
-    """A rule: its code, a short description of the fault, its consequence, its remedy."""
+    """A rule: its code, a short description of the fault, the consequence, the remedy."""
 
     code: str
     title: str
@@ -208,7 +208,7 @@ class Finding:
 
 
 class ViolationError(AssertionError):
-    """The exception of a property that does not hold."""
+    """Raised if a property does not hold; it becomes a `Finding`."""
 
     def __init__(self, code: str, what: str, path: str = "") -> None:
         self.code = code
@@ -220,7 +220,7 @@ class ViolationError(AssertionError):
 
 
 def require(holds: object, code: str, what: str, path: str = "") -> None:
-    """Raise a `ViolationError` unless `holds`.
+    """Raise a `ViolationError` if `holds` is false.
 
     Raises:
         ViolationError: with this code, text and path.

@@ -1,4 +1,4 @@
-"""Checks of single frames: examples, round trips, edits, damage, types.
+"""Checks of single frames: valid examples, edited frames and damaged frames.
 
 construct may omit bits, truncate numbers and accept contradictory values without an error. To find
 each of these faults, a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
@@ -30,7 +30,7 @@ from lidarspec.testing.sensor_under_test import MANY_FRAME_TYPES, SensorUnderTes
 
 #: Number of examples in which bytes are changed, for frames that are not compiled.
 CHANGED_EXAMPLES = 3
-#: Default number of values to which each of these bytes is changed.
+#: Default number of values to which each byte of these examples is changed.
 CHANGED_VALUES = 8
 #: Number of example frames that are edited.
 EDITED_EXAMPLES = 8
@@ -42,7 +42,7 @@ MIN_CUT_OFFSETS = 12
 MAX_CUT_BYTES = 1 << 20
 #: Maximum total bytes of the changed copies of a long frame that is not compiled.
 MAX_CHANGED_BYTES = 300_000
-#: Default and minimum number of frames in which each bit is flipped in turn.
+#: Default and minimum number of frames of a type whose bits are flipped one after another.
 FLIPPED_FRAMES = 3
 MIN_FLIPPED_FRAMES = 2
 #: Maximum total bytes of the copies of one frame with a flipped bit; in a longer frame, only bits
@@ -116,10 +116,10 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
 
 
 def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing and building keeps changed bytes, apart from checksums.
+    """Check that an example with a changed byte is parsed and built without a change.
 
-    Only frames that are not compiled are tested: they may contain functions of the author that lose
-    values.
+    The bytes of checksums may differ. Only frames that are not compiled are tested, because they
+    may contain functions of the author that lose values.
     """
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
@@ -165,7 +165,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
 
 
 def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame is invalid if a field differs from its `Rebuild`.
+    """Check that a frame is invalid if the value of a `Rebuild` field is wrong.
 
     Otherwise, building the parsed values would give a different frame.
     """
@@ -200,7 +200,7 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
 
 
 def is_cut(before: Any, after: Any) -> bool:
-    """Return whether a number is lower by one step after building and parsing."""
+    """Return whether a number was truncated: `after` is lower by at most one step."""
     if (
         not isinstance(before, int | float)
         or not isinstance(after, int | float)
@@ -394,7 +394,7 @@ def _check_edit(
 
 
 def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
-    """Return the author's strategy for a field's raw value, or one for all its values."""
+    """Return the author's strategy for a field's raw value, else a strategy for any."""
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
@@ -443,9 +443,9 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that a damaged frame can be parsed or raises `WireError`.
+    """Check that parsing a damaged frame raises no error other than `WireError`.
 
-    It is parsed with and without verification.
+    The frame is parsed with and without verification.
     """
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
@@ -514,8 +514,8 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
 def _choose_flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
     """Return the offsets of the bytes in which bits are flipped.
 
-    In a long frame, bits are flipped in one byte of each field and in some random bytes, in a short
-    frame in all bytes.
+    In a short frame, these are all bytes. In a long frame, they are one byte of each field and some
+    random bytes.
     """
     number = MAX_FLIPPED_BYTES // (8 * length)
     if number >= length:

@@ -2,11 +2,11 @@
 
 Four kinds of frames are used:
 
-* Examples: clouds must keep the conventions of `PointCloud`, and tracing `points` gives the source
-  fields of each column.
+* Examples: their clouds must keep the conventions of `PointCloud`. Tracing `points` with them gives
+  the source fields of each column.
 * Packets of the sensor's `sweep`: directions must be in radians, turn clockwise or
-  counter-clockwise throughout, cross the full circle without a jump, and exist if a packet has a
-  single point. Clock and counter must increase.
+  counter-clockwise throughout, and cross the full circle without a jump. The point of a packet with
+  a single point must have a direction. Clock and counter must increase.
 * Frames with an angle that is changed by a few steps: the points must turn as the vendor's axes
   declare.
 * Packets simulated in a room: the decoded points must lie on its walls. Their distances are
@@ -70,23 +70,26 @@ MIN_PACKETS = 8
 MAX_SWEEP_AZIMUTH_RAD = 4 * np.pi
 #: If an azimuth of a random frame is larger than this value in radians, it must be in degrees.
 MAX_RANDOM_AZIMUTH_RAD = 15 * np.pi
-#: Minimum share of steps of the azimuth in the same direction.
+#: Minimum share of the steps of the azimuth that must be in the same direction.
 MIN_ONE_WAY_SHARE = 0.8
-#: Maximum step of the azimuth against its direction, in radians.
+#: Maximum step of the azimuth against the direction of rotation, in radians.
 MAX_BACK_STEP_RAD = np.deg2rad(1.5)
-#: The same limit as a multiple of the median step. The larger limit applies.
+#: The same limit as a multiple of the median step. The larger of both limits applies.
 MAX_BACK_STEP_MEDIANS = 4
 #: Number of raw units by which an angle is changed to test whether the points turn with it.
 SMALL_CHANGE = 4
 #: Default number of examples that are tried until one has points.
 TRIED_EXAMPLES = 8
-#: A sensor rotates if the median step of its azimuth, in radians, is larger than this.
+#: A sensor is treated as rotating if the median step of its azimuth, in radians, is larger than
+#: this.
 MIN_ROTATION_STEP_RAD = 1e-5
-#: Minimum component along an axis of a direction that is taken as that axis.
+#: A unit vector with at least this component along an axis is treated as the direction of that
+#: axis.
 MIN_AXIS_COMPONENT = 0.9
 #: Rounding error of a point in float32, in metres.
 FLOAT32_ERROR_M = 2e-6
-#: Minimum tolerance of a distance in metres, because a step may be larger than the field shows.
+#: Minimum tolerance of a distance in metres. It is needed because the resolution may be worse than
+#: the scale of the field.
 MIN_HALF_STEP_M = 0.004
 
 
@@ -173,7 +176,7 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
 
 
 def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
-    """Return the field of a node; it belongs to this frame type or to the state."""
+    """Return the field of a node, which is a field of this frame type or of the state."""
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
     if node.kind == "state":
@@ -190,8 +193,8 @@ def directions(
 ) -> list[NDArray[np.float64]] | None:
     """Return the azimuths and elevations that `points` returns, without padding.
 
-    They are not yet folded to the full circle. For Cartesian points, the directions that the
-    simulation declares are returned instead; None if it declares none.
+    The angles are not limited to a full circle. For Cartesian points, the directions that the
+    simulation declares are returned instead, or None if it declares none.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -216,7 +219,7 @@ def directions(
 
 
 def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np.float64]] | None:
-    """Return the declared directions of the first frames; None if there are none."""
+    """Return the directions that the spec declares for the first frames, or None."""
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
@@ -274,9 +277,9 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
 
 
 def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
-    """Check that the point of a frame with one point has a valid direction.
+    """Check that the point of a frame with a single point has a valid direction.
 
-    Only frames with the number of points in the header are tested.
+    Only frame types with a field for the number of points are tested.
     """
     engine = get_codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
@@ -353,8 +356,8 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
 def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
     """Check that points turn in the direction that the vendor's axes declare.
 
-    No finding is reported if golden vectors have points in two quadrants, because they prove the
-    direction better. The direction is always part of the report.
+    No finding is reported if golden vectors have points in two quadrants, because these are better
+    evidence of the direction. The direction that was found is always part of the report.
     """
     for path, info in _find_point_angles(subject, name).items():
         zero = _find_zero(info)
@@ -383,7 +386,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
 
 
 def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
-    """Return the direction in which angles grow that begin on one axis.
+    """Return the direction in which the vendor's angles increase.
 
     1 is counter-clockwise, -1 clockwise, 0 unknown.
 
@@ -596,8 +599,8 @@ def _decode_with_values(
 def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     """Return the direction in which points turn if a field increases.
 
-    1 is counter-clockwise, -1 clockwise, 0 if they do not turn. For example, they do not turn with
-    a rate or an elevation.
+    1 is counter-clockwise, -1 clockwise, 0 if the points do not turn, for example because the field
+    is a rate or an elevation.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
@@ -643,9 +646,9 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half a step of the coarsest range field in metres.
+    """Return half of the largest raw step of all fields in metres, in metres.
 
-    The result is at least `MIN_HALF_STEP_M`.
+    Returns `MIN_HALF_STEP_M` if no step is larger.
     """
     fields = subject.fields(name).values()
     metres = [

@@ -1,7 +1,7 @@
 """The table of properties that every sensor must have, for `lidarspec check` and for pytest.
 
 A property is a function of a `SensorUnderTest` that raises an exception if the property does not
-hold. It tests the sensor's declaration; the engine has tests of its own.
+hold. It tests the sensor's declaration, not the engine.
 
 This module imports neither pytest nor hypothesis, so that it can be imported without the extra
 `testing`. `conformance` makes a test for pytest from the table.
@@ -65,9 +65,10 @@ class Property:
         each: what the property is tested for: the "sensor", or each "frame", "data" frame,
             "command" or "vector".
         rule: the code of the rule that is violated if the function raises a plain `AssertionError`.
-        lacks: returns the reason why the property does not apply to a sensor; "" if it applies.
-        unless: codes of rules that describe the fault better. If one of them is violated, the
-            property is not tested.
+        lacks: a function that returns the reason why the property does not apply to a sensor, or ""
+            if it applies.
+        unless: codes of other rules. If one of them is violated, the property is not tested,
+            because the other rule describes the fault better.
         depends_on: attributes of a sensor that determine the result. If a related model that is
             tested as well has equal attributes, the property is not tested again. If empty, the
             property is tested for each sensor.
@@ -144,7 +145,7 @@ class Property:
         return findings
 
 
-#: Rules that a plugin violates if its functions raise an exception for valid frames.
+#: The rules that are violated if a function of the plugin raises an exception for a valid frame.
 FAILING_RULES = ("LS213", "LS214", "LS215", "LS414")
 
 #: Attributes of a sensor that determine the result of decoding a stream.

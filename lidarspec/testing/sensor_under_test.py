@@ -1,4 +1,4 @@
-"""A sensor under test, and its examples, edited and truncated.
+"""A sensor under test, and functions that make, edit and truncate its examples.
 
 A `SensorUnderTest` has the sensor, its examples (with values of the author's strategies, if there
 are any) and measured values. All random values are seeded, so that a failure can be repeated.
@@ -18,7 +18,7 @@ from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
-#: Maximum length in bytes of a frame that is cut at every byte.
+#: Maximum length in bytes of a short frame, which is cut at every byte.
 MAX_SHORT_BYTES = 300
 #: Number of random offsets at which a longer frame is cut, besides those near its ends.
 CUT_OFFSETS = 50
@@ -123,7 +123,7 @@ def integers(
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """Parse a frame; its scaled numbers are in their units.
+    """Parse a frame, with scaled numbers in their units.
 
     Returns None if a number is too large for an exact float.
     """
@@ -146,7 +146,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
 
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
-    """Return the paths of the fields of a frame that store a checksum."""
+    """Return the paths of all fields in a frame that store a checksum."""
     engine = get_codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
     if layout is None or engine.schema.has_measured_sizes:
@@ -176,7 +176,7 @@ MANY_FRAME_TYPES = 8
 MAX_EXAMPLE_BYTES = 300_000
 #: After this number of bytes, no further round of a conversation begins.
 CONVERSATION_BYTES = 500_000
-#: Number of examples by which the length of frames is measured.
+#: Number of examples whose lengths are measured to find the length of a frame type.
 MEASURED_SEEDS = 3
 #: Number of values that are drawn from a hypothesis strategy.
 POOL_SIZE = 60
@@ -199,7 +199,7 @@ class SensorUnderTest:
         measured: measured values of frames as text, by description.
         picture: measured values of points as text, by description, to compare with the manual.
         traced: data frame -> the result of `points` for traced columns, if it can be traced.
-        placed: the data frames whose golden vectors have points in two quadrants.
+        placed: names of the data frames whose golden vectors have points in two quadrants.
         swept: data frame -> the packets of its `sweep` that have been made so far.
     """
 
@@ -245,11 +245,11 @@ class SensorUnderTest:
         return get_codec(self.sensor.frames[frame]).schema.all_fields
 
     def source(self, purpose: str = "") -> random.Random:
-        """Return a random generator for a purpose; it repeats its numbers in every run."""
+        """Return a random generator for a purpose; it gives the same numbers in every run."""
         return random.Random(f"{self.sensor.id} {purpose}")
 
     def seeds(self, name: str, share: float = 1.0) -> range:
-        """Return the seeds of the examples of a frame type that are used.
+        """Return the seeds of the examples of a frame type that a property uses.
 
         There are fewer seeds if the frame is long, because each field takes time, or if the sensor
         has many frame types.
@@ -310,7 +310,8 @@ class SensorUnderTest:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Return frames of all incoming types in a possible order, as (type, bytes).
 
-        Each frame follows the frames without which the decoder would not accept it.
+        If a frame type is only valid after another type (`after`), a frame of that type comes
+        first.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0

@@ -7,12 +7,12 @@
     def test_distances_are_positive(value): ...
 
 Each field is drawn separately, so that a failure is reported with the smallest value of each field.
-First, the fields are drawn that determine the layout (counts, lengths, keys of a `Switch`). Then
+First, the fields that determine the layout are drawn (counts, lengths, keys of a `Switch`). Then
 the other fields of the layout are drawn, within the ranges that the struct and `plausible` accept
 (`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. In a long array,
 all elements have the same drawn value except a few.
 
-Frames without layouts (which only construct can parse) and frames with parts are drawn value by
+Frames without layouts, which only construct can parse, and frames with parts are drawn value by
 value, in the order of their struct. If such values are seldom valid together, one of a few examples
 is drawn instead.
 """
@@ -73,10 +73,11 @@ MAX_OCTETS = 16
 #: Maximum number of runs of frames in a stream, and maximum length of the noise between two runs.
 MAX_RUNS = 6
 MAX_NOISE_BYTES = 16
-#: Number of packets in which a complete scan is searched: initial number, and maximum.
+#: Initial and maximum number of packets that are simulated to find a complete scan.
 FIRST_PACKETS = 16
 MAX_PACKETS = 8192
-#: Limits of a scan: distance of a wall in metres, number of boxes, number of scans since power-on.
+#: Maximum values for a drawn scan: distance of a wall in metres, number of boxes, and number of
+#: scans since power-on.
 MAX_WALL_M = 6
 MAX_BOXES = 2
 MAX_SCANS = 3
@@ -211,8 +212,9 @@ def streams(
 
     The input consists of valid frames of all incoming types. It is bytes, or a list of datagrams if
     the sensor sends datagrams. If a frame type is only valid after another type (`after`), that
-    type comes first. If a frame type needs several frames in a row (`confirm`), there are as many.
-    Without noise, every byte belongs to a frame.
+    type comes first. If a frame type is only valid after several such frames in a row (`confirm`),
+    the input has at least this number of frames in a row. Without noise, every byte belongs to a
+    frame.
 
     Args:
         sensor: an id or a Sensor.
@@ -259,8 +261,8 @@ def _truncated(draw: DrawFn, sensor: Sensor) -> list[bytes]:
 def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
     """Return a strategy for scans of a simulated sensor in a room.
 
-    The walls, the boxes in the room, the number of the scan since power-on and the lost packets are
-    drawn. The simplest scan is complete and shows an empty room.
+    These are drawn: the walls, the boxes in the room, the number of the scan since power-on, and
+    the lost packets. Hypothesis simplifies a failure towards a complete scan of an empty room.
 
     Args:
         sensor: an id or a Sensor.
@@ -268,8 +270,8 @@ def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
 
     Raises:
         UsageError: for a sensor that declares no `sweep`.
-        SpecError: if the sensor's ranges cannot be traced back to fields, or if it sends no
-            complete scan.
+        SpecError: if the fields that the ranges are calculated from cannot be found, or if the
+            simulated sensor sends no complete scan.
     """
     resolved = _resolve(sensor)
     return _scans(resolved, _packets_per_scan(resolved), lost)
@@ -322,7 +324,7 @@ def _boxes(draw: DrawFn) -> Box:
 
 
 def _delivery(sensor: Sensor, packets: list[bytes]) -> Any:
-    """Return data frames as the data link delivers them.
+    """Return data frames as the data link transmits them.
 
     If data frames are only valid after another frame, that frame is the first.
     """
@@ -394,7 +396,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
 
 @functools.lru_cache(maxsize=4096)
 def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrategy[int]:
-    """Return a strategy for a field that decides the layout."""
+    """Return a strategy for a field that the layout depends on."""
     if info.const is not None:
         return st.just(int(info.const))
     if info.allowed:
@@ -409,7 +411,7 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
 
 
 def _element(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
-    """Return a strategy for the raw value of a field, of an element, or of a byte."""
+    """Return a strategy for raw values of a field, or of its elements or bytes."""
     if info.path in fields:
         return fields[info.path]
     if info.kind == "float":
@@ -445,7 +447,7 @@ def _draw_leaf(draw: DrawFn, leaf: Leaf, element: SearchStrategy[Any]) -> NDArra
 def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[Any]:
     """Draw the elements of an array.
 
-    In a long array, all elements have one value except a few.
+    In a long array, all elements except a few have the same value.
     """
     if count <= MAX_SINGLE_DRAWS:
         return [draw_one() for _ in range(count)]
@@ -456,7 +458,7 @@ def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[A
 
 
 class _DrawnNumbers(random.Random):
-    """A source of random numbers that are drawn by Hypothesis."""
+    """A random generator that draws its numbers by Hypothesis."""
 
     def __init__(self, draw: DrawFn, ranges: Mapping[str, tuple[int, int]]) -> None:
         super().__init__(0)
@@ -525,7 +527,7 @@ def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
 
 @st.composite
 def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw a frame with parts, or without layouts, value by value."""
+    """Draw a frame with parts, or a frame without layouts, value by value."""
     source = _DrawnNumbers(draw, ranges_of_values(sensor, frame))
     drawn = {path: functools.partial(_draw_own, strategy) for path, strategy in fields.items()}
     try:

@@ -1,7 +1,7 @@
 """Properties of a sensor's streams: no lost frame, repeatable results, equal scans in batches.
 
-The following faults are found: a frame of one type is mistaken for another type, and functions of
-the sensor (`plausible`, `points`, `clock`) depend on more than their arguments, such as earlier
+Two kinds of faults are found. A frame of one type is mistaken for another type. A function of the
+sensor (`plausible`, `points`, `clock`) depends on more than its arguments, for example on earlier
 calls, random numbers, or the other packets of a batch. The engine itself is tested elsewhere.
 """
 

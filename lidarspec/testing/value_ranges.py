@@ -1,10 +1,10 @@
-"""The valid values of the fields of one layout, for strategies that draw them field by field.
+"""The ranges of values that are valid in one layout, for drawing field by field.
 
 Conditions of the struct and the sensor's `plausible` accept or reject a whole frame. Therefore, one
-valid frame, the *base*, is searched first. Then each field is varied alone in the base: its range
-extends from its value in the base to the last value that is accepted, which is found by bisection.
-Values from these ranges are mostly valid together. If they are not, `LayoutRanges.repair` replaces
-some of them by values of the base.
+valid frame, the *base*, is searched first. Then each field is varied alone in the base. The range
+of a field extends in both directions from its value in the base to the last value that is accepted,
+which is found by bisection. Values from these ranges are mostly valid together. If they are not,
+`LayoutRanges.repair` replaces some of them by values of the base.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ class LayoutRanges:
     ) -> Mapping[str, Values]:
         """Return the fixed values and all other values that are valid with them.
 
-        Fields that are missing in the result have their value of the base. Of a field in an array,
-        the valid elements are kept.
+        Fields that are missing in the result have their value from the base. For a field in an
+        array, the valid elements are kept, and the other elements have their value from the base.
         """
         kept = dict(fixed)
         for leaf in self.free:
@@ -125,7 +125,7 @@ class LayoutRanges:
         return kept
 
     def _mix(self, kept: Mapping[str, Values], leaf: Leaf, values: Values) -> Values:
-        """Replace each invalid element of an array by the element of the base."""
+        """Replace each invalid element of an array by the same element of the base."""
         base = leaf.load(self._base)
         mixed = base.copy()
         tried = []
@@ -165,7 +165,7 @@ class LayoutRanges:
         return ranges
 
     def _find_ranges(self, leaves: Sequence[Leaf]) -> dict[str, tuple[int, int]]:
-        """Return the range of each field with the other fields as in the base."""
+        """Return the range of each field; the other fields keep their values of the base."""
         starts = {leaf.info.path: int(leaf.load(self._base).flat[0]) for leaf in leaves}
         lowest = {
             leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[0]) for leaf in leaves
@@ -192,14 +192,14 @@ class LayoutRanges:
 
     @property
     def _has_rules(self) -> bool:
-        """Whether any values of these fields may be invalid."""
+        """Whether the struct or the sensor rejects some values of fields."""
         declared = self._sensor.frames[self._frame]
         return bool(
             declared.plausible is not None or declared.wire is not None or self.layout.conditions
         )
 
     def _accept(self, values: Sequence[tuple[str, int]]) -> list[bool]:
-        """Return for each (path, value) whether the base is valid with it in all elements."""
+        """Return for each (path, value) whether the base with this value is valid."""
         tried = []
         for path, value in values:
             leaf = self.layout.leaves[path]
