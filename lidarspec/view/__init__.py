@@ -1,13 +1,13 @@
 """Draw scans: in a terminal, as pictures in files, in notebooks and in the Rerun viewer.
 
-In: a device, or points. Out: pictures. The distribution `lidarspec-web` draws the page in a
-browser. Modules in reading order:
+The input is a device or points, the output pictures. The page in a browser belongs to the
+distribution `lidarspec-web`. Modules in reading order:
 
 * `terminal_window`: a window in the terminal that shows a running sensor and reads keys.
 * `terminal_window_parts`: the title, statistics, colours and keys around the picture.
 * `live_scans`: reads, counts and plays the scans of a device.
 * `live_frames`: reads and counts the frames of a device without points.
-* `rate_meter`: speed, rates, losses and jitter of a running sensor.
+* `rate_meter`: measures speed, rates, losses and jitter of a running sensor.
 * `polar`: draws points from above and from the side.
 * `canvas`: pictures made of characters, and their colours.
 * `terminal_screen`: writes changed cells to the terminal, and reads single keys.

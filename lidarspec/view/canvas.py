@@ -2,8 +2,8 @@
 
 A cell has 2 columns and 4 rows of dots. The dots are square if a cell is twice as high as wide.
 Each cell has a character and an ink. An ink is an index of `INKS`, so that two pictures can be
-compared cell by cell. It is shown in true colour, 256 colours, 16 colours or without colour, as the
-terminal supports.
+compared cell by cell. It is shown in true colour, 256 colours, 16 colours or without colour,
+depending on the terminal.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from lidarspec.points.colours import Rgb, make_ramp
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 
-#: SGR codes (terminal colours) of the ramp for terminals with 16 colours, from dark to light.
+#: SGR codes (terminal colours) for the colour ramp on terminals with 16 colours, from dark to
+#: light.
 _STANDARD = (94, 36, 92, 93)
 #: indices of the inks that are not part of the ramp.
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
@@ -80,7 +81,7 @@ _FIXED = (
     TextStyle((96, 216, 110), 92, bold=True),
     TextStyle((255, 92, 87), 91, bold=True),
 )
-#: the first ink of the ramp, for its lowest values.
+#: the first ink of the colour ramp, for the lowest values.
 FIRST_STEP = len(_FIXED)
 _SCALE = tuple(
     TextStyle(rgb, _STANDARD[step * len(_STANDARD) // RAMP_STEPS])
@@ -204,13 +205,13 @@ class Canvas:
         width: number of columns of cells.
         height: number of rows of cells.
         ramp: the column that the colours show. For "range", a cell has the colour of its nearest
-            point; for other columns, of the point with the highest value.
+            point. For other columns, it has the colour of the point with the highest value.
         dots: the dots of points, (4 * height, 2 * width) bool.
         lines: the dots of rings and axes, (4 * height, 2 * width) bool. They are shown only in
             cells without points.
-        steps: the step of the ramp of each cell's points, (height, width) int16; -1 for cells
-            without points.
-        labels: (row, column) of a cell -> character and ink of a text.
+        steps: the colour of each cell's points, as a step of the colour ramp, (height, width)
+            int16; -1 for cells without points.
+        labels: (row, column) of a cell -> its character and ink, for the cells of labels.
     """
 
     def __init__(self, width: int, height: int, ramp: str = "range") -> None:
@@ -283,7 +284,7 @@ class Canvas:
 
 
 def _to_braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the bits of the braille character of each cell, (height, width)."""
+    """Return each cell's dots as the bits of a braille character, (height, width)."""
     blocks = dots.reshape(
         dots.shape[0] // DOTS_DOWN, DOTS_DOWN, dots.shape[1] // DOTS_ACROSS, DOTS_ACROSS
     )

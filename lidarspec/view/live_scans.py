@@ -1,8 +1,8 @@
 """Read, count and play the scans of an open device.
 
 `LiveScans.read` reads the data that has arrived, counts it in a `RateMeter` and keeps the newest
-scan. A file can be played: each scan is then shown when it is due by its time. The file is read
-only a little ahead of the shown scan, so that the statistics belong to this scan.
+scan. If a file is played, each scan is shown at its recorded time. The file is read only a little
+ahead of the shown scan, so that the statistics belong to this scan.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LOOK_S = 0.04
 DEFAULT_STEP_S = 0.1
 #: maximum time between two scans of a file. A longer time is replaced by `DEFAULT_STEP_S`.
 MAX_STEP_S = 2.0
-#: duration of the recorded data that one read of a played file reads.
+#: how much recorded data one read of a played file reads, in recorded time.
 READ_AHEAD_S = 0.1
 #: size of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
@@ -41,12 +41,12 @@ class LiveScans:
 
     Args:
         device: the open device; it is not closed.
-        played: whether scans of a file are shown when they are due by their times, instead of as
-            fast as possible.
+        played: whether scans of a file are shown at the recorded speed, instead of as fast as
+            possible.
         speed: the speed of a played file, relative to the recorded speed.
         select: the scans to show; None for all.
-        ahead: duration of the recorded data that one read of a played file reads, in seconds; None
-            for the size that is read fastest.
+        ahead: how much recorded data one read of a played file reads, in seconds of recorded time;
+            None for the amount that is read fastest.
 
     Attributes:
         speed: the speed of a played file; it may be changed.
@@ -150,7 +150,7 @@ class LiveScans:
         self.stop_clock()
 
     def stop_clock(self) -> None:
-        """Pause a played file: the next scan is due one interval after it is continued."""
+        """Pause a played file. After the pause, the next scan is shown after one interval."""
         self._due = None
 
     def _read(self) -> None:
@@ -194,7 +194,7 @@ class LiveScans:
             raise self._sieve.make_missing_error()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
-        """Adjust the size of a read so that it contains `ahead` seconds of recorded data."""
+        """Adjust the size of later reads so that they contain `ahead` seconds of data."""
         portion = self._portion
         duration_s = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9
         if duration_s < ahead / 2 and portion < BATCH_BYTES:

@@ -24,15 +24,15 @@ from lidarspec.view.rate_meter import totals
 
 #: supported suffixes of `save`.
 SUFFIXES = (".png", ".pdf", ".svg")
-#: width of a figure. The next constant is the height of a panel.
+#: width of a figure. The next constant is the height of one of its panels.
 WIDTH_INCHES = 7.0
 PANEL_INCHES = 4.2
 #: minimum and maximum height of the side view.
 MIN_SIDE_INCHES = 0.7
 MAX_SIDE_INCHES = 3.0
 DPI = 160
-#: maximum number of bins of the intensity histogram. The next two constants are the numbers of bins
-#: of the range axis and, at most, of the time axis.
+#: maximum number of bins of the intensity histogram. The next two constants are the number of bins
+#: of the range axis, and the maximum number of bins of the time axis.
 MAX_INTENSITY_BINS = 128
 RANGE_BINS = 200
 MAX_TIME_BINS = 400
@@ -82,7 +82,7 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Return a figure of a scan to scale, from above with forward up.
+    """Return a figure of a scan to scale, seen from above; the sensor faces up.
 
     If `look` is not flat, the figure also has a view from the right side.
     """
@@ -179,9 +179,10 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
-    """Return a figure of the number of returns at each range over time.
+    """Return a figure with the number of returns at each range and time.
 
-    The figure also shows the median range. Of many scans, only every n-th scan is shown.
+    The figure also shows the median range over time. If there are many scans, only every n-th scan
+    is shown.
 
     Args:
         scans: at least one scan.
@@ -283,9 +284,9 @@ class RateSeries:
 
     Attributes:
         width: the duration of a step, in seconds.
-        totals: numbers of packets, lost packets and invalid frames in each step, (3, n). Losses and
-            invalid frames are known per batch of packets, and distributed evenly over the time of
-            the batch.
+        totals: numbers of packets, lost packets and invalid frames in each step, (3, n). Lost
+            packets and invalid frames are only counted per batch of packets, so they are
+            distributed evenly over the time of the batch.
         scans: (seconds since the first packet, scans per second) of each complete scan.
     """
 
@@ -331,7 +332,7 @@ class RateSeries:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edges of the steps, (n + 1,) seconds, and their counts, (3, n).
+        """Return the edges of the time steps, (n + 1,) seconds, and their counts, (3, n).
 
         Steps are joined so that there are at most `MAX_TIME_BINS`. The last step is omitted,
         because it is incomplete.

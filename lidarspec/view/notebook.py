@@ -32,13 +32,13 @@ from lidarspec.view.svg import svg
 PICTURE_PX = 520
 #: maximum number of dots of a view.
 MAX_DOTS = 12_000
-#: number of packets to show from the beginning, and number to show from the end.
+#: number of packets to show at the beginning, and also at the end.
 END_ROWS = 5
 #: maximum number of fields of packets.
 MAX_FIELDS = 24
 #: maximum number of rows of an explanation.
 MAX_ROWS = 200
-#: difference of hue between two consecutive fields.
+#: difference in hue between two consecutive fields.
 HUE_STEP_DEG = 67
 #: maximum height of a table; a higher table has a scroll bar.
 MAX_TABLE_PX = 640
@@ -46,7 +46,7 @@ _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:to
 
 
 def scan(value: Scan) -> str:
-    """Return a scan as SVG, from above and, if the points are not flat, from the side."""
+    """Return a scan as SVG, seen from above, and also from the side if it is not flat."""
     return _make_picture(value.points, f"{value.sensor.id}: {value}")
 
 
@@ -60,8 +60,8 @@ def cloud(value: PointCloud) -> str | None:
 def packets(value: Packets) -> str:
     """Return the first and the last packets as an HTML table.
 
-    The columns are the offset, the times, and the fields in their units. An array is shown as the
-    number and the range of its values.
+    The columns are the offset, the times, and the fields in their units. For an array, the number
+    and the range of its values are shown.
     """
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
     shown = dict(list(fields.items())[:MAX_FIELDS])

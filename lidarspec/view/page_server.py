@@ -78,7 +78,7 @@ def open_page_server(
     The hook `lidarspec_page` of a plugin makes the server.
 
     Args:
-        source: the SOURCE.
+        source: the source, as the user typed it.
         sensor: the sensor, or its id; None to detect it.
         selection: the scans to show.
         host: the address to listen on.

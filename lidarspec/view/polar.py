@@ -1,6 +1,6 @@
-"""Draw clouds in character cells, from above with range rings.
+"""Draw clouds in character cells, seen from above, with range rings.
 
-Forward is up, and left is left. 3D clouds are also drawn from the right side.
+Forward is up, and the sensor's left is at the left. 3D clouds are also drawn from the right side.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from lidarspec.view.canvas import DOTS_ACROSS, DOTS_DOWN, FAINT, LABEL, STRONG, 
 
 #: distance between two drawn dots of a ring, in units of dots.
 RING_GAP_DOTS = 4
-#: share of the height of the window for the view from above, if there are two views.
+#: share of the window's height that the view from above gets if there are two views.
 TOP_VIEW_SHARE = 0.62
 #: factors by which heights can be enlarged in the side view.
 HEIGHT_FACTORS = (1, 2, 5, 10)
-#: maximum share of the height of the side view that the points fill.
+#: maximum share of the side view's height that the points fill.
 MAX_FILLED_SHARE = 0.9
 
 
@@ -46,7 +46,7 @@ def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppear
 
 
 def _find_scale(width: int, height: int, reach: float) -> float:
-    """Return the scale in dots per metre that fits `reach` metres into half a canvas."""
+    """Return the scale in dots per metre at which half a canvas shows `reach` metres."""
     return (min(width * DOTS_ACROSS, height * DOTS_DOWN) - 1) / 2 / reach
 
 
@@ -85,7 +85,7 @@ def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
 
 
 def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
-    """Write the range of a ring at an axis, at the first crossing with space for it."""
+    """Write the range of a ring where the ring crosses an axis and there is space."""
     text = f"{radius:g} m"
     across = round(radius * scale / DOTS_ACROSS)
     down = round(radius * scale / DOTS_DOWN)
@@ -104,7 +104,7 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
 def _draw_from_side(
     cloud: PointCloud, width: int, height: int, look: CloudAppearance, scale: float
 ) -> tuple[CellGrid, int]:
-    """Return the view from the right side, and the factor that enlarges heights.
+    """Return the view from the right side, and the magnification of heights.
 
     Forward is right. The points are in the vertical middle of the view.
     """

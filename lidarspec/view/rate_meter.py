@@ -1,6 +1,7 @@
 """Measure a running sensor: speed, rates, losses and jitter.
 
-A `RateMeter` counts packets and scans, both since its last reading and from the beginning.
+A `RateMeter` has two sets of counts of packets and scans: since its last reading, and from the
+beginning.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ class RateTally:
         return self._gap_sum > 0 and self._is_by_host
 
     def _packet_rate(self, duration: float | None) -> float | None:
-        """Return packets per second, from the times of the packets if they are known."""
+        """Return packets per second, by the times of the packets if they are known."""
         if self._gap_sum:
             return self._gap_count / self._gap_sum
         if duration:
@@ -232,7 +233,7 @@ class RateMeter:
 
 
 def totals(counters: Counters) -> dict[str, int]:
-    """Return the counts that the rates of a reading are calculated from."""
+    """Return the counts that the rates in a `MeterReading` are calculated from."""
     rejected = (
         counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible
     )

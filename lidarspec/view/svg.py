@@ -1,6 +1,6 @@
 """Draw a cloud as SVG, with the same views as in the terminal.
 
-The picture is light or dark, as the colour scheme of the browser.
+The picture follows the light or dark colour scheme of the browser.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidarspec.points.colours import make_ramp, to_hex
 
 #: side of the view from above.
 SIDE_PX = 720
-#: margin around the picture. The next constant is the height of its header.
+#: margin around the picture. The next constant is the height of the picture's header.
 MARGIN_PX = 24
 HEADER_PX = 58
 #: height of the title of a view.
@@ -39,8 +39,7 @@ VIEW_MARGIN_PX = 24
 #: height of a text above its base line.
 FONT_HEIGHT_PX = 11
 CHARACTER_WIDTH_PX = 6.7
-#: possible distances between dots. The first distance is used with which there are at most as many
-#: dots as allowed.
+#: possible distances between dots. The first distance that gives no more dots than allowed is used.
 GRIDS_PX = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 #: colours of `_PARTS` on light and on dark pages.
 _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
@@ -64,7 +63,7 @@ def svg(
         look: the appearance.
         title: the title of the picture.
         side: side of the view from above, in pixels.
-        most: maximum number of dots of a view; None for no limit. A dot may represent several
+        most: maximum number of dots in a view; None for no limit. A dot may represent several
             returns.
     """
     cloud = points[points.valid]
@@ -129,8 +128,8 @@ class _ViewDrawer:
         cloud: the valid points.
         look: the appearance.
         side: side of the view from above, in pixels.
-        most: maximum number of dots of a view; None for no limit.
-        colours: the step of the ramp of each point, (n,).
+        most: maximum number of dots in a view; None for no limit. colours: the colour of each
+            point, as a step of the colour ramp, (n,).
     """
 
     cloud: PointCloud
@@ -231,9 +230,9 @@ class _ViewDrawer:
     def _draw_dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
     ) -> tuple[int, list[str]]:
-        """Return the number of dots, and an SVG path of the dots of each colour.
+        """Return the number of dots, and for each colour an SVG path that draws its dots.
 
-        The finest grid of `GRIDS_PX` is used that gives at most `most` dots.
+        The dots are on the finest grid of `GRIDS_PX` that gives at most `most` dots.
 
         Args:
             across: horizontal coordinates of the points, (n,) pixels.
@@ -345,7 +344,7 @@ def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
 def _style_of(part: str, attribute: str = "fill") -> str:
     """Return the SVG attributes for the colour of a part of the picture.
 
-    The attribute has the colour for light pages. The CSS class sets the colour for dark pages.
+    The attribute sets the colour for light pages, and the CSS class the colour for dark pages.
 
     Args:
         part: one of `_PARTS`.

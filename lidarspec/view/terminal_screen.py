@@ -1,8 +1,8 @@
 """Show pictures on the alternate screen of a terminal, and read single keys.
 
-Only changed cells are written. rich writes all cells of each picture, about 50 times as many, so it
-is used only for output that is printed once. Single keys are read with termios on POSIX and with
-msvcrt on Windows.
+Only changed cells are written. The library rich writes all cells of each picture, which are about
+50 times as many, so it is used only for output that is printed once. Single keys are read with
+termios on POSIX and with msvcrt on Windows.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ LEAVE = "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
 #: escape sequences before and after a picture. Between them, terminals do not update the screen.
 BEGIN = "\x1b[?2026h"
 END = "\x1b[?2026l"
-#: maximum number of unchanged cells between two changed cells that are written as well. Moving the
-#: cursor would need as many bytes.
+#: up to this number of unchanged cells between two changed cells are written as well, because
+#: moving the cursor over them would need as many bytes.
 MAX_BRIDGED_CELLS = 4
 
 
@@ -165,7 +165,7 @@ else:
 
 
 class TerminatedError(BaseException):
-    """A signal ends the process; raised so that resources are closed.
+    """Raised if a signal ends the process, so that resources are closed.
 
     Attributes:
         code: the exit code for shells: 128 plus the number of the signal.
@@ -177,9 +177,9 @@ class TerminatedError(BaseException):
 
 
 def find_colour_depth(stream: TextIO) -> Depth:
-    """Return the colour depth of a terminal, from the environment variables.
+    """Return the colour depth of a terminal.
 
-    These are NO_COLOR, COLORTERM and TERM.
+    It depends on the environment variables NO_COLOR, COLORTERM and TERM.
     """
     console = Console(file=stream)
     system = console.color_system
@@ -289,7 +289,7 @@ class Screen:
 
 
 def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> str:
-    """Return the text that replaces the shown picture by another.
+    """Return the escape sequences and text that replace the shown picture by another.
 
     Args:
         before: the shown picture; None for an empty screen.

@@ -201,7 +201,7 @@ class Window:
         return window
 
     def _draw_picture(self, width: int, height: int, current_look: CloudAppearance) -> CellGrid:
-        """Draw the scan, with the current warning in the middle."""
+        """Draw the scan, and the current warning, if any, in the middle."""
         if self._scan is None:
             drawn = CellGrid.blank(width, height)
         else:
@@ -228,7 +228,7 @@ class Window:
         self._read_at = now
 
     def _update_scan(self) -> None:
-        """Use the newest scan; keep the scale of the previous scan if the points fit."""
+        """Use the newest scan; keep the scale of the previous scan if it still fits."""
         newest = self._live.scan
         if newest is None or newest is self._scan:
             return
