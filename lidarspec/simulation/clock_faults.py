@@ -1,7 +1,7 @@
 """Faults of a simulated sensor's clock.
 
 `ClockFaults` describes the faults; a user can give them as text, ``drift=50ppm,step=0.2s@10s``. A
-`ClockTimeline` applies the faults to the readings of a clock from power-on to power-off. These
+`ClockTimeline` applies the faults to the readings of a clock, from power-on to power-off. These
 texts are supported:
 
 | text | fault |
@@ -47,7 +47,7 @@ class ClockFaults:
     Args:
         follows: "utc", "tai" or "gps" to set the clock to the time of the computer in this time
             scale; "" to use the times that the simulated sensor declares.
-        drift_ppm: how much faster the clock runs, in millionths; negative if it runs slower.
+        drift_ppm: how much too fast the clock runs, in millionths; negative if it runs too slow.
         steps: (time, size) of each jump forward, in seconds; negative sizes are jumps back.
         unlocked: (start, end) of each time range in which the clock is not locked.
         restarts: the times at which the clock starts again as after power-on. After a restart, it
@@ -76,7 +76,7 @@ class ClockFaults:
 
     @property
     def sets_status(self) -> bool:
-        """Whether these faults change the status that the sensor reports."""
+        """Whether these faults change the status of the clock that the sensor reports."""
         return bool(self.follows or self.unlocked or self.restarts)
 
 
@@ -216,6 +216,6 @@ class ClockTimeline:
         return states
 
     def _scale_offset_ns(self) -> int:
-        """Return the time scale that the clock follows minus UTC, ns."""
+        """Return the offset from UTC of the time scale that the clock follows, ns."""
         offsets_s = read_leap_seconds().scale_offsets(self._power_on_ns / SECOND_NS)
         return offsets_s[self.faults.follows] * SECOND_NS

@@ -1,15 +1,15 @@
 """Write the time and the status of a clock into simulated frames.
 
 A clock is a field, a sum of fields, or a function of fields. The fields that a function depends on
-are found by increasing each field by one and by two. If both steps of the time are equal, the field
-is linear, such as the microseconds or the hour. A field with steps of 28 to 31 days is the month,
-and a field with steps of 365 or 366 days is the year.
+are found by increasing each field by one, twice. If the time increases by the same step both times,
+the field is linear, for example the microseconds or the hour. If both steps are 28 to 31 days, the
+field is the month. If they are 365 or 366 days, it is the year.
 
-To write a time, the date is written into the fields of the date. The rest is distributed over the
-linear fields, from the coarsest to the finest. If the clock is a single field, a time difference is
-added to the field instead, and also to all elements of its array, to the other parts of its frame,
-and to all fields of the same unit, scale and size. These fields have times of the same clock, such
-as the start and the end of a measurement.
+To write a time, the date is written into the fields of the date. The time of day is distributed
+over the linear fields, from the coarsest to the finest. If the clock is a single field, a time
+difference is added to the field instead, and also to all elements of its array, to the other parts
+of its frame, and to all fields of the same unit, scale and size. These fields have times of the
+same clock, such as the start and the end of a measurement.
 
 If the time that was written cannot be read back from a frame, the clock cannot be written.
 """
@@ -40,20 +40,21 @@ from lidarspec.spec.tree import FieldInfo
 
 Times = NDArray[np.int64]
 DAY_NS = DAY_S * 10**9
-#: Numbers of days in a year. The next constant is the numbers of days in a month.
+#: Possible numbers of days in a year. The next constant has the possible numbers of days in a
+#: month.
 YEAR_DAYS = (365, 366)
 MONTH_DAYS = (28, 29, 30, 31)
 #: Maximum raw value to write.
 MAX_RAW = 2**63 - 1
-#: Maximum number of values of a field to try, to find the values of a calculated status. The next
-#: constant is the maximum number of fields.
+#: Maximum number of values of a field that are tried to find the values of a calculated status. The
+#: next constant is the maximum number of fields that are tried.
 MAX_STATUS_VALUES = 16
 MAX_STATUS_FIELDS = 2
-#: Time difference that is added in order to test whether a clock can be written, ns. It is larger
-#: than a second.
+#: Time difference that is added to test whether a clock can be written, ns. It is more than a
+#: second.
 TEST_SHIFT_NS = 1_500_000_000
-#: The date that a sensor counts from after power-on without a source of time, if it sends year,
-#: month and day: 2000-01-01, ns since 1970. Manuals call it a virtual UTC.
+#: The date at power-on, if the sensor has no source of time but sends year, month and day:
+#: 2000-01-01, in ns since 1970. Manuals call this time a virtual UTC.
 POWER_ON_DATE_NS = 946_684_800 * 10**9
 
 
@@ -63,7 +64,7 @@ class _TimeField:
 
     Attributes:
         path: path of the field.
-        step_ns: nanoseconds per raw step; not always a whole number.
+        step_ns: ns per step of the raw value; may be a fraction.
     """
 
     path: str
@@ -72,7 +73,7 @@ class _TimeField:
 
 @dataclass(frozen=True)
 class _StatusChoice:
-    """A possible status of a clock: the raw values of its fields, and their meaning."""
+    """A possible status of a clock: its fields' raw values, and what they mean."""
 
     raw: tuple[int, ...]
     state: ClockState
@@ -98,7 +99,7 @@ class _DateFields:
 
 
 class ClockWriter:
-    """Writes readings into the clock of one frame type.
+    """Writes readings into the fields of the clock in one frame type.
 
     Args:
         sensor: the sensor.
@@ -136,7 +137,8 @@ class ClockWriter:
     def can_follow_dates(self) -> bool:
         """Whether the reading at a date is defined.
 
-        The clock must never wrap, or wrap after a time that divides a day.
+        It is defined if the clock never wraps, or if a day is a multiple of the time after which it
+        wraps.
         """
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
@@ -145,9 +147,9 @@ class ClockWriter:
         return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
     def find_power_on_reading(self, frame: CompiledTable) -> int:
-        """Return the reading after power-on without a source of time, ns.
+        """Return the reading at power-on of a clock that has no source of time, ns.
 
-        It is 2000-01-01 if the frames have a year, a month and a day. The other clocks begin with
+        If the frames have a year, a month and a day, it is 2000-01-01. All other clocks begin with
         their lowest reading.
 
         Args:
@@ -266,7 +268,7 @@ class ClockWriter:
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
-        """Return the steps of the reading, ns, if a field is increased by one, twice."""
+        """Increase a field by one, twice; return both increases of the reading, ns."""
         before = table.raw(path)
         start = 0  # a float cannot represent a date and a step of one raw value
         if info.kind == "int":
@@ -362,7 +364,7 @@ class FrameClock:
         assert status is not None, self._frame
 
     def apply(self, table: CompiledTable, timeline: ClockTimeline, times: Times) -> None:
-        """Write the faults of a timeline into frames.
+        """Apply the faults of a timeline to the clock of frames.
 
         Args:
             table: the frames.
@@ -385,7 +387,7 @@ class FrameClock:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
 
     def _write_dates(self, table: CompiledTable, readings: Times) -> None:
-        """Write the dates of readings, (n,) ns since 1970, beside the clock.
+        """Write the dates of readings, (n,) ns since 1970, into fields beside the clock.
 
         Frames after a restart have no date, and keep their values.
         """
@@ -408,7 +410,7 @@ class FrameClock:
 def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
     """Return the clock of a frame type; None if it has no clock.
 
-    The frames that give the date of the data frames have a clock as well.
+    Frames that provide the date for the clock of the data frames have a clock as well.
     """
     clock = find_clock(sensor, frame)
     shared = sensor.clock
@@ -443,8 +445,8 @@ class StatusWriter:
         sensor: the sensor; its clock declares a status.
         table: frames of the type that has the status.
         read: returns the readings of the clock in frames, (n,) ns; None if they have no clock. A
-            status that changes the reading is not used, because the fields of the clock then have
-            another format.
+            status that changes the reading is not used, because it changes the format of the
+            clock's fields.
 
     Raises:
         UsageError: if no values of the fields give a locked and an unlocked status.
@@ -497,8 +499,8 @@ class StatusWriter:
     def choose(self, follows: str) -> tuple[tuple[int, ...], ...]:
         """Return the raw values of the fields for a locked, a lost and a restarted clock.
 
-        The status of a lost clock has the same epoch as that of the locked clock, if possible. The
-        status of a restarted clock has the epoch power-on, if possible.
+        If possible, the status of a lost clock has the same epoch as the status of the locked
+        clock, and the status of a restarted clock has the epoch power-on.
         """
 
         def rank(choice: _StatusChoice, epoch: str, raw: tuple[int, ...]) -> tuple[Any, ...]:
@@ -529,7 +531,7 @@ class StatusWriter:
         return bool(read(frame).item() == reading)
 
     def _find_choices(self, table: CompiledTable) -> None:
-        """Find the fields of a calculated status, and their values with a meaning."""
+        """Find the fields that the status is calculated from, and their valid values."""
         for path, info in table.schema.fields.items():
             if info.kind != "int" or info.axes or info.const is not None:
                 continue

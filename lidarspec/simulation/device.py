@@ -1,10 +1,10 @@
-"""A simulated sensor as a device: it gets bytes and returns bytes, without I/O.
+"""A simulated sensor as a device: it takes bytes and returns bytes, without I/O.
 
 All behaviour follows from the spec. Data frames are sent at the rate of the sensor's clock, and
 other frames at their declared rate. Commands get the documented replies (`ReplyMaker`), and can
 start and stop the data. If no command of `on_open` starts the sensor, it sends data from power-on.
-The caller passes the current time to each method, in ns of one monotonic clock; the device can be
-faster than real time.
+The caller passes the current time to each method, in ns of one monotonic clock, so the device can
+run faster than real time.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: Maximum duration of a batch of data, in ns of the device's time. The next constant is the maximum
-#: number of packets.
+#: Maximum duration of a batch of packets, in ns of the device's time. The next constant is the
+#: maximum number of packets in a batch.
 MAX_BATCH_NS = SECOND // 4
 MAX_BATCH_PACKETS = 128
 #: Number of fillers that are sent in a pause.
 PAUSE_FILLERS = 14
-#: Maximum delay of a device in ns. If a device is polled later, the rest of the delay is skipped.
+#: If a device is polled later than this, in ns, its clock skips the additional delay.
 MAX_DELAY_NS = SECOND
 
-#: Name of the value for `answers` functions with the port at which the data is served.
+#: Name under which functions in `answers` get the port at which the data is served.
 DATA_PORT = "{data_port}"
 Packet = tuple[str, bytes]
 #: Nanoseconds without input after which an incomplete request is discarded.
@@ -63,7 +63,8 @@ REQUEST_TIMEOUT_NS = 50_000_000
 class ReceivedCommand:
     """A received command, with the raw values of the fields of its frame by path.
 
-    The values in its templates are among them as texts, by name in braces: "{handle}".
+    The texts that match placeholders of the command's templates are among the values, by the name
+    in braces, for example "{handle}".
     """
 
     name: str
@@ -83,7 +84,7 @@ class ReceivedCommand:
         return _to_host(address), int(port)
 
     def _find(self, kind: type[Port | Address], placeholder: str) -> Any:
-        """Return the value of this kind in the command; None if it has no such value."""
+        """Return the port or address in the command; None if it has none."""
         paths = [path for path, value in self.command.values.items() if isinstance(value, kind)]
         paths += [
             argument.path
@@ -194,7 +195,7 @@ class ReplyMaker:
         return ReplyPart(name, self._frames.make(name, given))
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
-        """Return the physical values of a reply that are determined by its request."""
+        """Return the physical values that a reply copies from its request, or must have."""
         fields = get_codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
@@ -245,7 +246,7 @@ def _match_command(
 
 
 def _rank(command: Command) -> tuple[int, int]:
-    """Return a rank; the highest of several matching commands is the most specific."""
+    """Return how specific a command is, to choose one of several matching commands."""
     literal_size = sum(template.literal_size for template in command.templates.values())
     return len(command.fixed), literal_size
 
@@ -290,7 +291,7 @@ def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[st
 
 
 class _PlannedData(NamedTuple):
-    """Data to be sent at a time, ordered by time and by the order of planning.
+    """Data to send at a time; sorted by time, then by the order of planning.
 
     Attributes:
         at: the time, ns since power-on.
@@ -298,7 +299,8 @@ class _PlannedData(NamedTuple):
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
-        repetition: how often a periodic frame was sent before; the sweep gets this number.
+        repetition: how many frames of a periodic type were sent before; the argument of its
+            `sweep`.
     """
 
     at: float
@@ -346,7 +348,7 @@ class _FrameStream:
         return self._next
 
     def change(self, frame_simulation: FrameSimulation) -> None:
-        """Continue with frame 0 of another simulation, after the frames made so far."""
+        """Continue with frame 0 of another simulation, after the frames already made."""
         self._made = frame_simulation
         self._next = 0
 
@@ -389,7 +391,7 @@ class SimulatedDevice:
     Args:
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
-        rate: speed relative to real time; infinity for as fast as the data is read.
+        rate: speed relative to real time; with infinity, data is sent as fast as it is read.
         faults: the faults on the links.
 
     Attributes:
@@ -399,8 +401,8 @@ class SimulatedDevice:
             has. The address is "" if the command contained only a port.
         sent: number of sent frames by type, before faults.
         lines: name of each link -> the link with its faults.
-        utc_offset_ns: UTC minus the time that the caller passes, ns, for clocks that follow UTC. A
-            change has an effect at the next `start`.
+        utc_offset_ns: UTC minus the time that the caller passes, ns; used by clocks that follow
+            UTC. A change takes effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
@@ -490,7 +492,7 @@ class SimulatedDevice:
         return any(command.starts and command.frame for command in opening)
 
     def serve_at(self, data_port: int) -> None:
-        """Set the port at which the data is served; some replies report this port."""
+        """Set the port at which the data is served, which some replies report."""
         self._replies.data_port = data_port
 
     def unplug(self) -> None:
@@ -499,11 +501,11 @@ class SimulatedDevice:
         self._plug = None
 
     def jump_clock(self, seconds: float) -> None:
-        """Make the sensor's clock jump, starting within the next quarter of a second.
+        """Make the sensor's clock jump; the jump happens within a quarter of a second.
 
         Args:
-            seconds: the size of the jump; negative to jump back. Jumps add up until the next
-                `start`.
+            seconds: the size of the jump; negative to jump back. Several jumps add up until the
+                next `start`.
 
         Raises:
             UsageError: if the sensor has no clock, if its clock cannot be written, or if no data is
@@ -516,7 +518,7 @@ class SimulatedDevice:
         self._replies.use_timeline(self._timeline)
 
     def delay_output(self, seconds: float, now: int) -> None:
-        """Send the data of the next seconds late, all at the end of this time."""
+        """Hold back the data of the next `seconds`, and send all of it at their end."""
         self._late_until = now + round(seconds * SECOND)
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
@@ -527,14 +529,14 @@ class SimulatedDevice:
                 self._reply(request, self._clock(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
-        """Return the data that is sent until `now`, in order, as (link, bytes).
+        """Return the data that is due until `now`, in order, as (link, bytes).
 
         All bytes of a byte stream are one entry. Each datagram is an entry.
         """
         return [(link, data) for link, _, data in self.outgoing_with_types(now)]
 
     def outgoing_with_types(self, now: int) -> list[tuple[str, str, bytes]]:
-        """Return the data that is sent until `now`, as (link, frame type, bytes).
+        """Return the data that is due until `now`, as (link, frame type, bytes).
 
         All bytes of a byte stream are one entry, with the type "".
         """
@@ -670,7 +672,7 @@ class SimulatedDevice:
                 self._begin(time_ns, chosen)
 
     def _apply_effect(self, command: str) -> None:
-        """Change the sweep after a command; data that is made already is sent before."""
+        """Change the sweep after a command; frames that exist already are still sent."""
         sweep = self._sweep or self.sensor.simulation.sweep
         if sweep is None:
             return
@@ -687,7 +689,7 @@ class SimulatedDevice:
             self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
-        """Plan the fillers that are sent in a pause, and return the end of the pause."""
+        """Plan the fillers that are sent during a pause, and return the end of the pause."""
         for step in range(PAUSE_FILLERS if self.sensor.fillers else 0):
             data = bytes([self._source.choice(self.sensor.fillers)])
             self._put(at + seconds * SECOND * (step + 1) / (PAUSE_FILLERS + 1), link, "", data)

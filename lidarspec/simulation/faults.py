@@ -1,8 +1,8 @@
 """Inject faults into the data of a simulated sensor.
 
 The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor, IMU noise
-and faults of the clock. For the same seed and the same packets, the faults are the same, even if
-the packets are split into different batches.
+and faults of the clock. The seed and the packets determine the faults. The sizes of the batches do
+not matter.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.spec.fields import duration, share
 
 #: Fraction of datagrams that are delayed if `reorder` is set.
 DELAYED_SHARE = 0.1
-#: The value of `rotor` for a rotor that does not turn.
+#: Value of `Faults.rotor` for a rotor that does not turn.
 BLOCKED = "blocked"
 
 
@@ -110,8 +110,8 @@ class FaultyLink:
 
     Attributes:
         sent: number of packets that were passed to `transmit`.
-        intact: number of packets that arrive without a corrupt byte.
-        lost: number of packets that are dropped.
+        intact: number of packets that arrived without a corrupt byte. lost: number of packets that
+            were dropped.
 
     Raises:
         UsageError: if a byte stream is to be reordered.
@@ -158,7 +158,7 @@ class FaultyLink:
         return arrived
 
     def _draw_gap(self) -> int:
-        """Return a random number of valid bytes before the next corrupt byte."""
+        """Draw the number of valid bytes before the next corrupt byte."""
         rate = self._faults.errors
         if rate in (0.0, 1.0):
             return 0

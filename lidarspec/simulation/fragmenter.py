@@ -1,6 +1,6 @@
 """Split messages into datagrams, as `lidarspec.spec.links.Assembled` declares.
 
-It is the reverse of `lidarspec.framing.datagram_assembly`.
+`lidarspec.framing.datagram_assembly` does the reverse.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Assembled
 
-#: Maximum size of the part of a message in one datagram; with its head it fits an Ethernet frame.
+#: Maximum number of bytes of a message in one datagram. With its header, the datagram fits into an
+#: Ethernet frame.
 MAX_PART_BYTES = 1400
 MAX_DATAGRAM_BYTES = 65_535
 

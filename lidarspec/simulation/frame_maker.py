@@ -1,8 +1,8 @@
 """Make frames from physical values by path; all other fields are 0.
 
 Constants and checksums are filled in. Unlike `build`, `FrameMaker` makes many frames at once, and
-requires only some fields, for example those that a `sweep` returns. The values of header fields,
-such as counts, determine the layout of a frame, as in a decoder.
+requires values for only some fields, for example the fields that a `sweep` returns. As in a
+decoder, the values of header fields, such as counts, determine the layout of a frame.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class FrameMaker:
 
     @classmethod
     def of_struct(cls, sensor: str, frame: Frame) -> FrameMaker:
-        """Return a maker for a struct that is no frame type of a sensor.
+        """Return a maker for a struct that is not a frame type of the sensor.
 
         Args:
             sensor: the id of the sensor, for errors.
@@ -112,8 +112,8 @@ class FrameMaker:
     def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return a table with one frame for each mapping of field paths to values.
 
-        Values are physical; codes may be given by their names. An array of bytes may be given as
-        bytes, and a part as a mapping of the same form.
+        Values are physical. The value of an enum may be given by its name, an array of bytes as
+        bytes, and a part as a mapping like that of a frame.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -163,7 +163,7 @@ class FrameMaker:
         return frames
 
     def _with_texts(self, values: Values) -> Values:
-        """Return the values of a frame, with texts as bytes, and the sizes that their ends give."""
+        """Return the values of a frame, with texts as bytes, and with the sizes of texts."""
         result = dict(values)
         for path, info in self._decoded.items():
             value = result.get(path)
@@ -200,8 +200,8 @@ class FrameMaker:
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
         """Return the values of a frame without its parts, and the bytes of the parts.
 
-        The values contain the sizes and counts of the parts. The bytes are given by path of the
-        parts.
+        The values include the sizes and counts of the parts. The second dict has the bytes of each
+        array of parts, by its path.
         """
         result = dict(values)
         parts_by_axis = dict[str, bytes]()
@@ -239,9 +239,9 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the first field of a formula so that the formula gives `number`.
+        """Set the first field of a formula so that the result of the formula is `number`.
 
-        A field that has a value is not changed.
+        If this field has a value already, nothing is changed.
         """
         if formula is None:
             paths = []
@@ -255,7 +255,7 @@ class FrameMaker:
             values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
     def _layout(self, values: Values) -> Layout:
-        """Return the layout of a frame with these values of header fields."""
+        """Return the layout of a frame whose header fields have these values."""
         while True:
             header = {path: self._raw(values, path) for path in self._layout_fields}
             key = tuple(header.values())

@@ -23,7 +23,7 @@ def round_raw(info: FieldInfo, raw: Floats) -> Floats:
 
 
 class PartRows(CompiledTable):
-    """The parts of frames that contain the points.
+    """A table of the parts that contain the points, taken from frames.
 
     Args:
         frames: the frames. `put_back` writes the parts into them.

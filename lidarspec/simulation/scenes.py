@@ -35,7 +35,7 @@ from lidarspec.errors import UsageError, did_you_mean
 from lidarspec.trusted_files import read_document
 
 Floats = NDArray[np.float64]
-#: A number for all beams, or an array that broadcasts against the beams.
+#: A number that applies to all beams, or an array that broadcasts against the beams.
 Value = Any
 Vector = tuple[Value, Value, Value]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
@@ -58,13 +58,16 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box by its corners, in metres, in the sensor's axes."""
+    """An upright box, given by its lowest and its highest corner.
+
+    The corners are in metres, in the sensor's axes.
+    """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """Return the lowest and the highest corner in metres, which do not depend on time."""
+        """Return the lowest and the highest corner in metres; `time` is ignored."""
         return self.low, self.high
 
     @property
@@ -166,7 +169,7 @@ class Room:
 def _shorten_ranges(
     ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value
 ) -> None:
-    """Shorten the ranges of the beams that hit a body from outside, in place."""
+    """Reduce the ranges of beams that hit the outside of a body, in place."""
     low, high = body.at(time)
     near = _may_hit(body, low, high, beams, origin)
     where = np.flatnonzero(np.broadcast_to(near, ranges.shape))
@@ -193,7 +196,7 @@ def _shorten_ranges(
 def _may_hit(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
     """Return a mask of the beams that may hit a body.
 
-    All other beams miss the sphere around the body.
+    All other beams miss even the sphere that contains the body.
     """
     middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     aside = np.sqrt(sum(np.max(np.square(part)) for part in origin))

@@ -6,21 +6,21 @@ A block of packets is made in four steps:
    The packets are filled with these values.
 2. The sensor's `points` gives the directions of the beams.
 3. The scene gives the range of each beam.
-4. The ranges are written into the fields that they come from, through the scale of these fields
+4. The ranges are converted with the scale of the range fields, and written into these fields
    (`Measurement`).
 
 The last step does not need an inverse of `points`. To find the points that depend on a field, each
-field in metres is set to a probe value. If directions depend on ranges, the steps are repeated; a
-beam with a direction that keeps changing gets no return. If the sensor declares a function
-`encode`, it gets the measured points and returns the values of the fields instead.
+field in metres is set to a probe value. If directions depend on ranges, steps 2 to 4 are repeated;
+a beam whose direction keeps changing gets no return. If the sensor declares a function `encode`,
+this function gets the measured points and returns the values of the fields instead.
 
 The directions of beams cannot be calculated from Cartesian points, so the spec declares the
-directions. The coordinates are linear in the raw values of fields, and the equations are solved for
-the point that a beam hits (`PointPlacement`).
+directions. The coordinates are linear functions of the raw values of fields. The resulting
+equations are solved for the point that a beam hits (`PointPlacement`).
 
-The time of each packet comes from the first of these that the spec has: the declared rate; the
-sensor's clock, which `sweep` sets; the times of the points in a packet; the baud rate of the serial
-line.
+The time of each packet is calculated from the first of the following that the spec declares: the
+packet rate; the sensor's clock, which `sweep` sets; the times of the points in a packet; the baud
+rate of the serial line.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ from lidarspec.spec.timing import Every
 Times = NDArray[np.int64]
 #: Number of bits on a serial line for each byte: a start bit, eight data bits and a stop bit.
 BITS_PER_BYTE = 10
-#: If a clock deviates from equal steps by less than this, it is considered coarse, and the steps
-#: equal.
+#: If a clock deviates from equal steps by less than this, the deviation is attributed to its coarse
+#: resolution, and equal steps are used.
 CLOCK_TOLERANCE_NS = 1_000_000
-#: Number of packets to simulate after the last requested packet, because directions may depend on
-#: the next packet.
+#: Number of packets that are simulated after the last requested packet. They are needed because
+#: directions may depend on the next packet.
 AHEAD = 1
 #: Maximum number of packets that are made to find the fields with ranges, and the packet rate.
 MAX_PROBED_PACKETS = 256
-#: Number of packets that show the fields of the clock.
+#: Number of packets from which the fields of the clock are found.
 CLOCK_PROBE_PACKETS = 2
 #: Maximum total size of these packets. The next constant is their minimum number.
 MAX_PROBED_BYTES = 1 << 21
@@ -91,7 +91,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: index in the last axes of the points, for points that the field determines.
+        inner: index of the points that the field determines, in those last axes of the points that
+            the field does not have.
         step: metres per raw step; None if it differs between packets, for example because of a
             value in the header or a calibration.
         zero: range of the raw value 0, metres.
@@ -105,7 +106,7 @@ class RangeField:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a table of packets; the first axis of the arrays is the packet.
+    """The beams of a table of packets; the first axis of each array is the packet.
 
     The arrays broadcast against each other.
 
@@ -181,7 +182,8 @@ class Measurement:
 
         Args:
             table: the frames, or the parts of frames.
-            numbers: number of each packet; for parts, of the packet that contains the part.
+            numbers: number of each packet in the sweep; for parts, the number of the packet that
+                contains the part.
             scene: the scene.
             times: time of each packet, (n,) seconds since the scene began.
         """
@@ -208,7 +210,7 @@ class Measurement:
             self._fill_intensity(table, written[self._targets[0].path])
 
     def _fill_intensity(self, table: CompiledTable, ranges: NDArray[Any]) -> None:
-        """Write an intensity for each range. Without a return, it is 0."""
+        """Write an intensity for each range; 0 for a beam without a return."""
         write_raw(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
 
     def beams(self, table: CompiledTable) -> Beams:
@@ -267,7 +269,7 @@ class Measurement:
     def _values(
         self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
-        """Return {path: raw values} of the fields for these ranges."""
+        """Return the raw values of the fields that give these ranges, by path."""
         if self._encode is not None:
             polar = Polar(
                 ranges,
@@ -330,8 +332,8 @@ class Measurement:
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
         """Return the fields that ranges depend on linearly, but not by the declared scale.
 
-        These are fields in metres to which `points` applies a correction, and array elements
-        without a unit, if a field of the header has the unit.
+        These are fields in metres to which `points` applies a correction, and elements of arrays
+        that have no unit, if ranges are proportional to them.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -380,7 +382,7 @@ class Measurement:
         return (twice - once) / PROBE_VALUE, 2 * once - twice
 
     def _inner(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
-        """Return the indices in the axes that the points have but the fields do not."""
+        """Return all indices in the axes that the points have but the fields do not have."""
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
             return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
@@ -399,7 +401,7 @@ class Measurement:
 
 
 class PointPlacement(Measurement):
-    """Writes the raw values of the point that each beam hits, for Cartesian points.
+    """For Cartesian points, writes the raw values of the point that each beam hits.
 
     Raises:
         SpecError: if no directions are declared, or no field determines the coordinates of a point.
@@ -420,7 +422,7 @@ class PointPlacement(Measurement):
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Return the declared azimuths and elevations of packets, (n, *shape) each.
 
-        They are nan for points that a shorter packet does not have.
+        Packets with fewer points are padded with nan.
         """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
@@ -477,7 +479,7 @@ class PointPlacement(Measurement):
         return raw_values
 
     def _move(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
-        """Return the coordinates with all fields at 0, then with each at its probe value.
+        """Return the coordinates with all fields 0, then with one field at a time probed.
 
         Each array has the shape (3, n, ...). The table is restored afterwards.
         """
@@ -549,7 +551,7 @@ def _name(frame: str, table: CompiledTable) -> str:
 
 
 def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
-    """Return the result of `points` for a table, as for the first frames of a stream."""
+    """Return the result of `points` for a table of the first frames of a stream."""
     batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
@@ -565,7 +567,7 @@ def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, B
 
 
 def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
-    """Return a batch of frames or parts, as for the first frames of a stream."""
+    """Return a batch of frames or parts, without earlier frames of other types."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -673,7 +675,7 @@ class RestingImu:
         return paths
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
-        """Return the measurements with one field at its probe value, and others at 0."""
+        """Return the measurements with one field at its probe value and the others at 0."""
         write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
@@ -724,7 +726,7 @@ class PacketTimes:
         self.interval = float(times[-1]) / (len(times) - 1)
 
     def times(self, table: CompiledTable, beams: Callable[[], Beams]) -> Times:
-        """Return the time of each packet of a batch since the first, (n,) ns.
+        """Return the times of the packets of a batch, since the first packet, (n,) ns.
 
         Args:
             table: the packets.
@@ -781,8 +783,8 @@ class PacketBlock:
 
     Attributes:
         frames: the bytes of each packet.
-        times: times since the first packet, of each packet and of the packet after the last, (n +
-            1,) int64 ns.
+        times: time of each packet, and of the packet after the last, since the first packet of the
+            block, (n + 1,) int64 ns.
     """
 
     frames: list[bytes]
@@ -795,8 +797,8 @@ class FrameSimulation:
     Args:
         sensor: the sensor.
         frame: the frame type.
-        blocked: whether the rotor does not turn. Angles, and the field that separates scans, then
-            have the values of the second frame in all frames.
+        blocked: whether the rotor does not turn. If so, the angles, and the field that separates
+            scans, have the same values in all frames as in the second frame.
 
     Attributes:
         interval: mean time between packets, ns; 0 if the spec does not determine times.
@@ -858,7 +860,7 @@ class FrameSimulation:
         shake: float = 0.0,
         timeline: ClockTimeline | None = None,
     ) -> PacketBlock:
-        """Return `count` packets, the first with the number `start`.
+        """Return `count` packets of the sweep, beginning with number `start`.
 
         Args:
             start: number of the first packet.
@@ -907,12 +909,12 @@ class FrameSimulation:
         return replace(beams, counts=counts.astype(np.intp))
 
     def _sweep_values(self, numbers: range) -> list[Mapping[str, Any]]:
-        """Return the values of packets that are not measured."""
+        """Return the values that the sweep gives for packets."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
             return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
     def _angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a frame that change because the rotor turns."""
+        """Return the values of a frame that would not change if the rotor did not turn."""
         fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
         assert rule is not None  # as of every sensor with points
@@ -987,7 +989,7 @@ class FramesWithoutPoints:
         return self._get_maker(name).seal(table)
 
     def _fill(self, name: str, numbers: range, values: Mapping[str, Any]) -> CompiledTable:
-        """Return frames with the values of the spec, which these physical values replace."""
+        """Return frames with the values of the spec, except for these physical values."""
         declared = self._sensor.frames[name]
         state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
@@ -1048,8 +1050,8 @@ def simulate(
             switched on at the start of 1970.
 
     Raises:
-        UsageError: if the sensor declares no `sweep`; or, without points, no `rate`. Also if its
-            frames cannot show the faults of the clock.
+        UsageError: if the sensor declares no `sweep`, if a sensor without points declares no
+            `rate`, or if its frames cannot show the faults of the clock.
         SpecError: if no fields that determine the ranges are found.
     """
     timeline = ClockTimeline(clock or ClockFaults())
