@@ -1,8 +1,8 @@
 """A `Device` for asyncio.
 
 `AsyncDevice` calls the methods of a `Device` in its own threads, so that the event loop is never
-blocked. A thread stores each item in a `_ThreadedIterator`, and an awaited call takes it from
-there. If the call is cancelled, the item is kept for the next call.
+blocked. A thread stores each item in a `_ThreadedIterator`, from which an awaited call takes it. If
+the call is cancelled, the item is kept for the next call.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from lidarspec.scans.selection import EVERYTHING, Selection
 from lidarspec.sensor_operations import Sensor
 
 T = TypeVar("T")
-#: Longest wait of a thread before it returns to the event loop, which may have cancelled the call.
+#: Maximum time that a thread waits before it returns to the event loop, which may have cancelled
+#: the call.
 _MAX_WAIT_S = 0.2
 
 
@@ -221,8 +222,8 @@ async def _run(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
 async def _finish(future: asyncio.Future[T]) -> T:
     """Return the result of a future.
 
-    If the caller is cancelled, wait until the future is done before raising. A device that is only
-    half opened or half closed would keep its port.
+    If the caller is cancelled, CancelledError is raised only after the future is done. Otherwise, a
+    device that is not completely opened or closed would keep its port.
     """
     try:
         return await asyncio.shield(future)

@@ -4,9 +4,10 @@ The thread only reads, records and queues, so that no byte is lost if the consum
 recording contains everything that arrives. The queue has a maximum size. If it is full, the policy
 "drop_oldest" drops the oldest chunks, and "block" makes the thread wait.
 
-If the device disappears, the thread reports this, tries to open the device again with growing
-pauses, and marks the first chunk after the gap. Silence is the sum of the durations of reads that
-returned nothing, so that time in which the thread did not run does not count.
+If the device disappears, the thread reports this, and tries to open the device again with growing
+pauses between the attempts. It marks the first chunk after the gap. The duration of a silence is
+the sum of the durations of reads that returned nothing. Time during which the thread did not run is
+not included.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL_S, Chunk, Disconnected, LiveTransport
 
-#: The limits of a queue have room for several seconds of data of the fastest sensors.
+#: The limits of a queue. They allow several seconds of data of the fastest sensors.
 MAX_QUEUED_CHUNKS = 1 << 16
 MAX_QUEUED_BYTES = 1 << 25
-#: The pause between attempts to open a device again grows from the first value to the second.
+#: First and longest pause between attempts to open a device again.
 MIN_RETRY_PAUSE_S = 0.02
 MAX_RETRY_PAUSE_S = 0.25
 POLICIES = ("drop_oldest", "block")
 
 
 class LinkEvent(Enum):
-    """An event on a link that is not data."""
+    """An event on a link, other than arriving data."""
 
     SILENT = "silent"
     LOST = "lost"
@@ -50,8 +51,8 @@ class BoundedQueue:
     `len` returns the number of chunks in the queue.
 
     Args:
-        policy: what `put` does if the queue is full: "drop_oldest" drops the oldest chunks, "block"
-            waits.
+        policy: what `put` does if the queue is full. "drop_oldest" drops the oldest chunks, and
+            "block" waits.
         chunks: maximum number of chunks in the queue.
         size: maximum total size of the chunks in the queue, in bytes.
 
@@ -115,8 +116,8 @@ class BoundedQueue:
 
         Args:
             timeout: seconds to wait.
-            until: the time (of `time.monotonic`) until which events are collected, limited by
-                `timeout`.
+            until: a time of `time.monotonic` until which events are collected, at most for
+                `timeout` seconds.
             chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
@@ -189,7 +190,7 @@ class CaptureThread:
     Attributes:
         transport: the transport.
         connected: whether the device is connected.
-        disconnects: how often the device has disappeared.
+        disconnects: number of times that the device has disappeared.
         last_arrival: the time of `time.monotonic` when data last arrived; if none has arrived, the
             time when the transport was opened.
         warnings: warnings about the host's clock.

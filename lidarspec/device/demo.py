@@ -1,4 +1,4 @@
-"""Demonstrate a session with a simulated sensor, end to end.
+"""Demonstrate a complete session with a simulated sensor.
 
 A simulated serial sensor sends through a pseudo-terminal, or through a TCP port on systems without
 pseudo-terminals. Other simulated sensors send over UDP to this computer. Some of the sent data is
@@ -32,9 +32,9 @@ from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
-#: The time limit for all scans is this time and one second for each scan.
+#: The time limit for all scans is this time plus one second for each scan.
 EXTRA_TIMEOUT_S = 15.0
-#: After this time without a scan, all sent data has arrived.
+#: After this time without a scan, all data that was sent is considered to have arrived.
 DRAINED_AFTER_S = 0.2
 
 
@@ -74,12 +74,13 @@ def demonstrate(
 
     Args:
         turns: the number of complete scans.
-        errors: for a stream, the share of damaged bytes, at most one in the size of the longest
-            data frame; for datagrams, the share of lost datagrams.
+        errors: for a stream, the share of damaged bytes, limited to one byte in the length of the
+            longest data frame; for datagrams, the share of lost datagrams.
         seed: the seed of the errors and the scene.
 
     Raises:
-        SourceError: if the interface cannot be opened, or the scans do not arrive in time.
+        SourceError: if the simulated sensor's port cannot be opened, or the scans do not arrive in
+            time.
         PluginError: if a function of the plugin raises.
     """
     longest = sensor.frames[sensor.data_frame].max_length

@@ -1,4 +1,4 @@
-"""A sensor on a source: it yields packets and scans, and sends commands.
+"""A sensor on a source: it yields packets and scans, and takes commands.
 
 A `Device` gets frames from its input, which is a `FileInput` or a `LiveInput` with the same
 interface. A `PacketReader` makes packets and scans from the frames.
@@ -44,9 +44,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport, Transport
 
-#: number of frames at the start that are compared with related models.
+#: number of frames at the start of the input that are compared with related models.
 _MAX_CHECKED_FRAMES = 64
-#: An iterator without a limit waits for data in steps of this length.
+#: An iterator without a time limit waits for data in steps of this length.
 _LONG_WAIT_S = 3600.0
 
 
@@ -264,15 +264,15 @@ class Device(ClosingContext):
         """Yield scans, until the input ends or the device is closed.
 
         The first and the last scan, and the scans before and after an interruption, have
-        ``complete=False``. A scan without an end is yielded after twice the longest revolution of
-        the sensor, and `warnings` reports it.
+        ``complete=False``. A scan whose end does not arrive is yielded after twice the duration of
+        the sensor's longest revolution, and `warnings` reports it.
 
         A file is read only once: all iterators share one position in it. After `latest`, a new
         iterator begins with the batch that contains the end of the returned scan.
 
         Args:
             wait: if no scan arrives for this number of seconds, yield None.
-            select: the scans, and the parts of them, to yield. Reading stops after the last
+            select: which scans, and which parts of them, to yield. Reading stops after the last
                 selected scan. Long parts of a recording before the first selected scan are skipped.
 
         Raises:
@@ -314,7 +314,7 @@ class Device(ClosingContext):
                 yield_timer.restart()
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """Return the newest whole scan; wait for one that was not returned before.
+        """Return the newest whole scan; wait if it was already returned.
 
         Older scans are dropped. For a file, each call returns the next whole scan.
 
@@ -403,8 +403,8 @@ class Device(ClosingContext):
     def delay_decoding(self, until: float) -> None:
         """Collect arriving data until a time, and decode it together.
 
-        This needs less processor time. An iterator with `wait` delays its data by at most `wait`
-        seconds. For a file, this has no effect.
+        Decoding more data at a time needs less processor time. An iterator with `wait` delays its
+        data by at most `wait` seconds. For a file, this method has no effect.
 
         Args:
             until: a time of `time.monotonic`.
@@ -414,9 +414,10 @@ class Device(ClosingContext):
     def read_ahead(self, size: int) -> None:
         """Read a file in portions of about `size` bytes from now on.
 
-        Small portions keep the counters and a `DecoderObserver` close to the packets that were
-        returned last, for example to show a file at its recorded pace. The default of 0 selects the
-        fastest size. For a live source, this has no effect.
+        With small portions, the counters and a `DecoderObserver` are hardly ahead of the packets
+        that were returned last. A viewer needs this to show a file at its recorded speed. A size of
+        0, the default of a device, selects the fastest size. For a live source, this method has no
+        effect.
         """
         self._input.read_ahead(size)
 
@@ -448,8 +449,8 @@ class Device(ClosingContext):
     def write(self, data: bytes, link: str = "data") -> None:
         """Send bytes as they are, without waiting for a reply.
 
-        A reply arrives among the other frames. The bytes are not interpreted: if they start the
-        sensor, `close` does not stop it.
+        A reply arrives among the other frames. The bytes are not interpreted. If they start the
+        sensor, `close` therefore does not stop it.
 
         Args:
             data: the bytes.
@@ -617,10 +618,10 @@ class Device(ClosingContext):
 
 
 class _YieldTimer:
-    """Decides when an iterator without new data has to yield.
+    """Measures when an iterator has to yield although no data has arrived.
 
     Args:
-        wait: longest time between two yields, in seconds; None for no limit.
+        wait: maximum time between two yields, in seconds; None for no limit.
     """
 
     def __init__(self, wait: float | None) -> None:
@@ -651,12 +652,13 @@ def open(
             "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
             "capture.pcap", or a device name from `lidarspec.toml`.
         sensor: an id, a path to a sensor's module, or a Sensor; by default it is detected.
-        backend: evaluates `points`: "auto", "numpy" or "jit".
-        start: False omits the commands that the sensor declares for opening and closing.
-        record: a new file, or a `Recorder`, for everything that arrives and is sent; or a function
-            that makes a recorder for the open transport.
-        overflow: the policy if the consumer of a live source is too slow: "drop_oldest" or "block".
-            The default is "block" for a simulated sensor without a rate, else "drop_oldest".
+        backend: the backend that evaluates `points`: "auto", "numpy" or "jit".
+        start: whether to send the commands that the sensor declares for opening and closing.
+        record: where to record everything that arrives and is sent: a new file, a `Recorder`, or a
+            function that makes a recorder for the open transport.
+        overflow: what happens if the data of a live source is consumed too slowly: "drop_oldest" or
+            "block". The default is "block" for a simulated sensor without a rate, else
+            "drop_oldest".
         period: seconds between two decodings of the data that has arrived.
 
     Raises:
@@ -680,7 +682,10 @@ def open(
 
 
 def _describe_nominal(sensor: Sensor) -> str:
-    """Return a warning about a nominal calibration, with the option that replaces it."""
+    """Return a warning that the calibration is nominal.
+
+    It names the option that sets the calibration of the unit.
+    """
     text = f"{sensor.id}: points use the nominal calibration of the model, not that of the device"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
@@ -713,7 +718,7 @@ def _make_recorder(
 
 
 def _close(source: DeviceInput | Transport, recorders: list[TrafficLog]) -> None:
-    """Close source and recorders, the recorders even if the source raises."""
+    """Close the source, and then the recorders even if closing the source fails."""
     try:
         source.close()
     finally:

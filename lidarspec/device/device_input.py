@@ -1,7 +1,7 @@
 """The interface of a device's input (`DeviceInput`), and the input of a file (`FileInput`).
 
-An input returns frames in batches. `FileInput` reads a file or standard input as fast as the caller
-requests batches. `live_input.LiveInput` reads a live source.
+An input returns frames in batches. `FileInput` reads a file or standard input, one batch each time
+the caller requests one. `live_input.LiveInput` reads a live source.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """The frames of a piece of input, in stream order.
+    """The frames in a portion of the input, in stream order.
 
     Attributes:
         frames: the frames of all incoming types.
@@ -54,7 +54,7 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    The methods with a body are implemented for sources that are not live.
+    Methods that are implemented in this class have the behaviour for sources that are not live.
 
     Attributes:
         is_live: whether data arrives from a live source, not from a file.
@@ -62,7 +62,8 @@ class DeviceInput(Protocol):
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
-        info_frames: the last frame that contained each fact of `Sensor.info`, from any link.
+        info_frames: for each fact of `Sensor.info`, by name, the last frame from any link that
+            contained it.
     """
 
     is_live: bool = False
@@ -75,7 +76,7 @@ class DeviceInput(Protocol):
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
         """Keep the latest frame that contains each fact of `Sensor.info`.
 
-        A frame that contains other frames is ignored if it lacks values of an earlier frame.
+        A frame with parts is ignored if it lacks facts that the stored frame contains.
         """
         for frames in batches:
             for role, fact in self.sensor.reported.items():
@@ -93,7 +94,7 @@ class DeviceInput(Protocol):
                 self.info_frames = {**self.info_frames, role: item}
 
     def _lacks_values(self, role: str, item: Found) -> bool:
-        """Return whether a frame with frames in it lacks values of an earlier frame."""
+        """Return whether a frame with parts lacks facts that the stored frame contains."""
         earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False
@@ -155,7 +156,8 @@ class DeviceInput(Protocol):
         """Send the commands that the sensor declares for opening.
 
         Raises:
-            CommandError: if the device does not start, unless it sends data nevertheless.
+            CommandError: if an opening command fails. A missing reply is only a warning if the
+                sensor sends data, or can be read without the values in the reply.
         """
 
     def next(self, wait: float) -> FrameBatch | None:
@@ -194,7 +196,7 @@ class DeviceInput(Protocol):
         """
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes as they are; a reply is read like all other data.
+        """Send bytes without interpreting them; a reply is read like all other data.
 
         Raises:
             UsageError: if `data` is a str, or if the sensor does not have the link.
@@ -218,7 +220,7 @@ class DeviceInput(Protocol):
 def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     """Return the frames that consecutive chunks complete.
 
-    Each frame has the arrival time of the chunk that holds its last byte.
+    Each frame has the arrival time of the chunk that contains its last byte.
     """
     if not decoder.stream:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
@@ -240,7 +242,7 @@ def _decode_stream(
 ) -> Iterator[list[Frames]]:
     """Yield the frames in captured datagrams that carry a byte stream.
 
-    Each frame has the arrival time of the datagram that holds its last byte.
+    Each frame has the arrival time of the datagram that contains its last byte.
 
     Args:
         size: number of bytes that are decoded together.
@@ -255,7 +257,7 @@ def _decode_stream(
 def _set_arrival(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
-    """Return frames with the arrival time of the piece that holds their last byte.
+    """Return frames with the arrival time of the chunk that contains their last byte.
 
     Args:
         batches: the frames.
@@ -277,7 +279,7 @@ def select_frames(batches: Sequence[Frames], names: frozenset[str]) -> list[Foun
     return selected
 
 
-#: Chunks are decoded together until they reach one of these limits.
+#: Chunks are collected until they reach one of these limits, and decoded together.
 BATCH_BYTES = 1 << 18
 BATCH_CHUNKS = 1024
 
@@ -425,7 +427,7 @@ class FileInput(DeviceInput):
     def _iter_chunk_batches(self) -> Iterator[list[Chunk]]:
         """Yield the chunks in batches to decode together.
 
-        A batch ends before a gap or a silence, because an incomplete frame cannot continue there.
+        A batch ends before a gap or a silence, because no frame continues after it.
         """
         batch: list[Chunk] = []
         size = 0

@@ -3,11 +3,12 @@
 Decoding from the middle of a file needs state from the bytes before that position, for example an
 incomplete frame, the number of clock wraps and the direction of rotation. A bookmark is this state,
 pickled. The scans that are read from a bookmark on are identical to the scans of an uninterrupted
-reading. The functions and structs of a sensor cannot be pickled, but no input changes them. A
-bookmark therefore refers to them by name, and the sensor that is given on resuming supplies them.
+reading. The functions and structs of a sensor cannot be pickled, but they do not depend on the
+input. A bookmark therefore refers to them by name. When reading is resumed, they are taken from the
+sensor that the caller passes.
 
-A bookmark divides a file into pieces. A scan belongs to the piece in which it begins: the piece
-before a bookmark reads its last scan to the end, and the piece after it omits that scan.
+Bookmarks divide a file into pieces. A scan belongs to the piece in which it begins. Therefore, the
+last scan of a piece is read to its end beyond the bookmark, and the next piece omits this scan.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class FileScans(ClosingContext):
 
     @property
     def stats(self) -> Counters:
-        """The counters of everything read, including the part before the bookmark."""
+        """The counters of everything read, including everything before the bookmark."""
         return self._input.stats
 
     @property
@@ -151,7 +152,8 @@ class FileScans(ClosingContext):
     def _make_bookmark(self) -> bytes | None:
         """Return the pickled state.
 
-        None if the state cannot be pickled, or if the file cannot be read from this position.
+        Returns None if the state cannot be pickled, or if the file cannot be read from this
+        position.
         """
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_resume:

@@ -1,6 +1,7 @@
 """Find the frames of a file that are used from its first packet on.
 
-They are the first frame of each state type, and the first frame that dates the clock.
+They are the first frame of each type in `Sensor.state`, and the first frame that provides a date
+for the clock.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
 
-#: The search for a frame that dates the clock ends after this number of bytes without one.
+#: The search for a frame that provides a date for the clock ends after this number of bytes.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
@@ -26,7 +27,7 @@ class FirstFrames:
 
     Attributes:
         state: the first frame of each type that `points` depends on, by name.
-        reference: the first frame that dates the clock; None if no frame does.
+        reference: the first frame that provides a date for the clock; None if no frame does.
     """
 
     state: dict[str, bytes] = field(default_factory=dict)
@@ -34,7 +35,7 @@ class FirstFrames:
 
 
 def needs_first_frames(sensor: Sensor) -> bool:
-    """Return whether later frames of a file can be used from the first packet on."""
+    """Return whether packets may need frames that arrive later in the file."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
@@ -78,7 +79,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
 def _find_reference(
     sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
-    """Return the first valid reference of the clock in some frames, else None."""
+    """Return the first valid date for the clock in some frames, else None."""
     assert sensor.clock is not None
     table = get_codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:

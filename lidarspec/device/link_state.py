@@ -18,9 +18,10 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
 
-#: A warning is given if bytes arrive without a frame for this time.
+#: A warning is issued if bytes arrive for this time without containing a frame.
 FRAMELESS_WARNING_S = 0.9
-#: A source without data for this time is silent. Even a busy computer reads more often.
+#: A source without data for this time is considered silent. Even a busy computer reads more often
+#: than this.
 SILENT_AFTER_S = 3.0
 
 
@@ -113,7 +114,7 @@ class LinkState:
         return [f"{self._source}: {text}; next: {self.suggest_command()}"]
 
     def suggest_command(self) -> str:
-        """Return the shell command, or the step, that helps with the current problem."""
+        """Return the shell command, or the action, that helps with the current problem."""
         other = self._other_sender
         if other is not None and self.name == "silent":
             chosen = with_option(self._source, "src", endpoint(other))
@@ -127,7 +128,7 @@ class LinkState:
         return self._senders.other_sender or self._transport.other_sender
 
     def _describe_others(self) -> str:
-        """Return a clause about datagrams of other senders; "" if none have arrived."""
+        """Return a clause for a message about datagrams of other senders; "" without such."""
         other = self._other_sender
         if other is None:
             return ""

@@ -4,8 +4,8 @@ The capture threads queue chunks, which are decoded together every few milliseco
 
 `next` decodes the chunks that have arrived and returns the frames. While it waits, it also runs the
 `Session`: it sends requests, and passes frames that may be replies to the session. Only one thread
-may run the decoders at a time. If `send` is called in another thread meanwhile, it waits for its
-reply. `LinkState` watches the data link.
+may run the decoders at a time. A call of `send` in another thread waits until this thread has found
+its reply. `LinkState` watches the data link.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 PERIOD_S = 0.02
 #: A thread waits for data at most this long before other threads may run the decoders.
 MAX_PUMP_S = 0.05
-#: how long `write` waits for a datagram if the address is known only from its first datagram.
+#: how long `write` waits for a first datagram if the sensor's address is only known from it.
 SENDER_TIMEOUT_S = 0.9
 #: maximum number of chunks that are decoded together.
 MAX_CHUNKS = 4096
-#: maximum number of batches that are kept for `next` while commands are sent.
+#: maximum number of batches that are kept for `next` while `send` runs the decoders.
 MAX_READY_BATCHES = 4096
-#: pause before the commands for opening are sent again, if the port of the data is unknown.
+#: pause before the opening commands are sent again, if no reply has reported the data port.
 REPEAT_PAUSE_S = 1.0
-#: time limit for all commands on closing.
+#: time limit for all closing commands together.
 SHUTDOWN_TIMEOUT_S = 4.0
 
 
@@ -66,12 +66,12 @@ class LiveInput(DeviceInput):
         source: the source.
         sensor: the sensor on the source.
         opened: the open transport of the data link.
-        backend: calculates points: "auto", "numpy" or "jit".
+        backend: the backend that evaluates `points`: "auto", "numpy" or "jit".
         policy: what happens if the queue is full, "drop_oldest" or "block"; see `BoundedQueue`.
         record: a function that makes the recorder for the configured sensor, or returns None. The
             recorder gets all data that is sent or arrives.
-        will_begin: whether `begin` will be called. If the sensor then reports options, all earlier
-            data is discarded.
+        will_begin: whether `begin` will be called. If the sensor reports options during `begin`,
+            all earlier data is discarded.
         period: seconds between two decodings.
     """
 
@@ -317,7 +317,7 @@ class LiveInput(DeviceInput):
             self._write(OutgoingData(link, bytes(data)))
 
     def _await_sender(self, link: str, seconds: float) -> None:
-        """Wait for a datagram if the sensor's address is known only from its first one."""
+        """Wait for a datagram if the sensor's address is only known from a first datagram."""
         data = self._captures["data"].transport
         is_known = (
             link in self._captures
@@ -374,7 +374,7 @@ class LiveInput(DeviceInput):
         """Run the decoders once, unless another thread runs them.
 
         Args:
-            pending: if this is done, the decoders do not run.
+            pending: a command that the caller waits for; if it is done, the decoders do not run.
         """
         if not self._decoder_lock.acquire(timeout=MAX_PUMP_S / 5):
             return
@@ -387,11 +387,11 @@ class LiveInput(DeviceInput):
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
-        """Decode data that arrives within `wait` seconds, and drive the session.
+        """Decode data that arrives within `wait` seconds, and run the session.
 
-        A request times out only after the arrived data was searched for its reply. If its deadline
-        passed more than `MAX_PUMP_S` ago, the computer is busy and the reply may be late as well,
-        so this still waits the full time.
+        Before a request times out, all data that has arrived is searched for its reply. If its
+        deadline passed more than `MAX_PUMP_S` ago, the computer is busy and the reply may be late
+        as well. In this case, the method waits for the full time before the request times out.
         """
         with self._session_lock:
             deadline = self._session.deadline
@@ -458,7 +458,7 @@ class LiveInput(DeviceInput):
             self._deliver(link, decode_chunks(decoder, chunks))
 
     def _decode_senders(self, chunks: list[Chunk]) -> None:
-        """Decode the sensor's chunks among chunks of the data link from several senders."""
+        """Decode chunks of the data link, but only those that the sensor sent."""
         chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return
@@ -521,14 +521,15 @@ class LiveInput(DeviceInput):
 
     @property
     def _reported_port_name(self) -> str:
-        """The name of the value with the port of the data; "" if the port is fixed."""
+        """The name under which replies report the data port; "" if the port is fixed."""
         link = self.sensor.links.get("data")
         return link.reported if isinstance(link, Tcp) else ""
 
     def _connect_to_reported_port(self) -> None:
         """Connect to the port of the data, if a reply has just reported it.
 
-        The next command may start the data, so that it must not be sent before.
+        The connection has to be made before the next command is sent, because this command may
+        start the data.
         """
         transport = self._captures["data"].transport
         port = self._session.provided.get(self._reported_port_name)
@@ -581,7 +582,7 @@ class LiveInput(DeviceInput):
                 ]
 
     def _send_outgoing(self) -> LidarSpecError | None:
-        """Send the outgoing data of the session; fail its requests if that is impossible.
+        """Send the session's outgoing data; if this fails, fail the session's requests.
 
         Returns:
             The error; None if everything was sent.
@@ -632,7 +633,7 @@ def _is_broadcast(link: Link | None) -> bool:
 
 
 def _join_chunks(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
-    """Return events with consecutive chunks of one link as a list, up to each gap."""
+    """Return events; consecutive chunks of a link become one list, which a gap ends."""
     joined: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
     run: list[Chunk] = []  # the last list of chunks; empty after another event
     for link, item in events:

@@ -6,12 +6,13 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name can be used wherever a SOURCE is expected; write ``./front`` for a file called front. Two
-files are read: the file in the user's configuration directory, and the nearest file owned by the
-user in the working directory or above it. The second file cannot override names of the first. A
-project may be untrusted, so unless the user has allowed its folder, its file cannot run Python or
-refer to paths outside the folder. A mistake in a file disables only the devices of that file. The
-table [owners] in the user's own file decides which plugin provides a sensor; `plugins` reads it.
+A name can be used wherever a SOURCE is expected. A file called front is written as ``./front``. Two
+files are read: the file in the user's configuration directory, and the project's file. The latter
+is the nearest file, in the working directory or above it, that the user owns. It cannot override
+names of the user's file. A project may be untrusted. Unless the user has allowed its folder, the
+project's file cannot run Python or refer to paths outside the folder. A mistake in a file disables
+only the devices of that file. The table [owners] in the user's own file decides which plugin
+provides a sensor; `plugins` reads it.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from lidarspec.trusted_files import (
     resolve_beside,
 )
 
-#: a valid name: it cannot be mistaken for a file, a URL, or a port on Windows.
+#: pattern of a valid name. Such a name cannot be mistaken for a file, a URL, or a port on Windows.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
 _KEYS = ("source", "sensor", "mount", "options")
 
@@ -56,7 +57,7 @@ class NamedDevice:
         mount: the pose of the sensor; None if not given.
         options: options of the sensor.
         file: the settings file.
-        shadowed_file: another settings file with a device of this name, which is ignored; "" if
+        shadowed_file: another settings file that has a device of this name, which is ignored; "" if
             there is none.
         is_trusted: whether the settings file is the user's own, or in a folder that the user has
             allowed.
@@ -133,8 +134,9 @@ def find_device(source: str | Path) -> NamedDevice | None:
     """Return the device with this name; None for every other SOURCE.
 
     Raises:
-        UsageError: for a mistake in the device's file, with table and key; for a device that is
-            allowed only in a trusted folder; and for a word that is neither a name nor a file.
+        UsageError: for a mistake in the device's file (the message names table and key), for a
+            device that is allowed only in a trusted folder, or for a word that is neither a name
+            nor a file.
         SourceError: if the settings file cannot be read.
     """
     word = str(source)
@@ -167,7 +169,7 @@ def find_device(source: str | Path) -> NamedDevice | None:
 
 
 def read_devices() -> dict[str, NamedDevice]:
-    """Return all devices of valid settings files by name, the user's own first."""
+    """Return the devices of all valid settings files by name, the user's file first."""
     return _read_all()[0]
 
 
@@ -211,7 +213,7 @@ def read_settings_file(path: Path) -> dict[str, NamedDevice]:
     """Return the devices of one settings file by name.
 
     Raises:
-        UsageError: for a mistake in the file, with table and key.
+        UsageError: for a mistake in the file; the message names table and key.
         SourceError: if the file cannot be read.
     """
     content = read_document(path)

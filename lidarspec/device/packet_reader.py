@@ -59,7 +59,7 @@ class PacketReader:
 
     @property
     def waiting_imu(self) -> WaitingSamples | None:
-        """The IMU samples of scans that have not ended; None if scans have no samples."""
+        """The IMU samples of scans that have not ended; None if scans have no IMU samples."""
         if self._imu is not None:
             return self._imu.waiting
         return None
@@ -117,7 +117,7 @@ class PacketReader:
         Args:
             stream: the stream that divides packets into scans.
             batch: the next frames.
-            is_added: whether `batch` was the argument of the last `add`, so its packets are `last`.
+            is_added: whether `add` was already called with `batch`, so that `last` has its packets.
         """
         packets = self.last
         if not is_added:

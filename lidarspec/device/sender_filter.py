@@ -2,9 +2,9 @@
 
 All data of a sensor comes from one IP address. The frames of one type come from one port, which can
 change after a restart. If two ports alternate, they belong to two sensors. In a file, frames of two
-sensors are an error (`SenderCheck`), and the user has to select one. From a live source, the first
-sender of data frames is read (`SenderFilter`), and datagrams of other senders are dropped before
-they are decoded.
+sensors are an error (`SenderCheck`), and the user has to select one. For a live source, the first
+sender of data frames is selected (`SenderFilter`), and datagrams of other senders are dropped
+before they are decoded.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
-#: Maximum number of senders that are examined to find the sensor, and of stored ports.
+#: Maximum number of senders that are examined to find the sensor; also the maximum number of stored
+#: ports.
 MAX_SENDERS = 16
 
 
@@ -61,9 +62,9 @@ class SenderCheck:
                 raise self._make_error(other, sender)
 
     def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
-        """Return the port that alternates with `sender` for frames of a type.
+        """Return another port whose frames of a type alternate with frames of `sender`.
 
-        If no port alternates with it, returns None and stores `sender` as the current port.
+        If there is no such port, returns None and stores `sender` as the current port.
         """
         port = self._current.setdefault(name, sender)
         previous = self._previous.setdefault(name, {})
@@ -96,7 +97,7 @@ class SenderFilter(SenderCheck):
     sender of any frame.
 
     Args:
-        datagrams: whether each datagram is a whole frame, not a piece of a stream.
+        datagrams: whether each datagram is a whole frame, not a part of a byte stream.
 
     Attributes:
         foreign: number of datagrams of other senders so far.
@@ -127,7 +128,7 @@ class SenderFilter(SenderCheck):
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Select a sender that replied on another link, unless one sends data frames already."""
+        """Select a sender that replied on another link, unless the sensor is known."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
@@ -164,9 +165,9 @@ class SenderFilter(SenderCheck):
         return mine
 
     def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
-        """Return the frames from the ports of the sensor, and count the others.
+        """Return the frames from the ports of the sensor, and count the other frames.
 
-        Other ports at the same address belong to other sensors.
+        The other ports at the address of the sensor belong to other sensors.
 
         Args:
             sent: the type and the sender of each frame. If one sender sent all frames, each type is
@@ -188,7 +189,7 @@ class SenderFilter(SenderCheck):
         return frames.select(np.array(mine, np.bool_))
 
     def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
-        """Store the sender of a chunk as the sensor if the frames in the chunk show this.
+        """Store the sender of a chunk as the sensor if the frames in the chunk prove it.
 
         Returns:
             Whether the sender replaces another sender.
@@ -236,7 +237,7 @@ class SenderFilter(SenderCheck):
     def _find_port(self, name: str, sender: Sender) -> Sender:
         """Return the port that frames of a type come from.
 
-        If `sender` alternates with other ports, it is the port, and the others are added to
+        If `sender` alternates with other ports, `sender` is returned, and the others are added to
         `_other_senders`.
         """
         concurrent_port = self._find_concurrent_port(name, sender)

@@ -1,21 +1,23 @@
 """Commands and their replies, without I/O.
 
-Requests go in, and bytes to send come out; frames go in, and replies come out. The caller passes
-all times, in ns of one monotonic clock. Each link has at most one current request. Further requests
-wait in a queue until the current request is done and the device has settled. All frames that arrive
-on the link, including data frames, are compared with the expected reply.
+The session takes requests and returns bytes to send. It takes received frames and returns replies.
+The caller passes all times, in ns of one monotonic clock. Each link has at most one current
+request. Further requests wait in a queue until the current request is done and the device has
+settled. All frames that arrive on the link, including data frames, are compared with the expected
+reply.
 
 A late reply must not be used as the reply to the next request. If no reply to a command arrives in
 time, the session still expects the reply until twice the timeout has passed. If this late reply
-could also be the reply to the next request (they share a frame type, and no field has to differ),
-the next request is held back. If the late reply arrives, it is counted in `late`, and the next
-request is sent. A frame that arrived before a request was sent is not its reply. After twice the
-timeout, only the fields in `matches` or `echoes` distinguish a late reply from the next reply.
+could also be the reply to the next request, the next request is held back. This is the case if both
+replies have the same frame type, and no field has to differ. If the late reply arrives, it is
+counted in `late`, and the next request is sent. A frame that arrived before a request was sent is
+not its reply. After twice the timeout, late replies are no longer expected. Then only the fields in
+`matches` or `echoes` distinguish a late reply from the next reply.
 
-A running number (`Count`) is filled in when a request is made, so that a repeated command has the
-same number; `echoes` then distinguishes its reply from all others. A value that an earlier reply
-provides is filled in when the command is sent, because that reply may still be on its way. The
-owner of the session configures the sensor with the options that a reply reports.
+A running number (`Count`) is filled in when a request is made, so a command that is sent again has
+the same number. With `echoes`, this number distinguishes the reply from all other replies. A value
+that an earlier reply provides is filled in when the command is sent, because that reply may still
+be on its way. The owner of the session configures the sensor with the options that a reply reports.
 """
 
 from __future__ import annotations
@@ -226,11 +228,11 @@ class _PendingCommand:
     """A command in progress.
 
     Attributes:
-        data: the bytes of the command; until it is sent, without values that are not known yet.
-        arguments: its arguments, and the values filled in when it was requested.
+        data: the bytes of the command. Until it is sent, values that are not known yet are missing.
+        arguments: its arguments, and the values that were filled in when it was requested.
         timeout: time from the first sending until the command fails, ns.
         sent: the times of all sendings, ns.
-        wrong: a description of the last frame that had the type of the reply, but other values.
+        wrong: a description of the last frame that had the type of the reply, but wrong values.
     """
 
     name: str
@@ -257,7 +259,7 @@ class _PendingCommand:
 
     @property
     def max_reply_delay(self) -> int:
-        """The time after each sending during which a late reply can arrive, ns."""
+        """The time after each sending until which a late reply can arrive, ns."""
         return 2 * max(self.timeout, _to_ns(self.command.timeout))
 
 
@@ -321,14 +323,14 @@ class Session:
     """The commands of one sensor on its links.
 
     Pass every arriving frame to `receive`, including the frames that `Decoder.idle` returns when
-    the link falls silent. If a device stops in the middle of a frame, the decoder at first takes
-    its reply for the rest of that frame.
+    the link falls silent. This is needed if a device stops in the middle of a frame. The decoder
+    then treats the reply as the rest of this frame, until `idle` is called.
 
     Attributes:
         sensor: the sensor.
         started: whether the sensor was started, and was not stopped afterwards.
         late: number of replies that arrived after their timeout.
-        unanswered: command -> error, of heartbeats without a reply.
+        unanswered: heartbeat commands without a reply, and their errors.
         host: the address of this computer as seen by the sensor; None if unknown.
         port: the port at which this computer expects the data; None if unknown.
         provided: the values that replies have provided (`Command.provides`), by name.
@@ -427,7 +429,7 @@ class Session:
         self._advance(link, now)
 
     def tick(self, now: int) -> None:
-        """Perform everything that is due: repeated commands, timeouts, heartbeats."""
+        """Do everything that is due: send commands again, fail requests, send heartbeats."""
         for name, beat in list(self._heartbeats.items()):
             if now >= beat.due:
                 beat.due = now + _to_ns(self.sensor.commands[name].every)
@@ -491,9 +493,9 @@ class Session:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
     def _fill_values(self, command: Command) -> dict[str, Any]:
-        """Return the values of a command that are known only now.
+        """Return the values of a command that are determined when it is requested.
 
-        They are the next numbers of the session, and the address and the port of this computer.
+        They are the next running numbers, and the address and the port of this computer.
         """
         filled: dict[str, Any] = {}
         for path, value in command.filled.items():
@@ -690,7 +692,7 @@ def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     """Return the values that a reply provides for later commands, by name.
 
     Raises:
-        CommandError: if `provides` raises, or returns something else than texts and numbers.
+        CommandError: if `provides` raises, or returns a value that is not a text or number.
     """
     provides = sensor.commands[reply.command].provides
     if provides is None:
@@ -714,7 +716,7 @@ def provided_values(sensor: Sensor, reply: Reply) -> dict[str, Any]:
 
 
 def _describe_labels(fields: Mapping[str, FieldInfo], values: Any) -> str:
-    """Return all values that have a name, as text; "" if there are none."""
+    """Return the fields whose values have names, as text; "" if there are none."""
     named = {path: get_nested(values, path) for path, info in fields.items() if info.labels}
     return ", ".join(
         f"{path} {value}"

@@ -3,9 +3,9 @@
 A live source is recorded until a limit is reached or the caller stops. A file is copied as fast as
 the disk allows.
 
-If the sensor of a live source is known, a `Device` starts and stops it, and decodes the data to
-count packets. Otherwise a `CaptureThread` reads the source, and nothing is sent. The recorder is
-made after the source is opened, because the format depends on the source.
+If the sensor of a live source is known, a `Device` starts and stops the sensor, and decodes the
+data to count packets. Otherwise a `CaptureThread` reads the source, and nothing is sent. The
+recorder is made after the source is opened, because the format depends on the source.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: time between two checks of the limits and of the disk.
 CHECK_PERIOD_S = 0.1
-#: Numbers in a warning. Warnings that differ only in numbers are reported once.
+#: Matches the numbers in a warning. Warnings that differ only in numbers are reported once.
 _NUMBERS = re.compile(r"[\d.]+")
 
 
@@ -72,7 +72,7 @@ def make_recorder(
 
 
 class TimedLog:
-    """A recorder with a time limit, which begins at the first arrival.
+    """A recorder with a time limit, which is counted from the first arrival.
 
     Sent data is recorded without limit.
 
@@ -145,8 +145,8 @@ class SourceRecording:
         target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: the sensor; None to record raw bytes.
         seconds: the time limit; None for no limit.
-        count: the maximum number of data packets (of datagrams, if the sensor is unknown); None for
-            no limit.
+        count: the maximum number of data packets, or of datagrams if the sensor is unknown; None
+            for no limit.
         start: whether to send the sensor's commands for opening and closing.
         overwrite: whether the file may exist.
         salvage: whether to continue after damaged parts, if the source is a recording.
@@ -154,8 +154,8 @@ class SourceRecording:
     Attributes:
         recorder: writes the file; None before the source is open.
         device: reads a live source; None if its sensor is unknown.
-        packets: number of data packets so far (of datagrams, if the sensor is unknown); at the end,
-            the number of packets in the file.
+        packets: number of data packets so far, or of datagrams if the sensor is unknown; at the
+            end, the number in the file.
         elapsed: seconds since the source was opened; at the end, the seconds between the first and
             the last arrival in the file.
     """
@@ -325,7 +325,7 @@ class SourceRecording:
             self.packets += source.datagrams
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
-        """Create the file that an open source with a configured sensor is recorded to."""
+        """Create the file to which an open source is recorded."""
         counts = source.datagrams or (
             self._sensor is not None and isinstance(source, LiveTransport)
         )
