@@ -22,8 +22,8 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: records are written when they have this size. The next constant is the maximum time between
-#: writes.
+#: records are written when their total size reaches this limit. The next constant is the maximum
+#: time between writes.
 FLUSH_BYTES = 1 << 16
 FLUSH_PERIOD_S = 0.2
 #: time between two calls of fsync.
@@ -43,8 +43,9 @@ class RecordFile:
 
     Args:
         path: the path of the file.
-        size_at: returns the length of a record. After a partial write, the file is truncated after
-            the last complete record. None if records have no borders.
+        size_at: a function that returns the length of a record, so that the file can be truncated
+            after the last complete record if a write was partial. None if the file has no records,
+            only bytes.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -148,7 +149,7 @@ class TrafficLog(Protocol):
         """Record received or sent data with its time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the line, such as "disconnect" or "reconnect".
+        """Record an event of the connection, such as "disconnect" or "reconnect".
 
         Args:
             at: the time, ns since 1970; by default now.
@@ -211,7 +212,7 @@ class BackgroundWriter:
         """Record an event of the connection, if the format supports events."""
 
     def sync(self) -> None:
-        """Wait until all records so far are on the disk.
+        """Wait until all records that were added so far are on the disk.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
@@ -230,7 +231,7 @@ class BackgroundWriter:
         self._raise_failure()
 
     def wait_for_room(self) -> None:
-        """Wait until more records can be added; for sources that can wait.
+        """Wait until there is memory for more records; for sources that can wait.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
@@ -302,7 +303,7 @@ class BackgroundWriter:
                 self._changed.notify_all()
 
     def _make_drop_record(self, dropped: int) -> bytes:
-        """Return the record that reports dropped records; b"" if the format has none."""
+        """Return a record that reports dropped records; b"" if the format has none."""
         return b""
 
     def _raise_failure(self) -> None:

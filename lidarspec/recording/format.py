@@ -116,8 +116,8 @@ class Header:
             folder: folder of the recording. Only files in this folder are opened for options.
 
         Raises:
-            UsageError: if the header names no sensor, or if the caller must pass an option again,
-                such as a file in another folder.
+            UsageError: if the header names no sensor, or if an option cannot be restored and the
+                caller must pass it, for example a file in another folder.
             UnknownSensor: if the sensor is not installed.
         """
         if not self.sensor:
@@ -180,7 +180,8 @@ class Record:
     """One record of a recording.
 
     Attributes:
-        direction: "in" for received data, "out" for sent data, "event" for an event of the line.
+        direction: "in" for received data, "out" for sent data, "event" for an event of the
+            connection.
         data: the bytes; JSON for an event.
         at: arrival time, ns since 1970; None if unknown.
         sender: address and port of the sender of a datagram; None if unknown.
@@ -256,20 +257,20 @@ class Recording(ClosingContext):
         path: the file; "-" is standard input.
         file: the open or decompressed file; it is closed with the recording.
         salvage: whether to continue with the next valid record after damage, even if the header is
-            damaged, instead of ending there.
+            damaged. Otherwise, reading ends at the damage.
 
     Attributes:
         header: the header.
         records: number of valid records so far, including the header and events.
         damaged: number of damaged parts so far, including an incomplete record at the end.
-        leftover: number of bytes in damaged parts; without `salvage`, of all bytes after the last
-            valid record.
+        leftover: number of bytes in damaged parts; without `salvage`, the number of all bytes after
+            the last valid record.
         is_cut: whether the last damaged part is an incomplete record at the end of the file.
         offset: file offset of the next record, or of the damage that ended the reading.
 
     Raises:
         SourceError: if the file cannot be opened, is not a recording, or has a later format.
-        WireError: if its header is damaged, without `salvage`.
+        WireError: if its header is damaged and `salvage` is false.
     """
 
     def __init__(
@@ -299,7 +300,7 @@ class Recording(ClosingContext):
         return self._records
 
     def seek(self, at: int) -> bool:
-        """Seek to shortly before the first record that was received at a time or later.
+        """Seek to shortly before the first record that was received at or after a time.
 
         The position is at most a few blocks before this record. Damage in skipped data is not
         counted.

@@ -24,7 +24,7 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: description of the error when it was last switched; "" for no error.
+        trouble: description of the error when the recorder was last switched; "" for no error.
         written: (path, number of data bytes) of each closed file.
     """
 
@@ -39,7 +39,7 @@ class RecordingSwitch:
         self.written: list[tuple[str, int]] = []
 
     def attach(self, opened: Transport) -> TrafficLog:
-        """Set the transport to record, and return this recorder, for `open(record=...)`."""
+        """Set the transport to record, and return this recorder; for `open(record=...)`."""
         self._opened = opened
         return self
 

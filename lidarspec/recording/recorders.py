@@ -49,11 +49,11 @@ MAX_GAP_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class RecorderFactory:
-    """Makes a recorder when the sensor of a source is known.
+    """Makes a recorder as soon as the sensor of a source is known.
 
     Attributes:
-        make: takes the open transport, and the sensor with the options that it reported, and
-            returns the recorder.
+        make: a function of the open transport and of the sensor, which is configured with the
+            options that it reported. It returns the recorder.
     """
 
     make: Callable[[Transport, Sensor | str | None], TrafficLog]
@@ -75,7 +75,8 @@ class Recorder(BackgroundWriter):
         path: the file.
         sensor: the sensor, or its id; None to record without a sensor.
         source: the SOURCE that is recorded.
-        datagrams: whether each chunk is a datagram; by default, the sensor's data link decides.
+        datagrams: whether each chunk is a datagram; by default, the sensor's data link determines
+            this.
         baud: baud rate of a serial port.
         overwrite: whether an existing file may be replaced.
 
@@ -132,7 +133,7 @@ class Recorder(BackgroundWriter):
             self._put(record, len(data))
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the line, such as "disconnect" or "reconnect".
+        """Record an event of the connection, such as "disconnect" or "reconnect".
 
         Args:
             at: the time, ns since 1970; by default now.
@@ -175,7 +176,7 @@ class PcapRecorder(BackgroundWriter):
 
 
 class FrameRecorder(BackgroundWriter):
-    """Writes a byte stream as a capture with a packet for each frame, link type USER0.
+    """Writes a byte stream as a capture of link type USER0, with a packet per frame.
 
     Bytes outside frames become packets as well, so that the file contains all received bytes in
     order.
@@ -207,7 +208,7 @@ class FrameRecorder(BackgroundWriter):
     def _cut(self, frames: list[Found]) -> None:
         """Write frames, and the bytes outside frames before them.
 
-        Bytes that may become a part of a later frame are kept.
+        Bytes that may belong to a frame that is not complete yet are kept.
         """
         for item in frames:
             self._skip(item.offset - self._base)
@@ -276,7 +277,7 @@ def open_recorder(
         path: the file.
         sensor: the sensor if it is known. A capture of a byte stream requires it.
         source: the source of the data, for the header of an .lsr file.
-        datagrams: whether chunks are datagrams, not pieces of a stream.
+        datagrams: whether chunks are datagrams, not portions of a byte stream.
         baud: baud rate of a serial line, for the header of an .lsr file.
         overwrite: whether an existing file may be replaced.
 
@@ -363,7 +364,7 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record at an offset of a piece of a recording.
+    """Return the length of the record at an offset, in a part of a recording.
 
     At the start of the file, returns the length of the magic bytes.
     """
