@@ -1,7 +1,7 @@
 """Inputs and outputs: ports, sockets, files and simulated sensors.
 
-In: a SOURCE as text. Out: an open `Transport`, which yields `Chunk`s and sends bytes.
-Modules in reading order:
+The input is a SOURCE as text. The result is an open `Transport`, which yields `Chunk`s and sends
+bytes. Modules in reading order:
 
 * `protocol`: the base classes of transports; plugins derive from them.
 * `open_url`: opens the transport of a SOURCE.
@@ -9,15 +9,15 @@ Modules in reading order:
 * `host_clock`: the clock of this computer for arrival times.
 * `base`: functions that live transports share: reading a stream, waiting, system errors.
 * `serial`, `udp`, `tcp`: live sources.
-* `http`: requests to the web server of a sensor.
+* `http`: sends requests to the web server of a sensor.
 * `simulated`: a simulated sensor in this process (`sim:`).
 * `robotics_logs`: reads packets from ROS bags and MCAP files.
 * `hex_text`: reads bytes from hexadecimal text.
-* `files`: recordings, captures, raw bytes, standard input.
-* `ports`: the serial and UDP ports of this computer, and the programs that use them.
-* `usb_adapters`: USB serial adapters without a driver.
+* `files`: reads recordings, captures, raw bytes and standard input.
+* `ports`: lists the serial and UDP ports of this computer, and the programs that use them.
+* `usb_adapters`: finds USB serial adapters without a driver.
 
-These modules send data like a sensor:
+The following modules send data as a sensor does:
 
 * `outlets`: sends bytes and receives commands over pseudo-terminals, UDP and TCP.
 * `http_server`: receives requests and sends replies over HTTP.

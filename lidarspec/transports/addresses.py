@@ -16,13 +16,13 @@ from urllib.parse import parse_qs
 from lidarspec.errors import UnknownOption, UsageError, suggest
 from lidarspec.transports.protocol import Origin
 
-#: Options of every live SOURCE. "control" is the address for commands, by default the address of
-#: the data. "broadcast" is the broadcast address.
+#: Options of every live SOURCE. "control" is the address to send commands to; by default, it is the
+#: address that sends the data. "broadcast" is the broadcast address.
 _COMMON_OPTIONS = frozenset({"control", "broadcast"})
 _SWITCH_VALUES = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 #: Matches a host and a port; an IPv6 host is in brackets.
 _HOST_AND_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?")
-#: Port for finding the route to a host; nothing is sent to it.
+#: Port that is used to find the route to a host; nothing is sent to it.
 _DISCARD_PORT = 9
 
 
@@ -34,7 +34,7 @@ class SourceAddress:
         text: the whole text.
         scheme: "serial", "udp", "tcp" and so on.
         location: a path, or host and port.
-        options: the options after the question mark; the last value of a repeated option.
+        options: the options after the question mark, by name. A repeated option has its last value.
     """
 
     text: str
@@ -49,7 +49,7 @@ class SourceAddress:
         Args:
             text: the SOURCE, "udp://:2368?src=10.0.0.5". If `scheme` is given, the scheme may be
                 omitted.
-            scheme: replaces the scheme of the text.
+            scheme: a scheme that replaces the scheme of the text.
         """
         if "://" in text:
             written_scheme, _, rest = text.partition("://")
@@ -122,7 +122,7 @@ class SourceAddress:
 
 
 def with_option(source: str | Path, name: str, value: object) -> str:
-    """Return a SOURCE with an added option, which replaces one of the same name."""
+    """Return a SOURCE with an option, which replaces any option of the same name."""
     location, _, query = str(source).partition("?")
     options = [
         option for option in query.split("&") if option and not option.startswith(f"{name}=")
@@ -168,7 +168,7 @@ def resolve_host(host: str, place: str) -> str:
 
 
 def find_own_address(host: str) -> str | None:
-    """Return the address of this computer on the route to a host; None if no route."""
+    """Return the address of this computer that it uses to reach a host, else None."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

@@ -1,4 +1,4 @@
-"""Functions that live transports share: reading a stream, waiting, system errors."""
+"""Shared by live transports: reading a stream, waiting, and system errors."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from lidarspec.spec.links import Link
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
-#: Pause after a read, in which bytes accumulate. Without it, each byte of a fast line would cause a
-#: read.
+#: Pause after a read, during which bytes accumulate. Without it, each byte of a fast serial line
+#: would cause a read.
 READ_PAUSE_S = 0.002
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
@@ -27,10 +27,10 @@ _Selector = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class StreamTransport(LiveTransport):
-    """Base class for byte streams; pauses for a short time after each read.
+    """Base class for byte streams, which pauses for a short time after each read.
 
     Attributes:
-        gone: the exceptions that reading raises if the line is disconnected.
+        gone: the exceptions that reading raises if the device is disconnected.
     """
 
     gone: tuple[type[BaseException], ...] = (OSError, ValueError)
@@ -110,7 +110,7 @@ def disconnected_error(label: str, error: BaseException | str) -> Disconnected:
 
 
 def system_reason(error: BaseException | str) -> str:
-    """Return the system's text for an error, without text that pyserial adds."""
+    """Return the system's text for an error, without the text that pyserial adds."""
     if isinstance(error, BaseException):
         numbers = error_numbers(error)
     else:

@@ -18,8 +18,8 @@ def make_simulated_outlet(
 ) -> Outlet:
     """Return the outlet of a simulated sensor.
 
-    The outlet has a line for the data, and one for each further link over which the sensor receives
-    commands.
+    The outlet has a line for the data link, and a line for each other link over which the sensor
+    receives commands.
 
     Args:
         sensor: the sensor.
@@ -29,7 +29,7 @@ def make_simulated_outlet(
         link: path of a symbolic link to the pseudo-terminal; None for no link.
 
     Raises:
-        UsageError: if the destination is invalid, or cannot carry the sensor's frames.
+        UsageError: if the destination is invalid, or cannot transmit the sensor's frames.
         SourceError: if the destination is not available.
     """
     data = _make_data_line(sensor, destination, link)
@@ -47,7 +47,7 @@ def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> O
         port: the port for datagrams that were recorded without a port.
 
     Raises:
-        UsageError: if the destination is invalid, or cannot carry the recorded data.
+        UsageError: if the destination is invalid, or cannot transmit the recorded data.
         SourceError: if the destination is not available.
     """
     if destination.startswith("udp:"):
@@ -140,7 +140,7 @@ def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
 
 
 def _make_control_line(link: Link) -> OutletLine | None:
-    """Return a line at the declared port, or at a free port if that is in use.
+    """Return a line at the declared port, or at a free port if that port is in use.
 
     Returns None for a link type that only a plugin supports.
     """

@@ -2,8 +2,8 @@
 
 `open_file` detects the format of a file by its content: a recording, a capture, a robotics log (see
 `robotics_logs`), hexadecimal text or raw bytes. A file is read as fast as the caller requests
-chunks. The chunks of recordings and captures have the recorded arrival times, and data that cannot
-be read is counted. Raw bytes have no times.
+chunks. The chunks of recordings and captures have the recorded arrival times; raw bytes have no
+times. Data that cannot be read is counted.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 BLOCK_BYTES = 1 << 18
 #: Suffixes of hexadecimal text.
 HEX_SUFFIXES = {".hex", ".txt"}
-#: Suffixes of files that are read as hexadecimal text if their content is hexadecimal.
+#: Suffixes of files that are read as hexadecimal text only if their content is hexadecimal.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 
 
@@ -182,14 +182,14 @@ def _describe_damage(recording: Recording) -> str:
 
 
 def _describe_skipped(path: str, count: int, size: int) -> str:
-    """Return a warning with the numbers of damaged parts and of unread bytes."""
+    """Return a warning with the number of damaged places and of unread bytes."""
     return f"{path} is corrupt in {count} place{'s' * (count > 1)}: {size} bytes were not read"
 
 
 def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
     """Return whether a compressed file was decompressed to its end.
 
-    If it was not, adds a warning, and the number of unread bytes, to the transport.
+    If it was not, the transport gets a warning and the number of unread bytes.
     """
     fault = find_damage(file)
     if fault is not None:
@@ -212,9 +212,9 @@ class FileTransport(Transport):
 
     @property
     def can_resume(self) -> bool:
-        """Whether another transport can continue at the current offset of the file.
+        """Whether another transport can continue reading at the current offset.
 
-        This requires a seekable file with raw bytes or a capture.
+        This requires a seekable file, which is a capture or has raw bytes.
         """
         return (
             type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport)
@@ -235,7 +235,7 @@ class FileTransport(Transport):
             self.file.close()
 
     def _warn(self, stats: CaptureStats) -> None:
-        """Add a warning for each kind of data in a capture that was not read."""
+        """Add a warning for each kind of unread data in a capture."""
         self.unread = stats.lost
         if stats.damaged:
             self.warnings.append(_describe_skipped(self._path, stats.damaged, stats.lost))
@@ -279,9 +279,9 @@ def _list_counts(counts: Counter[str]) -> str:
 
 
 class HexTransport(FileTransport):
-    """Reads the bytes, and times, of hexadecimal text.
+    """Reads hexadecimal text, which may also contain times.
 
-    Lines without digits are skipped.
+    Lines without hexadecimal digits are skipped.
     """
 
     def chunks(self) -> Iterator[Chunk]:

@@ -1,9 +1,10 @@
 r"""Read bytes from hexadecimal text and the output of common tools.
 
 The supported forms are "54 2c", "542c", "54:2c", "0x54, 0x2C", "\x54\x2c", arrays in C and lists in
-Python. Comments are written as in Python or C. A line may begin with a time such as [12:00:01.123]
-or an offset, and end with the bytes as characters, as xxd, hexdump -C, tcpdump and Wireshark print
-them. Lines of candump, tables of logic analysers and annotations of sigrok are supported as well.
+Python. Comments are written as in Python or C. A line may begin with a time such as [12:00:01.123],
+or with an offset. It may end with the bytes as characters. The tools xxd, hexdump -C, tcpdump and
+Wireshark print such lines. Lines of candump, tables of logic analysers and annotations of sigrok
+are supported as well.
 
 Each format is recognised by a feature that no other format has. Ambiguous text is an error;
 `AMBIGUOUS` has the error messages.
@@ -20,7 +21,7 @@ from lidarspec.transports.protocol import Chunk
 
 #: maximum number of bytes of a line to read at once.
 BLOCK_BYTES = 1 << 18
-#: maximum number of characters of an invalid word in a message.
+#: maximum number of characters of an invalid word that a message quotes.
 MAX_QUOTED_CHARS = 64
 #: maximum length of a line of a dump that ends with the bytes as characters.
 MAX_ROW_CHARS = 1 << 10
@@ -129,8 +130,8 @@ class HexText:
         """Return the bytes and the time of a line of `FORMS`; None for other lines.
 
         Raises:
-            ValueError: if the line is from another bus, or from another sender on the bus, than the
-                lines before, or if its length field does not match its bytes.
+            ValueError: if the line comes from another bus or sender than the lines before, or if
+                its length field does not match its bytes.
         """
         matched = next((match for form in FORMS if (match := form.fullmatch(text))), None)
         if matched is None:
@@ -148,7 +149,7 @@ class HexText:
         return Chunk(data, _to_ns(groups.get("at")))
 
     def _read_table_line(self, text: str) -> Chunk | None:
-        """Return the byte and the time of a line of a table; None for other lines.
+        """Return the byte and the time in a line of a table; None for other lines.
 
         The first line of a table names the columns.
         """
@@ -176,8 +177,8 @@ class HexText:
     def _read_dump_line(self, text: str) -> bytes | None:
         """Return the bytes of a line of a dump; None for other lines.
 
-        The line begins with an offset. A colon follows the offset, or the offset is the number of
-        bytes in the lines before.
+        Such a line begins with an offset. Either a colon follows the offset, or the offset is equal
+        to the number of bytes in the lines before.
         """
         match = _ROW.fullmatch(text)
         if match is None:
@@ -276,9 +277,9 @@ def _to_ns(seconds: str | None) -> int | None:
 
 
 def _parse_dump_bytes(text: str) -> bytes:
-    """Return the bytes of a line of a dump, given without its offset.
+    """Return the bytes of a line of a dump whose offset was removed.
 
-    The line may end with the bytes as characters, which are between "|" or after several blanks.
+    The line may end with the bytes as characters. These are between "|" or follow several blanks.
 
     Raises:
         ValueError: if the characters do not match the bytes.
@@ -384,7 +385,7 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
 def find_cut(text: str) -> int:
     """Return an index at which hexadecimal text can be split.
 
-    It is next to the last separator. Without a separator, it is between two bytes.
+    It is directly before or after the last separator. Without a separator, it is between two bytes.
     """
     return (
         max(

@@ -10,14 +10,14 @@ import time
 from collections.abc import Callable
 
 #: If the wall clock differs by more than this from the expected time, it was set. Smaller
-#: differences are gradual adjustments.
+#: differences result from gradual adjustments.
 _SET_CLOCK_NS = 50_000_000
 #: Maximum number of attempts to read two clocks at the same moment.
 _READ_ATTEMPTS = 10
 #: If reading both clocks takes longer than this, they are read again.
 _MAX_READ_TIME_NS = _SET_CLOCK_NS // _READ_ATTEMPTS
-#: If the time between two readings is longer, the thread was suspended in between. A reading takes
-#: less than a thousandth of this time.
+#: If more than this time passes between two readings, the thread was suspended in between. A
+#: reading takes less than a thousandth of this time.
 _SUSPENDED_NS = 200_000
 _CLOCK_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 

@@ -2,7 +2,7 @@
 
 A request is a frame of `HttpRequest` (method, path, body), and a reply is a frame of `HttpReply`
 (status, body). The duration of a request and the size of its reply are limited. A request is sent
-when the reply to the previous one has arrived.
+only after the reply to the previous request has arrived.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 class HttpTransport(LiveTransport):
     """Sends HTTP requests to a host, in the thread that calls `read`.
 
-    If a request fails, `read` returns no reply, and `warnings` has the reason.
+    If a request fails, `read` returns no reply, and `warnings` contains the reason.
 
     Args:
         host: name or address of the sensor.

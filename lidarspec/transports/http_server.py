@@ -22,7 +22,7 @@ from lidarspec.transports.protocol import Chunk
 
 _MAX_BODY_BYTES = 1 << 20
 _REPLY_TIMEOUT_S = 2.0
-#: Maximum time until a request is passed from its thread to the simulated sensor.
+#: Maximum time until a request that a thread has received is passed to the simulated sensor.
 _REQUEST_POLL_S = 0.01
 _SHUTDOWN_POLL_S = 0.05
 
@@ -77,7 +77,7 @@ class HttpLine(OutletLine):
         self._server.server_close()
 
     def handle_request(self, request: bytes) -> bytes | None:
-        """Return the reply of the simulated sensor to a request; None if it is too late."""
+        """Return the simulated sensor's reply to a request; None if there is none in time."""
         reply = _ReplyQueue()
         with self._lock:
             self._reply_queues.append(reply)

@@ -42,7 +42,7 @@ def open_transport(source: str | Path, sensor: Sensor | None = None) -> Transpor
 
     Args:
         source: a file, "-", a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: gives the defaults of baud rate, control lines and ports; None for no defaults.
+        sensor: provides the defaults of baud rate, control lines and ports; None for no defaults.
 
     Raises:
         UsageError: for an unknown scheme, or an option that this kind of source does not accept.
@@ -71,7 +71,7 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
 
     Args:
         source: a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: gives the defaults of baud rate, control lines and ports; None for no defaults.
+        sensor: provides the defaults of baud rate, control lines and ports; None for no defaults.
 
     Raises:
         UsageError: for a file, an unknown scheme, or an option that this kind of source does not

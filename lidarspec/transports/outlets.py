@@ -4,9 +4,9 @@ Simulated sensors and replays use outlets. An `OutletLine` is the sensor's end o
 bytes without waiting, and returns the commands that have arrived. An `Outlet` contains the line of
 the data link and the lines of the sensor's other links, and waits for all of them together.
 
-Like a real sensor, an outlet also sends if no program listens, and counts the bytes that were not
-read. With `patient=True`, it waits for a slow reader instead of dropping bytes. This is used by
-replays, in which all bytes must arrive, and by simulated sensors that run as fast as they are read.
+Like a real sensor, an outlet also sends if no program listens. It counts the bytes that were not
+read. With `patient=True`, it waits for a slow reader instead of dropping bytes. Replays use this,
+because all their bytes must arrive, and so do simulated sensors that run as fast as they are read.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ LOCALHOST = "127.0.0.1"
 _LOOPBACK_BROADCAST = "127.255.255.255"
 _READ_BYTES = 1 << 16
 #: Maximum number of bytes that wait for a slow reader of a TCP connection; further bytes are
-#: dropped. The next constant is the maximum for a pseudo-terminal.
+#: dropped. The next constant is the maximum for a reader of a pseudo-terminal.
 _MAX_CONNECTION_BACKLOG_BYTES = 1 << 20
 _MAX_PTY_BACKLOG_BYTES = 1 << 18
 _SEND_BUFFER_BYTES = 1 << 20
 #: Number of attempts to send a datagram if the buffer is full or an ICMP error has arrived.
 _SEND_ATTEMPTS = 2
-#: A replay begins when a reader has had the port open for this time, because many readers drop
+#: A replay begins when a reader has kept the port open for this time, because many readers drop
 #: bytes that arrive while they open a port.
 _READER_SETTLE_S = 0.25
 _LISTENER_POLL_S = 0.02
-#: Time between two checks whether a program has opened a pseudo-terminal.
+#: Time between two checks of whether a program has opened a pseudo-terminal.
 _ABSENT_READER_POLL_S = 0.005
 #: Maximum time to wait until readers have read the last bytes.
 FETCH_TIMEOUT_S = 5.0
-#: Number of consecutive checks without unread bytes after which a pseudo-terminal is considered
-#: read.
+#: Number of consecutive checks without unread bytes after which all bytes of a pseudo-terminal are
+#: considered read.
 _EMPTY_CHECKS = 3
-#: Port for looking up the address of a host; nothing is sent to it.
+#: Port that is used to look up the address of a host; nothing is sent to it.
 _DISCARD_PORT = 9
 
 
@@ -65,7 +65,7 @@ class OutletLine:
     Attributes:
         local_source: the SOURCE with which a program on this computer opens the link.
         port: the port that the line listens on; 0 if it does not listen.
-        has_listener: whether a program listens; True if this is unknown.
+        has_listener: whether a program receives the bytes; True if this is unknown.
         unsent_bytes: number of bytes that were not read in time.
     """
 
@@ -76,7 +76,7 @@ class OutletLine:
 
     @property
     def source(self) -> str:
-        """The SOURCE with which a program on the destination computer opens the link."""
+        """The SOURCE with which a program on the receiving computer opens the link."""
         return self.local_source
 
     @property
@@ -112,7 +112,7 @@ class OutletLine:
         raise NotImplementedError
 
     def redirect(self, host: str, port: int) -> None:
-        """Send to another address from now on, if the line sends datagrams.
+        """Send to another address from now on; only lines that send datagrams do this.
 
         Args:
             host: the address; "" for the same address as before.
@@ -120,7 +120,7 @@ class OutletLine:
         """
 
     def await_listener(self) -> None:
-        """Wait for a new listener, so that it receives all bytes from the beginning.
+        """Wait until a new program listens, so that it receives all bytes.
 
         For links without connections, such as UDP, this returns at once.
         """
@@ -144,7 +144,7 @@ class _SendBuffer:
 
     Args:
         write: writes without waiting, and returns the number of bytes that were written.
-        max_bytes: maximum number of waiting bytes, for `has_room`.
+        max_bytes: the maximum number of waiting bytes that `has_room` allows.
     """
 
     def __init__(self, write: Callable[[bytearray], int], max_bytes: int) -> None:
@@ -184,7 +184,7 @@ class UdpLine(OutletLine):
         takes_commands: whether the line receives commands. If so, the data is sent to the sender of
             the last command.
         waits_for_address: whether the destination port is unknown until a command contains it.
-            Datagrams before this command are lost.
+            Datagrams that are sent before this command are lost.
     """
 
     takes_commands = False
@@ -280,7 +280,7 @@ class UdpLine(OutletLine):
 
     @property
     def source(self) -> str:
-        """The SOURCE for the destination computer.
+        """The SOURCE for the receiving computer.
 
         It contains no host, because datagrams may arrive at any interface of that computer.
         """
@@ -322,7 +322,7 @@ class UdpLine(OutletLine):
             opened.close()
 
     def _listen_for_commands(self) -> None:
-        """Choose a port, and add it to the SOURCE if the listener is on this computer."""
+        """Receive commands, on a free port; a local listener gets the port by the SOURCE."""
         self.takes_commands = True
         if self._host == LOCALHOST:
             self._sockets[0].bind((LOCALHOST, 0))
@@ -357,10 +357,10 @@ class UdpLine(OutletLine):
         return False
 
     def _may_succeed_later(self, error: OSError) -> bool:
-        """Wait after a temporary error and return True; return False for other errors.
+        """Return whether sending again may succeed; wait after a temporary error.
 
         Raises:
-            SourceError: for other errors, if the user has named the receiver.
+            SourceError: for any other error, if the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)
@@ -384,7 +384,7 @@ class TcpLine(OutletLine):
     Args:
         host: the address to listen on.
         port: the port to listen on; 0 selects any free port.
-        sole: whether only one connection is accepted at a time.
+        sole: whether only one connection at a time is accepted.
         is_reported: whether the sensor reports the port, so that the SOURCE does not contain it.
 
     Raises:
@@ -507,7 +507,7 @@ class TcpLine(OutletLine):
 
 
 class PtyLine(OutletLine):
-    """A pseudo-terminal that programs open by its path, POSIX only.
+    """A pseudo-terminal (POSIX only), which programs open by its path.
 
     If no program has opened it, sent bytes are lost, as on a serial cable.
 
@@ -610,7 +610,7 @@ class PtyLine(OutletLine):
             self._flush()
 
     def await_listener(self) -> None:
-        """Wait until a reader has had the terminal open for `_READER_SETTLE_S`."""
+        """Wait until a reader has kept the terminal open for `_READER_SETTLE_S`."""
         since = time.monotonic()
         while time.monotonic() - since < _READER_SETTLE_S:
             wait_for([self], _LISTENER_POLL_S)
@@ -682,7 +682,7 @@ class Outlet:
 
     Args:
         data: the line of the data link.
-        controls: name of each other link for commands and replies -> its line.
+        controls: the line of each other link for commands and replies, by the name of the link.
     """
 
     def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
@@ -697,7 +697,7 @@ class Outlet:
 
     @property
     def source(self) -> str:
-        """The SOURCE for the destination computer, with a `control=` option if required."""
+        """The SOURCE for the receiving computer, with a `control=` option if required."""
         ports = {line.port for line in self.controls.values()}
         if not ports:
             return self.data.source
@@ -744,7 +744,7 @@ class Outlet:
             raise Disconnected(f"{self.local_source}: the reader has disconnected")
 
     def await_listener(self) -> None:
-        """Wait for a new listener to the data; see `OutletLine.await_listener`."""
+        """Wait until a new program reads the data; see `OutletLine.await_listener`."""
         self.data.await_listener()
 
     def unplug(self) -> None:
@@ -823,7 +823,7 @@ def _bind_udp(host: str, port: int) -> socket.socket:
 
 
 def _format_ports(ports: Sequence[int]) -> str:
-    """Return ports as text that follows the host in a SOURCE."""
+    """Return ports as the text that follows the host in a SOURCE."""
     if not ports:
         return ""
     if len(ports) == 1:

@@ -27,7 +27,7 @@ class SerialPort:
     Attributes:
         path: the name of the port, such as "/dev/ttyUSB0" or "COM4".
         description: the system's description of the device.
-        lasting: a name of the port that does not depend on the USB socket; "" if it has none.
+        lasting: a name of the port that stays the same in every USB socket; "" if it has none.
         allowed: whether the current user may open the port.
         users: the programs that have opened the port, as far as the system shows them.
     """
@@ -76,12 +76,12 @@ def list_serial_ports() -> list[SerialPort]:
 
 
 def list_usb_ids() -> list[tuple[int, int]]:
-    """Return the USB ids, vendor and product, of the serial ports of this computer."""
+    """Return the (vendor id, product id) of each USB serial port of this computer."""
     return [(port.vid, port.pid) for port in list_ports.comports() if port.vid is not None]
 
 
 def find_lasting_path(port: str) -> str:
-    """Return the name of a port in /dev/serial/by-id; "" if it has none."""
+    """Return the path of a port in /dev/serial/by-id; "" if it has none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
     return next(
         (str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), ""
@@ -89,13 +89,13 @@ def find_lasting_path(port: str) -> str:
 
 
 def is_allowed(port: str) -> bool:
-    """Return whether the user may open a port; True if the port is not a file."""
+    """Return whether the user may open a port; True for a port that is not a file."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def find_group(port: str) -> str:
-    """Return the group that may open a port; "" if unknown or if only root may."""
+    """Return the group that may open a port; "" if unknown, or if only root may."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:
@@ -135,7 +135,7 @@ def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
 
 
 def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
-    """Yield the other programs that have opened a file that `wanted` accepts."""
+    """Yield other programs that have opened a file for whose path `wanted` is true."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue
@@ -168,9 +168,9 @@ def received_per_interface() -> dict[str, int]:
 
 
 def filters_senders(interface: str) -> bool:
-    """Return whether an interface drops packets of senders in other networks.
+    """Return whether an interface drops packets from senders in other networks.
 
-    This is the case for the setting rp_filter = 1 (strict) of Linux.
+    It does so if the Linux setting rp_filter is 1 (strict).
     """
     with contextlib.suppress(OSError):
         values = [

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
-#: maximum time of a wait, after which a loop checks whether it must stop.
+#: maximum time that a loop waits before it checks whether it must stop.
 POLL_S = 0.05
 #: (address, port) of a sender of datagrams.
 Sender = tuple[str, int]
@@ -28,7 +28,7 @@ Sender = tuple[str, int]
 class Origin:
     """A requested sender: an address with or without a port.
 
-    ``sender in origin`` is True if a `Sender` matches.
+    ``sender in origin`` is true if the `Sender` matches.
     """
 
     host: str
@@ -69,8 +69,8 @@ def endpoint(sender: Sender) -> str:
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
     """Return a name for each sender: its address, or ADDRESS:PORT if necessary.
 
-    The port is necessary if several ports of the address send to the same receiving port. The name
-    of an unknown sender is "".
+    The name includes the port if several ports of the address send to the same receiving port. The
+    name of an unknown sender is "".
 
     Args:
         ends: (sender, receiver) of each datagram.
@@ -95,12 +95,11 @@ class Format:
         suffix: the suffix including the dot, ".csv".
         description: a short description for lists.
         write: writes scans to a path. With `every_point`, it also writes points without a return.
-        holds: the names of optional features that the format supports:
-            "organized": points in rows and columns. `write` takes `organized=True` and one scan.
-            "scans": each scan is stored separately, and organized if its points are.
-            "beams": planar scans are also written as LaserScan messages.
-            "frame-id": messages contain a frame_id.
-            "packets": raw packets, which `write` takes as `packets=`.
+        holds: the names of optional features that the format supports: "organized": points in rows
+            and columns. `write` then accepts `organized=True` with one scan. "scans": each scan is
+            stored separately, and organized if its points are. "beams": planar scans are also
+            written as LaserScan messages. "frame-id": messages contain a frame_id. "packets": raw
+            packets, which `write` accepts as `packets=`.
     """
 
     suffix: str
@@ -115,7 +114,7 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """The bytes of one read: a datagram, or a piece of a byte stream.
+    """The bytes of one read: a datagram, or a portion of a byte stream.
 
     Attributes:
         data: the bytes.
@@ -166,8 +165,7 @@ class Transport(ABC):
             time.
         disconnects: number of interruptions that a recording reports.
         unread: number of bytes that could not be read from a damaged file.
-        stored: the open file as it is stored, before decompression; None if the source is not a
-            file.
+        stored: the open file before decompression; None if the source is not a file.
     """
 
     datagrams: bool = False
@@ -248,10 +246,10 @@ class LiveTransport(Transport):
     Attributes:
         label: the SOURCE as given by the user, for messages.
         closed: whether the transport was closed. `chunks` then ends.
-        overflow: default behaviour if the queue of read chunks is full: "drop_oldest", or "block"
-            for a source that waits for its reader.
+        overflow: the default policy if the queue of chunks is full: "drop_oldest", or "block" for a
+            source that waits for its reader.
         silence: seconds without a byte after which an incomplete frame is discarded.
-        other_sender: the sender of the last `foreign` datagram; None for no such datagram.
+        other_sender: the sender of the last `foreign` datagram; None if there was none.
     """
 
     label: str = ""
@@ -264,7 +262,7 @@ class LiveTransport(Transport):
     def addressed(self) -> bool:
         """Whether `write` has a destination.
 
-        It has none only for a datagram source, while the address of the sensor is unknown.
+        Only a datagram source has no destination, as long as the address of the sensor is unknown.
         """
         return True
 
@@ -275,7 +273,7 @@ class LiveTransport(Transport):
 
     @property
     def awaits_port(self) -> bool:
-        """Whether the source is not connected, because the sensor has to report its port."""
+        """Whether the source is not connected, because the sensor must report its port."""
         return False
 
     def connect_to(self, port: int) -> None:
@@ -288,7 +286,7 @@ class LiveTransport(Transport):
         """
 
     def accept(self, sender: Sender) -> None:
-        """Set the destination of `write` to the sender that is the sensor.
+        """Set the destination of `write` to the sender that was found to be the sensor.
 
         A source with a fixed destination ignores this.
         """

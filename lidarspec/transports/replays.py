@@ -1,7 +1,7 @@
-"""Send a recording again, byte for byte, at its recorded times or at another speed.
+"""Send the bytes of a recording at their recorded times, or at another speed.
 
-Each chunk has a deadline on the monotonic clock, which is computed from the deadline of the first
-chunk, so that delays do not add up. A late chunk is sent at once.
+Each chunk has a deadline on the monotonic clock. All deadlines are computed from the deadline of
+the first chunk, so that delays do not add up. A late chunk is sent at once.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _MAX_REORDERING_NS = _SECOND_NS
 
 
 class Deadlines:
-    """The deadline of each chunk of a replay, in ns of the monotonic clock.
+    """Computes the deadline of each chunk of a replay, in ns of the monotonic clock.
 
-    If a recorded time is earlier than a previous time by at most one second, because datagrams were
-    reordered, the chunk is sent at once. If it is earlier by more, because a clock was set, the
-    following deadlines are computed from the new time.
+    Recorded times may go back. If a time is earlier than a previous time by at most one second,
+    datagrams were reordered, and the chunk is sent at once. If it is earlier by more, a clock was
+    set, and the following deadlines are computed from the new time.
 
     Args:
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
@@ -48,8 +48,8 @@ class Deadlines:
         """Return the deadline of the next chunk.
 
         Args:
-            at: the recorded arrival time of the chunk, ns. None if it is unknown; the chunk is then
-                due at the start.
+            at: the recorded arrival time of the chunk, ns; None if it is unknown. A chunk without a
+                time is due at the start.
         """
         if self._speed is None or at is None:
             return self._start
@@ -95,19 +95,19 @@ class Replay:
         file: the SOURCE of a recording, capture or raw file.
         destination: an outlet, or a new file; it is not closed.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        needs_times: whether a file without times is an error. If not, it is sent as fast as
-            possible.
+        needs_times: whether a file without times is an error. Otherwise, such a file is sent as
+            fast as possible.
         loop: whether to start again at the end. Each listener receives the file from the beginning.
         source: the transport of the file if it is already open, for example standard input. It is
             used for the first pass, and then closed.
-        times: the arrival times of the part to send, as in `Selection`.
+        times: the range of arrival times to send, as in `Selection`.
 
     Attributes:
         chunks: number of chunks sent so far.
         bytes: number of bytes sent so far.
         late: number of chunks that were sent more than 20 ms late.
         latest: the greatest delay of a chunk, ns.
-        is_timed: whether the file has times.
+        is_timed: whether the chunks of the file have times.
         digest: SHA-256 of all bytes.
     """
 
@@ -193,9 +193,9 @@ class Replay:
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        """Yield the chunks; handle a chunk without a time.
+        """Yield the chunks; handle chunks without a time.
 
-        The chunk is an error if times are required; else `is_timed` is set to False.
+        If times are required, such a chunk is an error; otherwise, `is_timed` is set to False.
         """
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:

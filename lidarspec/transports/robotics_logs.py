@@ -5,13 +5,13 @@ message type contains packets if it has a field `packets`, or "packet" in its na
 packet are in its field `data` or `buf`. If the packet has a field `size`, only this number of bytes
 is used. A packet may have a field `stamp`.
 
-Most logs contain the definitions of their messages. Some do not, for example ROS 2 bags in SQLite
-of releases before Iron. Their messages are read with the definition in `FALLBACK_DEFINITIONS` that
-matches the length of the message.
+Most logs contain the definitions of their messages. Some logs do not, for example ROS 2 bags in
+SQLite that were written by releases before Iron. Their messages are read with the definition in
+`FALLBACK_DEFINITIONS` that matches the length of the message.
 
 lidarspec and its ROS 2 node write packets as std_msgs/UInt8MultiArray, because every ROS release
 has this message type. The first `data_offset` bytes of the data are the arrival time. The label of
-the dimension is `DATAGRAM` or `STREAM`.
+the array's dimension is `DATAGRAM` or `STREAM`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DATA_FIELDS = ("data", "buf")
 #: maximum number of topics in a warning.
 MAX_LISTED_TOPICS = 6
 #: message type of packets that lidarspec writes. The next constants are the encoding of the arrival
-#: time, int64 ns, and the labels of the dimension for datagrams and for a byte stream.
+#: time (int64, ns), and the labels of the array's dimension for datagrams and for a byte stream.
 RAW = "std_msgs/msg/UInt8MultiArray"
 STAMP = struct.Struct("<q")
 DATAGRAM = "datagram"
@@ -60,7 +60,7 @@ class LogKind(NamedTuple):
         description: name of the kind, for messages to the user.
         module: name of the module of rosbags that reads the log.
         reader: name of the class in this module.
-        form: serialization of the messages in the log: "cdr" or "ros1".
+        form: the serialization format of the messages in the log, "cdr" or "ros1".
     """
 
     description: str
@@ -100,9 +100,9 @@ def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
 class BagTransport(Transport):
     """Reads the packets of a robotics log, in the order of its messages.
 
-    The time of a packet is its own stamp. If it has none, it is the stamp of its message, or the
-    log time of the message. All topics of a namespace belong to one sensor. If several namespaces
-    have packets, the `sender` of each chunk is its namespace.
+    The time of a packet is its own stamp. A packet without a stamp has the stamp of its message, or
+    else the time at which the message was logged. All topics of a namespace belong to one sensor.
+    If several namespaces have packets, the `sender` of each chunk is its namespace.
 
     Args:
         path: the file or folder.
@@ -174,7 +174,7 @@ class BagTransport(Transport):
                     )
 
     def _is_stream(self, link: Any) -> bool:
-        """Return whether the packets of a connection are pieces of a byte stream."""
+        """Return whether the packets of a connection are portions of a byte stream."""
         if link.msgtype != RAW:
             return False
         first = next(
@@ -189,9 +189,9 @@ class BagTransport(Transport):
         self._log.close()
 
     def _deserialize(self, link: Any, raw: bytes) -> Any:
-        """Return a message, read with the first definition that fits; None if none fits.
+        """Return a message; None if no definition fits it.
 
-        The definition is then used for all following messages of the connection.
+        The first definition that fits is used for all following messages of the connection.
         """
         stores = self._type_stores[link.id]
         for store in stores:
@@ -210,7 +210,7 @@ class BagTransport(Transport):
 
     @contextmanager
     def _failures(self) -> Iterator[None]:
-        """Convert every exception to SourceError, because damaged files cause many types."""
+        """Convert all exceptions to SourceError, because damaged files cause many types."""
         try:
             yield
         except LidarSpecError:

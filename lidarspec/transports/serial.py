@@ -1,8 +1,8 @@
 """Read and write serial ports.
 
-A port is opened exclusively. After the device was unplugged, the port can be opened again. If the
-device disappears, pyserial raises SerialException, OSError, `termios.error` (which is not an
-OSError), or TypeError if the port is closed at the same time.
+A port is opened exclusively. When a device that was unplugged is back, its port can be opened
+again. If the device disappears, pyserial raises SerialException, OSError or `termios.error`, which
+is not an OSError. It raises TypeError if the port is closed at the same time.
 
 On POSIX systems, the port is read through its descriptor. After each read, the thread pauses, so
 that it does not wake up for every byte of a fast line.

@@ -1,8 +1,8 @@
 """Run a simulated sensor at an outlet, in real time.
 
-A loop passes the bytes that the device sends to the outlet, and the commands that arrive to the
-device. In between, it waits until the device sends again or a command arrives. `serve` runs the
-loop in the calling thread, and `Served` runs it in a new thread.
+A loop passes the bytes that the device sends to the outlet, and the commands that the outlet
+receives to the device. Between two passes, it waits until the device sends again or a command
+arrives. `serve` runs the loop in the calling thread, and `Served` runs it in a new thread.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.outlets import LOCALHOST, Outlet
 from lidarspec.transports.protocol import POLL_S, Chunk, ClosingContext, Sender
 
-#: Minimum time between two passes of the loop, in which the frames of a fast sensor accumulate.
+#: Minimum time between two passes of the loop, during which the frames of a fast sensor accumulate.
 _MIN_PAUSE_S = 0.001
 _PASS_TIMEOUT_S = 0.1
 #: Maximum time that a virtual clock waits until a program opens the port.
 _LISTENER_TIMEOUT_S = 10.0
 
 
-#: Step of a virtual clock. It must be less than the second that a simulated device can be advanced
-#: by.
+#: Step of a virtual clock. It must be less than a second, because a simulated device skips longer
+#: delays.
 _VIRTUAL_STEP_NS = 20_000_000
 
 
@@ -54,11 +54,11 @@ class VirtualClock:
         return self._now_ns < self._end_ns
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock by some seconds, in later steps."""
+        """Let later steps advance the clock by some seconds."""
         self.advance_to(self._end_ns + int(seconds * SECOND))
 
     def advance_to(self, end_ns: int) -> None:
-        """Advance the clock to a time, in later steps."""
+        """Let later steps advance the clock to a time."""
         self._end_ns = max(self._end_ns, end_ns)
 
     def step(self) -> None:
@@ -69,9 +69,9 @@ class VirtualClock:
 class FairLock:
     """A lock that threads get in the order in which they request it.
 
-    It is used by threads that simulate sensors. With an ordinary lock, or without a lock, a hundred
-    such threads make hardly any progress, because each often waits for all others to release the
-    interpreter lock.
+    It is used by threads that simulate sensors. Without this lock, or with an ordinary lock, a
+    hundred such threads make hardly any progress, because each of them often waits until all others
+    have released the interpreter lock.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class FairLock:
         """Hold the lock during the block; yield False if `cancel` was called instead.
 
         Args:
-            stop: the event that `cancel` identifies the waiting thread by.
+            stop: an event by which `cancel` identifies the waiting thread.
         """
         ticket = threading.Event()
         with self._lock:
@@ -218,7 +218,7 @@ def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
 def due_chunks(
     device: SimulatedDevice, now: int, arrival_ns: int | None = None
 ) -> dict[str, list[Chunk]]:
-    """Advance a device to the time `now`, and return the bytes that it sends, by link.
+    """Advance a device to the time `now`, and return the bytes it sends, by link.
 
     Args:
         device: the simulated device.
@@ -300,7 +300,7 @@ class Served(ClosingContext):
         self._call_in_thread(lambda: self.device.start(get_now()))
 
     def jump_clock(self, seconds: float) -> None:
-        """Let the sensor's clock jump, at a packet within the next quarter of a second.
+        """Let the sensor's clock jump; the jump happens within a quarter of a second.
 
         Args:
             seconds: size of the jump; negative to jump back.
@@ -322,14 +322,14 @@ class Served(ClosingContext):
             raise failures[0]
 
     def delay(self, seconds: float) -> None:
-        """Let the data of the next seconds arrive late, all at the end of this time."""
+        """Hold back the data of the next `seconds`, and send all of it at their end."""
         get_now = self._clock or time.monotonic_ns
         self._call_in_thread(lambda: self.device.delay_output(seconds, get_now()))
 
     def advance(self, seconds: float) -> None:
         """Advance the virtual clock, and wait until all data that is due was sent.
 
-        Before, waits until a program opens the port.
+        If no program has opened the port, this first waits until a program opens it.
 
         Raises:
             UsageError: if the port runs in real time.
@@ -373,7 +373,7 @@ class Served(ClosingContext):
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Call the queued functions; report the calls before the last pass as done."""
+        """Call the queued functions; report the calls of the previous pass as done."""
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

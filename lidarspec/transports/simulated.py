@@ -22,7 +22,7 @@ from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
 #: options of a ``sim:`` SOURCE.
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
-#: Minimum time between two reads, in which the packets of a fast sensor accumulate.
+#: Minimum time between two reads, during which the packets of a fast sensor accumulate.
 _MIN_READ_INTERVAL_NS = 2_000_000
 
 
@@ -111,7 +111,7 @@ class SimulatedTransport(LiveTransport):
 
     @property
     def own_port(self) -> int | None:
-        """The declared port of the data: the simulated sensor needs none."""
+        """The declared port of the data, although a simulated sensor needs no port."""
         link = self.sensor.links.get("data")
         return link.ports[0] if isinstance(link, Udp) and link.ports else None
 
@@ -126,8 +126,8 @@ class SimulatedTransport(LiveTransport):
     def _next_data_ns(self) -> float:
         """Return the time at which the device sends data again, ns; inf if unknown.
 
-        It is unknown for links other than the data link, because they get bytes only when the data
-        link is read.
+        It is unknown for all links other than the data link, because only reading the data link
+        advances the device.
         """
         if self._name == "data":
             deadline = self.device.deadline
@@ -163,8 +163,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
 
     Args:
         address: the SOURCE.
-        sensor: the sensor to read the source with. If it has the id in the SOURCE, it is simulated,
-            with its options.
+        sensor: the sensor that decodes the data. If it has the id in the SOURCE, this sensor, with
+            its options, is also simulated.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.

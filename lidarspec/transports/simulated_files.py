@@ -1,6 +1,6 @@
 """Write the bytes of a simulated sensor to a file, without waiting.
 
-The arrival times in the file are those of the simulated device. The file is like a recording that
+The arrival times in the file are those of the simulated device. The file equals a recording that
 begins when the device is switched on and opened.
 """
 
@@ -32,8 +32,8 @@ def write_file(
 ) -> int:
     """Write the bytes that a device sends in a period after its start.
 
-    The commands that a program sends to open the device are sent and recorded as well. If the
-    device sends no data, no file is created.
+    The commands that open the device are sent to it and recorded as well. If the device sends no
+    data, no file is created.
 
     Args:
         device: the simulated device.
@@ -99,12 +99,12 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
 
 
 def _commands_on_open(sensor: Sensor) -> list[str]:
-    """Return the commands that open a device, without mere settings of control lines."""
+    """Return the opening commands of a sensor that do more than set control lines."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
 
 def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
-    """Return an error with the reason why a device has sent no data."""
+    """Return an error that gives the reason why a device has sent no data."""
     sensor = device.sensor
     sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:

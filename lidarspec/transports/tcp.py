@@ -30,7 +30,7 @@ CONNECT_TIMEOUT_S = 5.0
 #: timeout of each attempt to connect again.
 RECONNECT_TIMEOUT_S = 0.5
 #: time without a byte after which an incomplete frame is discarded. It is long because TCP
-#: retransmits lost segments only after 0.2 s, 0.4 s, 0.8 s ...
+#: retransmits a lost segment only after 0.2 s, and then after 0.4 s, 0.8 s and so on.
 SILENCE_S = 10.0
 
 
@@ -38,8 +38,8 @@ class TcpTransport(StreamTransport):
     """A TCP connection to a sensor.
 
     Args:
-        port: the port; None if the sensor reports it, for every connection anew. `connect_to` then
-            opens the connection.
+        port: the port; None if the sensor reports a new port for every connection. In this case,
+            `connect_to` opens the connection.
 
     Raises:
         SourceError: if the connection fails.
@@ -147,11 +147,11 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
 
     Args:
         address: the SOURCE.
-        sensor: gives the default of the port; None for no default. If the sensor reports the port,
-            the connection is opened later.
+        sensor: the sensor whose port is the default; None for no default. If the sensor reports its
+            port, the connection is opened later.
 
     Raises:
-        UsageError: if host or port is missing, or for an option: TCP has none.
+        UsageError: if host or port is missing, or for any option, because TCP has no options.
         SourceError: if the connection fails.
     """
     address.check(())

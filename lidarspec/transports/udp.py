@@ -1,18 +1,18 @@
 """Receive the UDP datagrams of a sensor, with arrival times and drop counts from the kernel.
 
 Sensors send to the address of this computer or to the broadcast address. Sockets are therefore
-bound to all interfaces ("udp://"), unless the SOURCE contains the address of one
+bound to all interfaces ("udp://"), unless the SOURCE contains the address of one interface
 ("udp://127.0.0.1:2368"). Nothing is sent until `write` is called.
 
 Linux stores the arrival time of each datagram, and the number of datagrams that the socket has
-dropped before it. Arrival times are therefore exact although a short pause follows each read, in
-which datagrams accumulate. The receive buffer stores datagrams while the program does not read. The
-kernel may grant a smaller buffer than requested, so its size is read back.
+dropped before it. Arrival times are therefore exact, although datagrams accumulate in a short pause
+after each read. The receive buffer stores datagrams while the program does not read. The kernel may
+grant a smaller buffer than requested, so its size is read back.
 
 `ReceiveSlots` fetches many datagrams with one system call, recvmmsg. It uses ctypes, because Python
-has no function for this call. A call for each datagram would be too slow for a fast sensor: each
-socket call in Python releases the interpreter lock, and it takes milliseconds to get it back if
-another thread computes.
+has no function for this call. A call for each datagram would be too slow for a fast sensor. Each
+socket call in Python releases the interpreter lock, and if another thread is computing, it takes
+milliseconds to acquire the lock again.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from lidarspec.transports.protocol import Chunk, LiveTransport, Origin, Sender
 
 #: Maximum number of datagrams that one system call fetches.
 SLOT_COUNT = 256
-#: Size of the buffer for the payload of a datagram. Unused parts need no memory. The next constants
-#: are the sizes of the buffers for its address and its control messages.
+#: Size of the buffer for the payload of a datagram; unused pages of it need no memory. The next
+#: constants are the sizes of the buffers for the datagram's address and its control messages.
 PAYLOAD_SLOT_BYTES = 1 << 16
 ADDRESS_SLOT_BYTES = 32
 CONTROL_SLOT_BYTES = 128
@@ -67,13 +67,13 @@ READ_PAUSE_S = 0.002
 #: Maximum time that a datagram may have waited in the kernel. A longer time means that the clock
 #: was set.
 MAX_KERNEL_DELAY_NS = 60_000_000_000
-#: Numbers of socket options of Linux that have no name in Python (asm-generic/socket.h).
+#: Numbers of Linux socket options that have no name in Python (asm-generic/socket.h).
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 #: Layout of the value of SO_TIMESTAMPNS: seconds and nanoseconds.
 TIMESTAMP = struct.Struct("qq")
-#: The destination of commands while the address of the sensor is unknown.
+#: The destination of commands as long as the address of the sensor is unknown.
 BROADCAST_ADDRESS = "255.255.255.255"
 #: Options of a UDP SOURCE.
 OPTIONS = ("port", "group", "src")
@@ -103,8 +103,8 @@ class _ReceivedDatagram(ctypes.Structure):
 #: constant is the step to the next datagram.
 _SIZE_INDEX = _ReceivedDatagram.size.offset // ctypes.sizeof(ctypes.c_uint)
 _SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_uint)
-#: Index of the size of its control messages, in units of c_size_t, and the step to the next
-#: datagram.
+#: Index of the size of the first datagram's control messages, in units of c_size_t. The next
+#: constant is the step to the next datagram.
 _CONTROL_SIZE_INDEX = _MessageHeader.control_size.offset // ctypes.sizeof(ctypes.c_size_t)
 _CONTROL_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_size_t)
 
@@ -191,8 +191,8 @@ class ReceiveSlots:
     def single_control_message(self, index: int) -> tuple[int, int, int] | None:
         """Return the type and the two values of a datagram's only control message.
 
-        Returns None unless the datagram has one control message with two 64-bit integers. This is
-        faster than `control_messages`, for datagrams with only an arrival time.
+        Returns None unless the datagram has one control message with two 64-bit integers. For
+        datagrams with only an arrival time, this is faster than `control_messages`.
         """
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
         if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
@@ -205,7 +205,7 @@ class ReceiveSlots:
         return None
 
     def control_messages(self, index: int) -> list[tuple[int, memoryview]]:
-        """Return (type, value) of each control message at socket level of a datagram."""
+        """Return (type, value) of each socket-level control message of a datagram."""
         start = index * CONTROL_SLOT_BYTES
         messages = []
         end = start + self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
@@ -242,12 +242,12 @@ class UdpTransport(LiveTransport):
         group: multicast group to join; None for none.
         sender: accept only datagrams from this "HOST" or "HOST:PORT"; others are counted in
             `foreign`. None to accept all.
-        datagrams: whether each datagram is a whole frame, not a piece of a stream.
+        datagrams: whether each datagram is a whole frame, not a portion of a byte stream.
         sensor: the sensor, for suggested commands in messages.
-        remote: the destination of `write`. By default, it is `sender` if this has a port, else the
+        remote: the destination of `write`. The default is `sender` if it contains a port, else the
             sender that is passed to `accept`.
-        broadcast: whether `remote` is a broadcast address, which the sender passed to `accept`
-            replaces.
+        broadcast: whether `remote` is a broadcast address. The sender that is passed to `accept`
+            replaces a broadcast address.
 
     Attributes:
         ports: the open ports.
@@ -536,10 +536,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
     Args:
         address: the SOURCE.
-        sensor: gives the default of the ports; None for no default.
+        sensor: the sensor whose ports are the default; None for no default.
 
     Raises:
-        UsageError: if neither the SOURCE nor the sensor gives a port, or for an unknown option.
+        UsageError: if neither the SOURCE nor the sensor specifies a port, or for an unknown option.
         SourceError: if a socket cannot be opened.
     """
     address.check(OPTIONS)

@@ -38,7 +38,7 @@ class AdapterKind:
         product_ids: the USB ids of the products.
         module: the driver in the Linux kernel.
         website: the page with the drivers for Windows and macOS.
-        brltty: whether the program brltty takes such adapters for braille displays.
+        brltty: whether the program brltty mistakes such adapters for braille displays.
     """
 
     name: str
@@ -49,7 +49,8 @@ class AdapterKind:
     brltty: bool = False
 
 
-#: Sources: the id tables of the Linux drivers cp210x, ch341 and ftdi_sio (the vendors' own ids).
+#: Sources: the id tables of the Linux drivers cp210x, ch341 and ftdi_sio. Only ids of the chips'
+#: vendors are included.
 KINDS = (
     AdapterKind(
         "CP210x",
@@ -101,7 +102,7 @@ class UsbDevice:
 
 @dataclass(frozen=True)
 class MissingDriver:
-    """The driver that an adapter needs, in words.
+    """A description of the driver that an adapter needs.
 
     Attributes:
         text: the adapter and its driver.
@@ -113,7 +114,7 @@ class MissingDriver:
 
 
 def list_missing_drivers(platform: str = sys.platform) -> list[MissingDriver]:
-    """Return the driver of each known USB adapter of this computer that has none."""
+    """Return the driver that each known USB adapter without a driver needs."""
     return [
         describe_missing_driver(device, device.kind, platform)
         for device in list_usb_devices(platform)
@@ -181,7 +182,7 @@ def parse_ioreg(listed: bytes, ids_of_ports: Iterable[tuple[int, int]]) -> Itera
 
 
 def parse_windows(listed: bytes) -> Iterator[UsbDevice]:
-    """Yield the USB devices in the JSON output of Windows; empty output has none."""
+    """Yield the USB devices in the JSON output of Windows, which may be empty."""
     if not listed.strip():
         return
     entries: Any = json.loads(listed)
