@@ -1,19 +1,19 @@
 """Columns: the operands of `points`, `plausible` and clock functions.
 
-A `Batch` is a table of packets with the breaks in the stream, the last frame of each other type
-before each packet, and values that were kept from the previous batch. A function receives the
-fields of a batch as ``f``, a `Fields`. Each attribute of ``f`` is a `Column`.
+A `Batch` is a table of packets, with the breaks in the stream, the last frame of each other type
+before each packet, and values from the previous batch. The argument of a function is ``f``, the
+`Fields` of a batch. Each attribute of ``f`` is a `Column`.
 
-A `Column` is an array with one axis for the packets and one for each array level of the struct. An
-axis has length 1 if the field is outside of this array. Each axis has the name of its array, so
-arithmetic aligns columns by name, and fields of different arrays cannot be mixed by accident. If
-values depend on later packets, ``ready`` is the number of packets with final values. `FlatColumn`
-has the values of a column in stream order, without padding. `previous`, `following` and `last` use
-it.
+A `Column` is an array with one axis for the packets and one axis for each level of arrays in the
+struct. If the field is outside of an array, the axis of this array has length 1. Each axis has the
+name of its array. Therefore, arithmetic aligns columns by name, and fields of different arrays
+cannot be mixed by accident. If values depend on later packets, ``ready`` is the number of packets
+whose values are final. `FlatColumn` has the values of a column in stream order, without padding;
+`previous`, `following` and `last` use it.
 
 `align` also aligns other arrays. An array made by `along` is aligned by the name of its array. A
-plain array is aligned by its length, if exactly one array of the frame has this length. A plain
-array with as many axes as there are nested arrays is aligned by position, as in NumPy.
+plain array is aligned by its length, if exactly one array of the frame has this length. If a plain
+array has as many axes as there are nested arrays, it is aligned by position, as in NumPy.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis, row_numbers
 
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
-#: The messages for operations that columns do not support.
+#: Messages for operations that columns do not support.
 NO_TRUTH = (
     "a column has one value per packet, so it is neither true nor false: use & | ~ instead of"
     " `and`, `or`, `not`, write a < f.x < b as (a < f.x) & (f.x < b), and use np.where instead of"
@@ -66,10 +66,10 @@ class Batch:
         table: the raw columns of the packets.
         breaks: (n,) True if packets or bytes were lost before the packet.
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
-            the last frame before each packet (-1 if no frame has arrived yet).
+            the last frame before each packet; -1 for a packet before the first frame.
         defaults: the declared defaults of state columns, by frame type and path.
-        carry: the values that the previous batch kept for each call of `previous` or `last`, by the
-            number of the call.
+        carry: values from the previous batch, for each call of `previous` or `last`, by the number
+            of the call.
     """
 
     table: Table
@@ -84,7 +84,7 @@ class Batch:
         return len(self.table)
 
     def carry_over(self, ready: int) -> Carry:
-        """Return the values to keep for the next batch, which starts with packet `ready`."""
+        """Return values that the next batch needs, if it starts with packet `ready`."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: LayoutRows) -> Batch:
@@ -100,10 +100,10 @@ class Column(NDArrayOperatorsMixin):
     """Numbers of a batch of packets; NumPy's functions can be applied to it.
 
     Attributes:
-        array: the numbers, (n or 1, ...), with one axis for each array level of the struct; its
-            length is 1 if the field is outside of this array.
-        axes: the names of the axes after the first; None for an axis of length 1. A "?" marks an
-            axis that no field has confirmed. It follows a name that was given by `along`, and
+        array: the numbers, (n or 1, ...), with one axis for each level of arrays in the struct. The
+            axis of an array that does not contain the field has length 1.
+        axes: the names of the axes after the first; None for an axis of length 1. If no field has
+            this axis, a "?" marks the name: it follows a name that was given by `along`, and
             precedes a name that was guessed for a plain array.
         ready: the number of packets at the start of the batch with values that do not depend on
             later packets.
@@ -138,7 +138,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values that are known while the function runs, which are all values."""
+        """The values that are known while the function runs, here all values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -365,7 +365,7 @@ class FlatColumn:
 
     Attributes:
         values: (k,) float64.
-        starts: (n + 1,) the index of the first value of each packet, and k.
+        starts: (n + 1,) the index of the first value of each packet; the last element is k.
         edges: the indices of the values that follow a loss, ascending.
     """
 
@@ -387,7 +387,7 @@ class FlatColumn:
         self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
 
     def unflatten(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return k values in stream order as an array of the column's shape, padded with nan."""
+        """Return k values in stream order in the column's shape, padded with nan."""
         if self._mask is None:
             return values.reshape(self._shape)
         full = np.full(self._mask.shape, np.nan)
@@ -507,7 +507,7 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
     A name may be None.
 
     Raises:
-        SpecError: if the names are of different arrays, and neither was guessed.
+        SpecError: if the names belong to different arrays, and neither was guessed.
     """
     if first is None or name is None:
         return first or name
@@ -628,14 +628,14 @@ def _find_axis(
 def align_points(
     parts: Mapping[str, Any], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
-    """Align the parts of the result of `points`.
+    """Align the coordinates and other columns that `points` returns.
 
     Returns:
         The arrays, the names of their axes, the smallest `ready`, and their common shape (n, ...).
 
     Raises:
-        SpecError: if parts belong to different arrays of the frame, if their lengths differ, or if
-            a plain array is along an axis that no field has.
+        SpecError: if coordinates belong to different arrays of the frame or have different lengths,
+            or if a plain array is along an axis that no field has.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
@@ -739,8 +739,8 @@ def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray
 def remainder(values: Any, full: Any) -> NDArray[Any]:
     """Return exactly the same values as ``np.remainder``.
 
-    This is four times as fast if the values are less than one turn outside of [0, full), as nearly
-    all angles are.
+    For values less than one turn outside of [0, full), such as nearly all angles, this function is
+    four times as fast.
     """
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
@@ -755,7 +755,7 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
 def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
-    """Return at most `size` values directly before `end`, back to the last loss.
+    """Return at most `size` values before `end`, without values before the last loss.
 
     Args:
         values: the values in stream order.
@@ -778,8 +778,8 @@ def field_column(
     """Return a field in its unit as a column with `depth` array axes.
 
     Args:
-        which: for each packet the row of `table`; None if the packets are the rows.
-        frame: the frame type of `table`, if it is another type than that of the packets.
+        which: the row of `table` for each packet; None if the packets are the rows.
+        frame: the frame type of `table`; "" if it is the type of the packets.
     """
     array = field_array(info, table, depth)
     if which is not None:
@@ -798,7 +798,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
     field have length 1.
 
     Args:
-        raw: whether to return the integers of the frames, in their own type.
+        raw: whether to return the integers of the frames, in the dtype of the field.
     """
     if raw:
         array = table.raw(info.path)
@@ -814,7 +814,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
 
 
 def _name_axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
-    """Return the name of an axis; None if it has one element, which no packet lacks."""
+    """Return the name of an axis; None if every packet has exactly one element."""
     if length != 1 or (
         known
         and not isinstance(table.schema.arrays.get(name), int)
@@ -924,7 +924,7 @@ class _States:
 def _read_column(batch: Batch, frame: str, path: str) -> Column:
     """Return a field of a batch as a column.
 
-    For a field of another frame type, the value of a packet is the value of the last such frame
+    A field of another frame type has, for each packet, the value in the last frame of this type
     before the packet, or the declared default.
     """
     depth = batch.table.schema.depth()

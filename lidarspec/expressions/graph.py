@@ -3,14 +3,15 @@
 `trace` calls a `points`, `plausible` or clock function with `TracedFields`, and returns its result
 and the `Trace` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
 step that depends on the order of packets (`on`, `shift`, `latest`). Every node has its result for
-two sample packets, which defines its shape and axes. A step that cannot be recorded (a branch on
-data, a reduction, an attribute of an array) raises `UntraceableError` with the reason.
+two sample packets, which defines its shape and axes. Some steps cannot be recorded: a branch that
+depends on data, a reduction, or an attribute of an array. They raise `UntraceableError` with the
+reason.
 
 `traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
-fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph, and
-use the functions in this module that split conditions and sums. In these functions a value is
-*full* if each point has its own value. Otherwise it is *low*: the reference evaluator computes it
-once for its packet or block.
+fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph.
+They use the functions in this module that split conditions and sums. For these functions, an
+expression is *full* if each point has its own value. Otherwise, it is *low*, and the reference
+evaluator computes it once for each packet or block.
 
 Operands that are not nodes (`vocabulary.AlongAxis`, plain arrays) are aligned when they are
 recorded, so that evaluating the graph only broadcasts arrays.
@@ -52,7 +53,7 @@ class Node:
         args: the arguments: nodes, numbers and arrays.
         sample: the result for the sample packets.
         number: the position of the node in the order of evaluation.
-        path: the path of a field or state column, as written after ``f.``.
+        path: the path of a field or state column, as it is written after ``f.``.
     """
 
     kind: str
@@ -144,8 +145,8 @@ class Trace:
 
     Attributes:
         nodes: the nodes in the order in which they were made.
-        steps: pairs of a node and the number of indices that `steps` returned for it. The trace is
-            valid only for packets with the same numbers.
+        steps: (node, number of indices) for each call of `steps`. The trace is valid only for
+            packets for which `steps` returns these numbers of indices.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -162,7 +163,7 @@ class Trace:
     ) -> TracedColumn:
         """Add a node, and return it as a traced column.
 
-        If the node is a field that was read before, return the earlier node.
+        If the field was read before, the earlier node is returned.
         """
         if path in self._read:
             return TracedColumn(self._read[path], self)
@@ -234,7 +235,7 @@ class TracedColumn(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Any:
         """Record `Column.on`.
 
-        Return nan if frames of this layout lack the column's array.
+        Returns nan if frames of this layout lack the column's array.
         """
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
@@ -264,7 +265,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return `Column.steps` of the sample packets, and record the number of indices."""
+        """Return `Column.steps` of the sample packets, and record how many indices it has."""
         indices = self.node.sample.steps()
         self._tape.steps.append((self.node, len(indices)))
         return indices
@@ -370,8 +371,9 @@ def _fold_table_rows(
 ) -> tuple[Node, NDArray[np.float64]] | None:
     """Apply a function to whole tables, before their rows are looked up.
 
-    This is possible if the operands are rows of tables at the same indices, numbers, or a row that
-    all packets share. Sines and cosines of directions in a table are then computed once.
+    This is possible if each operand is a number, a row that all packets share, or rows of a table,
+    and if all tables have the same indices. The advantage is that sines and cosines of directions
+    in a table are computed only once.
 
     Args:
         function: the elementwise function.
@@ -426,7 +428,7 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
     """Return a batch for tracing, with the first frame of a group as two packets.
 
-    With two packets, values that all packets share can be distinguished from others.
+    With two packets, values that all packets share can be distinguished from values of each packet.
     """
     return batch.of(
         LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
@@ -438,7 +440,7 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
 
     Args:
         values: nodes, traced columns, or constants, which have no nodes.
-        into: a function that returns whether to continue to the arguments of a node.
+        into: a function that returns whether the arguments of a node are visited as well.
     """
     seen = set[Node]()
     waiting = [get_node(value) for value in values]
@@ -551,13 +553,12 @@ Made = Callable[[Any, int], NDArray[np.int64]]
 class HeaderFunction:
     """Evaluates a function of header fields, and caches the terms of its result.
 
-    The date in a clock, or the setting that a counter depends on, is the same in thousands of
-    packets, and needs many operations to compute. A term is therefore computed again only if its
-    fields have changed.
+    For example, the date in a clock is the same in thousands of packets, and many operations are
+    needed to compute it. A term is therefore computed again only if its fields have changed.
 
     Args:
         function: a function of `Fields` that returns a column, or several columns (the terms).
-        made: a function that converts the values of a term to integers.
+        made: a function that converts the values of a term to integers; see `Made`.
     """
 
     def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
@@ -664,7 +665,7 @@ def split_condition(node: Node) -> Iterator[Node]:
         yield node
 
 
-#: The functions of one argument that are a multiplication by a number.
+#: The functions of one argument that multiply it by a number, and these numbers.
 FACTORS = {np.negative: -1.0, np.positive: 1.0, np.deg2rad: np.pi / 180, np.radians: np.pi / 180}
 FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
@@ -738,7 +739,7 @@ def make_key(node: Node) -> tuple[Any, ...]:
 
 
 def split_sum(value: Any, width: int) -> list[Term]:
-    """Return an expression as the terms of a sum."""
+    """Return the terms of a sum; an expression that is not a sum is the only term."""
     if not isinstance(value, Node):
         return [Term(np.asarray(value, np.float64))]
     if not is_full(value, width) and value.width:
@@ -775,5 +776,5 @@ def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
 
 
 def last_axis(shape: tuple[int, ...]) -> int:
-    """Return the number of axes up to and including the last axis longer than 1."""
+    """Return the number of axes up to the last axis with a length above 1."""
     return max((index + 1 for index, length in enumerate(shape) if length > 1), default=0)
