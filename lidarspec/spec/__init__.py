@@ -10,15 +10,16 @@ Modules in reading order:
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`, `Reported`.
 * `sensor`: `SensorDescription`, which combines these values. `Sensor`, in
   `lidarspec.sensor_operations`, is a description with methods that decode, build and so on.
-* `enum_values`: the values of codes, with their names.
-* `options`: the values that options of `configure` accept, from their annotations.
-* `arguments`: arguments of commands, and values filled in when a command is sent.
-* `fields`: units, checksums and parts, as members of a struct.
+* `enum_values`: the values of enum fields, with their names.
+* `options`: finds the values that options of `configure` accept, from annotations.
+* `arguments`: arguments of commands, and values that are filled in when a command is sent.
+* `fields`: members of a struct that add units, checksums and parts.
 * `checksums`: checksum algorithms as values.
 * `wire_forms`: the encodings of frames without fixed field offsets: tokens, lines, escapes.
 * `links`: the connections of a sensor.
-* `timing`: clocks and dates, counters, ends of scans.
-* `results`, `vocabulary`: the return values of `points` functions, and functions for them.
+* `timing`: clocks, dates, counters, and the rules that end scans.
+* `results`: the values that `points` functions return. `vocabulary`: functions that `points`
+  functions can call.
 * `tree`: a frame type as a tree of nodes.
 * `syntax`: converts a construct struct to the tree.
 * `bits`: finds the layout of bit blocks by probing.

@@ -1,9 +1,10 @@
 """Arguments of commands, and values that are filled in when a command is sent.
 
 An argument is a number in a range, a named number, a text, an address, a port or bytes. Each kind
-describes the values that it accepts and packs them into the bytes of the frame. `Count`, `Address`,
-`Port` and `Template` among the `values` of a command are replaced when the command is sent, by a
-running number, by this computer's address or port, and by a text with values that are known then.
+describes the values that it accepts, and converts them to bytes of the frame. `Count`, `Address`,
+`Port` and `Template` among the `values` of a command are placeholders. When the command is sent,
+they are replaced by a running number, by this computer's address or port, and by a text that
+contains other values.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class Port(Range):
     """The UDP port to which the sensor sends its data.
 
     As an argument, it is a number. Among the `values` of a command, it is the port at which this
-    computer expects the data. A simulated sensor then sends its data there, to the `Address` of the
-    same command.
+    computer expects the data. A simulated sensor sends its data to this port, at the `Address` in
+    the same command.
     """
 
     low: float = 1
@@ -44,10 +45,10 @@ class Port(Range):
 
 @dataclass(frozen=True, init=False)
 class Choice(Range):
-    """One of several numbers with names, for a field that serves several commands.
+    """One of several numbers with names, for a field that several commands use.
 
     An example is ``("number", Choice(cartesian=0, spherical=1))``. The argument is a name, or its
-    number. A field of one command has construct's `Enum` instead.
+    number. For a field that only one command uses, construct's `Enum` is used instead.
 
     Raises:
         SpecError: without names, or if the values are not different integers.
@@ -71,7 +72,7 @@ class Text:
     If the field of the text has a fixed size, the text is padded with the byte `fill`.
 
     Raises:
-        SpecError: for a size below 1, or a fill that is not one byte.
+        SpecError: for a size below 1, or if `fill` is not one byte.
     """
 
     size: int
@@ -167,7 +168,7 @@ class Count:
     """A running number in `Command.values`; each command that is sent has the next number.
 
     Args:
-        bits: the width of the number in bits; the largest number is followed by 0.
+        bits: the width of the number in bits. After the largest number, the count continues with 0.
         first: the number of the first command.
 
     Raises:
@@ -185,14 +186,15 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """Return the number of the command with this index, counted from 0."""
+        """Return the number of a command, given its index from 0."""
         return (self.first + index) % (1 << self.bits)
 
 
 #: Names in a `Template` that need no declaration.
 OWN_ADDRESS = "own_address"
 OWN_PORT = "own_port"
-#: The values of a `Template`. A reply must not be able to add parts to a later request.
+#: The characters that are allowed in a value of a `Template`. No other characters are allowed, so
+#: that the values of a reply cannot add text to a later request.
 _SAFE_VALUE = r"[\w.~:+-]*"
 
 
@@ -207,7 +209,8 @@ class Template:
     ``_.~:+-``.
 
     Raises:
-        SpecError: for a text that is not ASCII, has no names, or has other parts in braces.
+        SpecError: for a text that is not ASCII, has no names, or has braces around anything but a
+            name.
     """
 
     text: str
@@ -256,7 +259,7 @@ class Template:
         return self.text.format_map(texts).encode()
 
     def match(self, data: Any) -> dict[str, str] | None:
-        """Return the values in a text of this form, by name; None for any other text."""
+        """Return the values in a text that matches the template, by name; else None."""
         if not isinstance(data, bytes):
             return None
         matched = self._pattern.fullmatch(data.decode("latin-1"))
@@ -279,7 +282,7 @@ def _format_value(value: Any) -> str:
     return str(value)
 
 
-#: A value of a command that is known only when the command is sent.
+#: A value of a command that is determined only when the command is sent.
 Filled = Count | Address | Port | Template
 
 

@@ -1,9 +1,9 @@
 """Find the bits of each value of a bit block by probing its parser.
 
-The values in a block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any
-nesting) are linear functions of its bits: value = sum of bit * weight. The block is parsed once
-with no bit set, and once with each single bit set, which gives the weights. Random blocks then
-confirm them. This module therefore needs no rules about the order of bits.
+A block is any nesting of ``BitStruct``, ``ByteSwapped``, ``BitsSwapped`` and ``BytesInteger``. Its
+values are linear functions of its bits: value = sum of bit * weight. To find the weights, the block
+is parsed once with no bit set, and once for each bit with only this bit set. The weights are then
+confirmed with random blocks. This module therefore needs no rules about the order of bits.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _make_field(
 
 
 def _iter_segments(targets: dict[int, int]) -> Iterator[Segment]:
-    """Yield runs of bits that are in one byte, and in the same order as in the value.
+    """Yield runs of bits that are in one byte, in the same order as in the value.
 
     Args:
         targets: the bit of the value, by bit of the block.

@@ -5,9 +5,9 @@ is called with the bytes of one message. `single` returns a function that is fas
 `lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the
 common CRCs, by the names of CRC catalogues.
 
-The low byte of a CRC register is combined with the next byte of data. For this, the register of a
-CRC with `refin` is the usual reflected register, and the register of a CRC without `refin` is the
-usual register, aligned left, with its bytes in reverse order. This form is called wire order.
+All registers of CRCs are in *wire order*, in which the low byte of the register is combined with
+the next byte of data. With `refin`, this is the usual reflected register. Without `refin`, it is
+the usual register, aligned left, with its bytes in reverse order.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Crc(Checksum):
         width: the number of bits of the register, 1 to 64.
         poly: the polynomial without its highest term; the highest bit is the highest power.
         init: the register before the first byte, not reflected.
-        refin: whether each byte is processed from its lowest bit on.
+        refin: whether each byte is processed from its lowest bit to its highest bit.
         refout: whether the result is reflected.
         xorout: the number that is XORed with the result.
 
@@ -171,8 +171,9 @@ class WordXor(Checksum):
 
     Args:
         head: the number of bytes at the start that are always two-byte words.
-        groups: the sizes of the following words, 1 or 2 bytes each, which are repeated. If the data
-            ends in a word of two bytes, the remaining byte is a word of its own.
+        groups: the sizes of the following words, 1 or 2 bytes each. This sequence of sizes is
+            repeated. If the data ends after the first byte of a two-byte word, this byte is a word
+            of its own.
 
     Raises:
         ValueError: for invalid sizes.
@@ -215,7 +216,7 @@ class WordXor(Checksum):
 
 @dataclass(frozen=True)
 class Fold15(Checksum):
-    """A 15-bit sum of words, each added to twice the sum so far.
+    """A 15-bit sum, which is doubled before each word is added.
 
     The words are little-endian. At the end, the bits above bit 14 are added to the low 15 bits. If
     the length is odd, a zero byte is appended. Bits that are shifted past bit 29 are lost, so only
@@ -242,7 +243,7 @@ class Fletcher(Checksum):
     """Two 8-bit sums, modulo 256.
 
     The first sum, in the low byte of the checksum, is the sum of all bytes. The second sum, in the
-    high byte, adds the first sum after each byte.
+    high byte, is the sum of the values that the first sum has after each byte.
 
     Source: RFC 1145; the checksum of UBX messages.
     """
@@ -265,7 +266,7 @@ class Fletcher(Checksum):
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
-    """Another algorithm, applied to the data after padding it with zeros.
+    """Applies another algorithm to the data, after padding the data with zeros.
 
     The data is padded to a multiple of `to` bytes, for checksums of hardware that processes whole
     words.
@@ -326,13 +327,13 @@ def reflect(value: int, width: int) -> int:
 
 
 def mirrored_bytes(register: int) -> int:
-    """Return the register with the bits of each byte reversed."""
+    """Return the register with the order of the bits in each byte reversed."""
     return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
 
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """Return the table of a CRC: the XOR of a byte and the low byte -> the next register."""
+    """Return the table of a CRC, by which a byte changes the register, (256,)."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):
@@ -393,7 +394,7 @@ CRCS: dict[str, Crc] = {
     "CRC-32/XFER": _crc(32, 0x000000AF),
 }
 _NAMES = {crc: name for name, crc in CRCS.items()}
-#: The polynomials in use, by width.
+#: The polynomials of the CRCs in `CRCS`, by width.
 KNOWN = {width: {crc.poly for crc in CRCS.values() if crc.width == width} for width in (8, 16, 32)}
 
 

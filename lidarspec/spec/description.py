@@ -1,6 +1,6 @@
 """The frame types and commands of a sensor, and facts for its simulation, as values.
 
-All values are immutable, and are checked when they are made. `spec.sensor` combines them to a
+All values are immutable, and are checked when they are made. `spec.sensor` combines them into a
 `SensorDescription`.
 """
 
@@ -34,9 +34,9 @@ from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import Node, Sealed, children
 from lidarspec.spec.wire_forms import WireForm
 
-#: An item that a sensor sends after a command, see `Simulation.answers`.
+#: An item that a sensor sends after a command; see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
-#: a function of the number of a frame: the physical values of its fields, by path.
+#: a function of the number of a frame that returns the physical values of its fields, by path.
 Sweep = Callable[[int], Mapping[str, Any]]
 Answers = tuple[Answer, ...] | Callable[[Mapping[str, Any]], Iterable[Answer]]
 _Described = TypeVar("_Described")
@@ -83,27 +83,27 @@ class Simulation:
     Args:
         sweep: a function of the frame number i that returns the physical values, by path, of fields
             that do not depend on the scene, such as angles, counters and time.
-        encode: a function of the measured `Polar` of a batch that returns the raw values of its
-            fields, by path. Needed if no field contains the range alone.
-        rate: the number of frames per second. Needed for data frames if neither the clock nor the
-            times of the points determine it, and for other frames that the sensor sends
+        encode: a function that gets the simulated points of a batch as `Polar`, and returns the raw
+            values of the fields, by path. Needed if there is no field that contains only the range.
+        rate: the number of frames per second. Data frames need it only if neither the clock nor the
+            times of the points determine it. Other frames need it if the sensor sends them
             periodically.
         answers: for each command, a list of the items that the sensor sends before any data, or a
-            function that returns this list for the raw fields of the request. An item is a frame by
-            name, (name, physical values by path), bytes, or a pause in seconds in which the sensor
-            sends its fillers. The raw fields contain the values of a `Template` as texts, by name
-            in braces: "{handle}", and "{data_port}" is the port at which the simulated sensor
-            serves its data. The default for a command is its reply. Only for a sensor, not for a
-            frame type.
+            function that returns this list, given the raw fields of the request. An item is the
+            name of a frame, (name, physical values by path), bytes, or a pause in seconds during
+            which the sensor sends its fillers. The raw fields also contain the values of a
+            `Template` as texts, by the name in braces, such as "{handle}". "{data_port}" is the
+            port at which the simulated sensor serves its data. By default, a command is answered
+            with its `reply`. Only for a sensor, not for a frame type.
         directions: a function of the frame number i that returns the azimuths and elevations of its
             points, radians, as two arrays that broadcast to the points of a frame. Needed for
             `Cartesian` points.
-        effects: command -> a function that returns the sweep from the command on. Its arguments are
-            the sweep so far and the number of the next frame; the new sweep counts from 0. Only for
-            a sensor, not for a frame type.
-        date: a function of seconds since 1970 that returns the physical values, by path, of the
-            fields in which the frame has this date beside its clock, such as an NMEA sentence. It
-            is used if the simulated clock follows UTC.
+        effects: command -> a function that returns the sweep that is used after the command. Its
+            arguments are the sweep so far and the number of the next frame. The new sweep counts
+            frames from 0. Only for a sensor, not for a frame type.
+        date: a function of seconds since 1970 that returns physical values, by path, of fields that
+            contain a date in addition to the clock, such as an NMEA sentence. It is used if the
+            simulated clock follows UTC.
     """
 
     sweep: Sweep | None = None
@@ -130,25 +130,27 @@ class Frame:
         points: the `points` function of this frame type, if the sensor has several data frames. If
             the points are in parts of the frame (`Parts`), a dict with the path of the parts and
             their function, such as {"modules": points} or {"tlvs.points": points}.
-        imu: a function of `Fields` that returns the `Imu` samples of this frame type; a dict as for
-            `points` if they are in parts.
+        imu: a function of `Fields` that returns the `Imu` samples of this frame type. If the
+            samples are in parts of the frame, a dict as for `points`.
         clock: the clock of this frame type, if it is not the clock of the sensor; not for data
             frames.
         max_length: the maximum length in bytes. The default is the size of the struct, if this is
             fixed.
-        plausible: a function of `Fields` that is False for values that no sensor sends; reduced
-            with `all` per packet.
-        after: the name of another frame type, after which this frame type is valid. Of all frame
-            types that are named in an `after`, that one must have arrived last.
-        confirm: the number of consecutive valid frames that are needed to accept any of them.
+        plausible: a function of `Fields` that is False for values that no sensor sends. A packet is
+            plausible if all values of the result are true.
+        after: the name of another frame type that must precede this frame type. This frame is valid
+            only if, of all frame types that are named in any `after`, the named type was the last
+            to arrive.
+        confirm: the number of consecutive valid frames of this type that must arrive before any of
+            them is accepted.
         simulation: facts for the simulation of this frame type. Needed if the sensor has several
             data frames, if random values never make a valid frame, or if the sensor sends this
             frame periodically.
-        acknowledged: the reasons to accept findings of `lidarspec check`, by "LS204" or "LS205
-            path.of.a.field".
+        acknowledged: findings of `lidarspec check` that are accepted: "LS204", or "LS205
+            path.of.a.field" -> the reason.
         wire: the wire form, if the frame is encoded so that its fields have no fixed offsets:
-            `Tokens`, `Lines`, `Escaped`, or a form of a plugin. The struct then describes the
-            decoded content, and `max_length`, in encoded bytes, is required.
+            `Tokens`, `Lines`, `Escaped`, or a wire form of a plugin. In this case, the struct
+            describes the decoded content, and `max_length` is required, in encoded bytes.
 
     Raises:
         SpecError: if the struct cannot describe a frame, for example because it has two fields of
@@ -252,34 +254,34 @@ class Command:
             `Address()` and `Port()` are this computer's own address and the port at which it
             expects the data. `Template(...)` is a text with arguments and values of earlier
             replies.
-        args: the arguments by name, each as (path of the field, lowest, highest) in the field's
-            unit, (path, Text(16)), (path, Address()), (path, Port()) or (path, bytes). A path may
-            have an index, such as "ports[1]", or may lead to a `Template` with the name of the
-            argument.
+        args: the arguments by name. A number is (path of the field, lowest, highest), in the
+            field's unit. Other arguments are (path, Text(16)), (path, Address()), (path, Port()) or
+            (path, bytes). A path may have an index, such as "ports[1]", or may lead to a `Template`
+            that contains the name of the argument.
         reply: the frame type of the reply, or a tuple of several possible types; None if no reply
             is documented.
-        matches: the values, by path, that fields of the reply must have. With several frame types,
-            each reply is compared in the fields that it has.
+        matches: the values, by path, that fields of the reply must have. If there are several frame
+            types, only the fields that a reply has are compared.
         echoes: the paths of fields that have the same value in the request and in the reply.
         refusal: the frame type that the sensor sends instead of the reply if it refuses the
-            command. The error shows the labels of its `Enum` fields.
-        timeout: the seconds to wait for the reply each time that the command is sent.
-        retries: the number of times that the command is sent again without a reply. Only for
-            commands that do no harm if they arrive twice.
-        settle: the seconds that the sensor needs after this command before the next one.
+            command. The error message contains the labels of this frame's `Enum` fields.
+        timeout: the seconds to wait for the reply, each time the command is sent.
+        retries: how many times the command is sent again if there is no reply. Only for commands
+            that do no harm if they arrive twice.
+        settle: the seconds that the sensor needs between this command and the next.
         link: the name of the link that the command is sent on.
         lines: the levels of control lines that are set with the command, such as {"dtr": False}.
         starts: whether the sensor starts to send data.
         stops: whether the sensor stops sending data.
         only_stopped: whether the sensor ignores the command while it sends data.
         learns: a function of the reply, as `Sensor.parse` returns it, that returns options for
-            `configure` by name. Values are numbers, or bytes and texts, which become `Learned`. The
-            options are applied if the command is in `on_open`.
+            `configure` by name. Their values are numbers, bytes or texts; bytes and texts become
+            `Learned`. The options are applied if the command is in `on_open`.
         provides: a function of the reply, as for `learns`, that returns numbers and texts by name.
             Later commands use them in a `Template`, and a link may use them (`Tcp(reported=)`). If
             the function raises ValueError, the command fails with the text of this error.
-        every: the seconds after which the command is sent again and again (a heartbeat); 0 to send
-            it once.
+        every: the interval in seconds at which the command is repeated (a heartbeat); 0 to send it
+            once.
     """
 
     frame: str | None = None
@@ -365,7 +367,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Relative:
-    """A related model, installed or not, with packets of the same form.
+    """A related model, installed or not, whose packets have the same layout.
 
     Args:
         difference: a text that describes the difference to this sensor.
@@ -386,8 +388,8 @@ class Reported:
             arrived counts.
         where: a function of `Fields` that is True for the frames of the type that contain the fact;
             None for all frames.
-        text: a function from the raw value to a text; by default the name of the value, or the
-            value with its unit. "" leaves the fact out.
+        text: a function that converts the raw value to a text; by default, the text is the name of
+            the value, or the value with its unit. If it returns "", the fact is left out.
     """
 
     paths: tuple[str, ...]
@@ -406,7 +408,7 @@ class Reported:
 
     @classmethod
     def of(cls, declared: str | Reported) -> Reported:
-        """Return an entry of `Sensor.info`; a path alone is a fact in all frames of its type."""
+        """Return an entry of `Sensor.info`, which may be declared as a path only."""
         if isinstance(declared, str):
             return cls(declared)
         return declared
@@ -432,6 +434,6 @@ class FrameTypes(dict[str, Frame]):
 
 
 def freeze(value: object, *names: str) -> None:
-    """Replace the mappings in some fields of a frozen dataclass by read-only copies."""
+    """Replace mappings in some fields of a frozen dataclass by read-only copies."""
     for name in names:
         object.__setattr__(value, name, MappingProxyType(dict(getattr(value, name))))

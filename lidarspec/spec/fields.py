@@ -1,7 +1,7 @@
 """Additions to construct for units, checksums, sizes and parts of variable size.
 
-They are ordinary members of a struct and can be nested in any construct. The raw integers of a
-frame stay the same. Units are names; the units that can be used on the command line are converted
+They are ordinary members of a struct and can be nested in any construct. They do not change the raw
+integers of a frame. Units are texts; units that can be used on the command line are converted
 exactly.
 """
 
@@ -39,7 +39,7 @@ from lidarspec.spec import syntax as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 
-#: An HTTP request and its reply as messages. The link `Http` handles the rest of the protocol.
+#: An HTTP request and its reply as structs. The link `Http` handles the rest of the protocol.
 HttpRequest = Struct(
     "mark" / Const(b"HTTP"),
     "method" / Enum(Int8ub, GET=1, PUT=2, POST=3, DELETE=4),
@@ -51,7 +51,8 @@ HttpRequest = Struct(
 HttpReply = Struct(
     "mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size)
 )
-#: unit -> its size in the target unit; only units that a user may type on the command line.
+#: target unit -> unit -> size of the unit in target units. Only units that a user may type on the
+#: command line are included.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
     "s": {
@@ -96,7 +97,7 @@ def split_unit(text: str) -> tuple[str, str]:
 
 
 def slug(unit: str) -> str:
-    """Return a unit as part of a name: "deg/s" becomes "deg_s"."""
+    """Return a unit in a form that can be part of a name: "deg/s" becomes "deg_s"."""
     return re.sub(r"\W+", "_", unit).strip("_").lower()
 
 
@@ -109,10 +110,10 @@ def _is_number(text: str) -> bool:
 
 
 def duration(text: str) -> float:
-    """Return the seconds of "10s", "500ms", "2min", "2m", "1h", or of a bare number.
+    """Return the seconds in a text such as "10s", "500ms", "2min", "2m", "1h" or "10".
 
     Raises:
-        UsageError: if the text is not a duration, or negative.
+        UsageError: if the text is not a duration, or the duration is negative.
     """
     for unit, seconds in (
         ("min", 60.0),
@@ -153,7 +154,7 @@ class Scaled(layer.DescribedField):
         offset: the physical value of the raw value 0, in `unit`.
 
     Raises:
-        SpecError: if the scale is 0 or not a number, or if the arguments are in another order.
+        SpecError: if the scale is 0 or not a number, or if the arguments are in the wrong order.
     """
 
     def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
@@ -189,13 +190,13 @@ class SizeOf(layer.SizeField):
 
     Args:
         subcon: a field that parses to an integer, such as Int16ub.
-        part: the path of the part, starting from the struct that contains this field, such as
-            "body" or "body.tags". A path that starts with "_." starts from the outer struct. "" is
-            the struct itself, and "_" is the outer struct itself.
-        plus: a number that is added to the number of bytes; negative if some bytes do not count.
+        part: the path of the part, relative to the struct that contains this field, such as "body"
+            or "body.tags". A path that begins with "_." is relative to the outer struct. "" is the
+            struct itself, and "_" is the outer struct itself.
+        plus: a number that is added to the number of bytes; negative if some bytes are not counted.
 
     Raises:
-        SpecError: if the arguments are in another order.
+        SpecError: if the arguments are in the wrong order.
     """
 
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
@@ -214,11 +215,11 @@ class Checksummed(layer.SealedStruct):
 
     Args:
         struct: a construct Struct.
-        field: the path of the field with the checksum, or the paths of several fields, low bits
-            first.
+        field: the path of the field that stores the checksum, or the paths of several fields that
+            store it together, low bits first.
         algorithm: the `Checksum`; if None, a ``lidarspec_checksum`` hook has to return it.
-        over: the names of consecutive fields that the checksum covers. The default is all bytes of
-            the struct, except for bytes with a bit of `field`.
+        over: the names of consecutive fields that the checksum covers. By default, it covers all
+            bytes of the struct, except bytes that contain a bit of `field`.
         absent: the values of the field that mean that the sensor has computed no checksum. They are
             valid, and are kept when a frame is built.
     """
@@ -399,18 +400,20 @@ layer.SealedStruct.plugin_class = Checksummed
 class Parts(layer.Partition):
     """Consecutive structs of different sizes, such as the modules of a telegram.
 
-    In a parsed frame the parts are a list. In the function ``Frame(points={"modules": points})``
-    each part is a packet of its own: ``f.distance`` is a field of the part, and ``f.frame.counter``
-    is a field of the outer frame. In expressions of a part, this field is ``this._.counter``. In
-    fields after the parts, ``this.modules.size`` is the total size of the parts in bytes.
+    In a parsed frame the parts are a list. In the function `points` of ``Frame(points={"modules":
+    points})``, each part is a packet of its own: ``f.distance`` is a field of the part, and
+    ``f.frame.counter`` is a field of the outer frame. In expressions in a part, the same field of
+    the outer frame is ``this._.counter``. In expressions after the parts, ``this.modules.size`` is
+    the total size of the parts in bytes.
 
     Args:
-        kinds: the Struct of a part, or a dict of several Structs by name. The first Struct with
-            matching constants is used, so a last Struct without constants matches all other parts.
+        kinds: the Struct of a part, or a dict of several Structs by name. The first Struct whose
+            constants match is used, so if the last Struct has no constants, it matches all other
+            parts.
         count: the number of parts.
         size: the size of the first part in bytes, 0 if there are no parts; requires `following`.
-        following: an expression of the fields of a part, with the size of the next part in bytes.
-            It is 0 in the last part.
+        following: an expression of the fields of a part that gives the size of the next part in
+            bytes; 0 in the last part.
         within: the total size of all parts in bytes.
 
     Raises:

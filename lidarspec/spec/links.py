@@ -12,7 +12,7 @@ from lidarspec.spec.syntax import has_member
 class Link:
     """The base class of all kinds of connection.
 
-    If a plugin declares a kind of its own, the hook `lidarspec_link` opens it.
+    If a plugin declares its own kind of connection, the hook `lidarspec_link` opens it.
 
     Attributes:
         datagrams: whether each datagram is a frame.
@@ -54,10 +54,10 @@ class Serial(Link):
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """The rule that joins datagrams, each of which is a fragment of a message.
+    """The rule for joining datagrams that are fragments of a message.
 
     Args:
-        struct: the construct Struct of a datagram, or of its header alone.
+        struct: the construct Struct of a datagram, or of only its header.
         key: the path of the field, or the paths of several fields, that identify the message, such
             as a counter. Any 16 consecutive messages must have different keys.
         index: the path of the field with the index of the fragment in its message.
@@ -99,13 +99,13 @@ class Assembled:
 
 @dataclass(frozen=True, init=False)
 class Udp(Link):
-    """UDP datagrams, which are frames or pieces of a byte stream.
+    """UDP datagrams, which are frames or portions of a byte stream.
 
     Args:
-        ports: the default ports. For data, they are the ports of this computer that the sensor
-            sends to. For a link that commands are sent on, it is the port of the sensor.
-        stream: whether the datagrams are pieces of a byte stream, because a frame can span several
-            datagrams.
+        ports: the default ports. For a data link, they are the ports of this computer to which the
+            sensor sends. For a link over which commands are sent, it is the port of the sensor.
+        stream: whether the datagrams are portions of a byte stream, in which a frame can extend
+            over several datagrams.
         assembled: the rule that joins datagrams to messages, if messages can be longer than a
             datagram. Datagrams that do not follow this rule are used unchanged.
         broadcast: the port to which commands are broadcast as long as the address of the sensor is
@@ -156,8 +156,8 @@ class Tcp(Link):
 
     Args:
         port: the port; 0 if the sensor reports it.
-        reported: the name of the value with the port that a reply provides
-            (`Command.provides`), if the port is not fixed. The link is opened after that reply.
+        reported: if the port is not fixed, the name under which a reply provides the port
+            (`Command.provides`). The link is opened after that reply.
     """
 
     port: int = 0
@@ -176,7 +176,7 @@ class Http(Link):
 
     Args:
         port: the port of the server.
-        timeout: the maximum time for a request with its reply, seconds.
+        timeout: the maximum time from a request to the end of its reply, seconds.
         largest: the maximum size of the body of a reply, in bytes. A longer reply is an error.
     """
 

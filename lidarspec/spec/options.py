@@ -21,14 +21,14 @@ from typing import Any, Literal, Optional, Union, get_args, get_origin, get_type
 
 from lidarspec.errors import SpecError, UsageError
 
-#: The maximum size of learned content from a file, decompressed, in bytes.
+#: The maximum size of learned content in bytes, after decompression.
 MAX_LEARNED_BYTES = 1 << 20
 
 
 class Learned(bytes):
-    """Bytes that a sensor has reported, as the value of an option that is usually a file.
+    """Bytes from a sensor, as the value of an option that is usually a file.
 
-    An option accepts this type if its annotation has it, as in ``calibration: str | Path |
+    An option accepts this type if its annotation contains it, as in ``calibration: str | Path |
     Learned``.
     """
 
@@ -44,7 +44,7 @@ class Learned(bytes):
         """Return the content that `to_dict` wrote.
 
         Raises:
-            UsageError: for other data, or for more than a megabyte of content.
+            UsageError: if the data is invalid, or has more than a megabyte of content.
         """
         reader = zlib.decompressobj()
         try:
@@ -58,7 +58,7 @@ class Learned(bytes):
 
     @classmethod
     def content(cls, value: str | PathLike[str] | Learned) -> bytes:
-        """Return the content of the file at a path, or learned content as it is.
+        """Return the content of the file at a path, or learned content unchanged.
 
         Raises:
             UsageError: for a file that cannot be read.
@@ -99,8 +99,8 @@ def _is_instance(kind: type, value: object) -> bool:
     return isinstance(value, kind)
 
 
-#: For types in an annotation, a function that tests a value. The plugin checks values of all other
-#: types.
+#: For each type in an annotation, a function that tests a value. Values for other types are tested
+#: only by the plugin.
 _TESTS: dict[object, Callable[[object], bool]] = {
     PathLike: _is_path,
     Learned: partial(_is_instance, Learned),

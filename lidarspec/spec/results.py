@@ -67,8 +67,8 @@ class Extra:
         unit: the unit, for example "m/s"; "" for a plain number. The default is the unit of the
             field, if the values are an unchanged field.
         dtype: a numeric NumPy type. The default is the type of the field if the values are an
-            unchanged integer field, bool if they are conditions, and float32 otherwise. In an
-            integer type nan becomes 0.
+            unchanged integer field, bool if they are conditions, and float32 otherwise. If the type
+            is an integer type, nan becomes 0.
     """
 
     values: Array
@@ -107,8 +107,8 @@ class Polar:
     """Points given by range and direction.
 
     Args:
-        range: metres; 0 or inf without a return, nan if the point is invalid.
-        azimuth: radians, counter-clockwise seen from above; if it is nan, the point is invalid.
+        range: metres; 0 or inf for a point without a return, nan for an invalid point.
+        azimuth: radians, counter-clockwise as seen from above; nan for an invalid point.
         elevation: radians above the horizon.
         intensity: the number on the wire; None if the sensor has none.
         time: seconds after the packet's clock.
@@ -193,7 +193,7 @@ class Imu:
     The axes are x forward, y left and z up (REP-145).
 
     Args:
-        angular_velocity: three columns, about x, y and z, rad/s, right-handed. A turn to the left
+        angular_velocity: three columns, about x, y and z, rad/s, right-handed: a turn to the left
             is positive about z.
         linear_acceleration: three columns, along x, y and z, m/s2, including gravity. A level
             sensor at rest has +9.80665 along z.

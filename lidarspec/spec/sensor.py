@@ -1,6 +1,6 @@
 """The facts of a sensor's manual as fields of a `SensorDescription`.
 
-A description is immutable. When it is made, it checks that its parts fit together. The packages
+A description is immutable. When it is made, it checks that its facts are consistent. The packages
 `frames`, `framing`, `points`, `packets` and `scans` work from a description. Plugins and users make
 a `lidarspec.Sensor`, which is the subclass with methods that call these packages (see
 `sensor_operations`).
@@ -49,12 +49,13 @@ from lidarspec.trusted_files import resolve_beside
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: The version of the plugin interface. Plugins for this version and the previous one are accepted.
+#: The version of the plugin interface. Plugins for this version and for the previous version are
+#: accepted.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: The valid keys of `Sensor.info`.
 _FACT = re.compile(r"[a-z][a-z0-9_]*")
-#: names of the returns of a firing; "varying" if a setting of the sensor decides.
+#: names of the returns of a firing; "varying" means that it depends on a setting of the sensor.
 RETURN_NAMES = ("first", "last", "strongest", "second strongest", "varying")
 #: The possible directions of a vendor's axes.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
@@ -73,7 +74,8 @@ class SensorDescription:
     """The facts of one sensor; `lidarspec.Sensor` explains each of them.
 
     Raises:
-        SpecError: for an invalid fact, or a reference to a part that the sensor does not have.
+        SpecError: for an invalid fact, or a reference to a frame, command or link that the sensor
+            does not have.
     """
 
     id: str
@@ -125,11 +127,12 @@ class SensorDescription:
 
     @property
     def data_frame(self) -> str:
-        """The name of the frame type with the points, or the selected one of several.
+        """The name of the frame type with the points; of several, the selected type.
 
         Raises:
             UsageError: for a sensor without points. The error lists its frame types.
-            UnknownFrame: for a sensor that needs a file first and has no frame types yet.
+            UnknownFrame: for a sensor whose frame types are unknown until it is configured with a
+                file.
         """
         names = self.data_frames
         self.require_points()
@@ -152,7 +155,7 @@ class SensorDescription:
 
     @property
     def has_points(self) -> bool:
-        """Whether the sensor has points; True for a sensor that has no frame types yet."""
+        """Whether the sensor has points; True as long as its frame types are unknown."""
         return bool(self.data_frames) or not self.frames
 
     def require_points(self) -> None:
@@ -218,8 +221,8 @@ class SensorDescription:
             frame: the name of a frame type, or "name.path" for the parts of a frame.
 
         Raises:
-            SpecError: if the frame type has no such function. The error lists the frame types with
-                one.
+            SpecError: if the frame type has no such function. The error lists the frame types that
+                have one.
         """
         name, _, parts = frame.partition(".")
         function = self.frames[name].imu
@@ -274,17 +277,17 @@ class SensorDescription:
 
     @property
     def announces_port(self) -> bool:
-        """Whether a command on opening tells the sensor the port to which it sends its data."""
+        """Whether an opening command sends the sensor the port to which it sends its data."""
         return any(self.commands[name].has_own_port for name in self.on_open)
 
     @property
     def commands_over_data(self) -> bool:
-        """Whether commands with a frame go over the data link."""
+        """Whether commands that have a frame are sent over the data link."""
         return any(one.frame and one.link == "data" for one in self.commands.values())
 
     @property
     def counts_losses(self) -> bool:
-        """Whether lost packets are counted, by a counter or by a clock with a declared pace."""
+        """Whether lost packets are counted, by a counter or a clock with a declared pace."""
         if self.sequence is not None:
             return True
         return self.clock is not None and self.clock.pace is not None
@@ -314,7 +317,7 @@ def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
 
 
 def _check_sensor(sensor: SensorDescription) -> None:
-    """Raise `SpecError` if a fact is invalid or refers to a missing part."""
+    """Raise `SpecError` if a fact is invalid or refers to something that is missing."""
     check_simulation(sensor.simulation)
     _check_facts(sensor)
     for name, frame in sensor.frames.items():
@@ -337,7 +340,7 @@ def _check_sensor(sensor: SensorDescription) -> None:
 
 
 def _check_reported(sensor: SensorDescription, name: str) -> None:
-    """Raise `SpecError` unless a reply can report the port of a link before its data."""
+    """Raise `SpecError` unless a reply can report a link's port before data is read."""
     if name != "data" or not any(
         sensor.commands[opening].provides and sensor.commands[opening].link != "data"
         for opening in sensor.on_open
@@ -427,7 +430,7 @@ def _check_facts(sensor: SensorDescription) -> None:
 
 
 def _comes_in_datagrams(sensor: SensorDescription, frame: Frame) -> bool:
-    """Return whether the sensor never sends a frame as part of a byte stream."""
+    """Return whether a frame is never part of a byte stream."""
     if frame.direction == "out":
         return True
     if frame.data and "data" in sensor.links:
@@ -436,7 +439,7 @@ def _comes_in_datagrams(sensor: SensorDescription, frame: Frame) -> bool:
 
 
 def _check_command(sensor: SensorDescription, name: str, command: Command) -> None:
-    """Raise `SpecError` if a command refers to a part that the sensor does not have."""
+    """Raise `SpecError` if a command refers to something that is missing."""
     frames = [command.frame, *command.replies, command.refusal]
     _check_names(sensor, f"commands.{name}", frames, sensor.frames)
     _check_names(sensor, f"commands.{name}.link", [command.link], sensor.links)
@@ -468,7 +471,7 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
 
 
 def _check_clock(sensor: SensorDescription) -> None:
-    """Raise SpecError if the frames of the clock are missing, or cannot complete the clock."""
+    """Raise `SpecError` if a frame type that the clock needs is missing or unsuitable."""
     clock = sensor.clock
     if clock is None:
         return
@@ -490,7 +493,7 @@ def _check_names(
 ) -> None:
     """Raise `SpecError` for the first name that is not in a table; None is allowed.
 
-    A sensor without frame types, which needs a file first, is not checked.
+    A sensor whose frame types are unknown until it is configured with a file is not checked.
     """
     for name in names:
         if name is not None and name not in table and sensor.frames:
@@ -558,7 +561,7 @@ class Configure:
         it.
 
         Raises:
-            UsageError: for a path outside the folder, or any other value.
+            UsageError: for a path outside the folder, or a value of another kind.
         """
         checked = dict(options)
         for name, value in options.items():

@@ -1,9 +1,10 @@
-"""Ends of scans, clocks and packet counters: rules that a sensor declares and the engine applies.
+"""Rules that a sensor declares for the ends of scans, clocks and packet counters.
 
-A `Clock` says how to read the time of a packet, and what that time counts (`EPOCHS`). Many sensors
-also send how good their clock is: a `ClockStatus` names the field and the meaning of its values.
+A `Clock` declares how the time of a packet is read, and from which epoch it counts (`EPOCHS`). Many
+sensors also send the state of their clock. A `ClockStatus` declares the field with the state, and
+the meaning of its values.
 
-`unix_time` is for the functions of a clock: it converts the fields of a date.
+A function of a clock can call `unix_time` to convert the fields of a date.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from lidarspec.errors import SpecError
 
 HOUR_S = 3600
 DAY_S = 86_400
-#: The first date that a clock can have, ns since 1970: 2001. Clocks that count from power-up, or
-#: from a date that was never set, show earlier times.
+#: Clock readings before this time, the start of 2001, are not dates, ns since 1970. Clocks that
+#: count from power-up, or from a date that was never set, have earlier readings.
 FIRST_DATE_NS = 10**18
-#: The days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
+#: The number of days from 0000-03-01 to 1970-01-01, plus 1 because the days of a month are counted
+#: from 1.
 _EPOCH_DAYS = 719_469
 #: Times in 64-bit nanoseconds are limited to 292 years.
 MAX_CLOCK_S = 2**63 / 1e9
@@ -32,7 +34,7 @@ Source = str | tuple[str, ...] | Callable[[Any], Any]
 #: The epochs of clocks with a date. They count from 1970 and differ by leap seconds only: in 2017
 #: to 2026, TAI is 37 s and GPS time 18 s ahead of UTC.
 DATED_EPOCHS = ("utc", "tai", "gps")
-#: What a clock can count, by the name in `Clock.epoch`.
+#: The epochs from which a clock can count, by the name in `Clock.epoch`.
 EPOCHS = MappingProxyType(
     {
         "": "not declared",
@@ -47,7 +49,7 @@ EPOCHS = MappingProxyType(
 
 @dataclass(frozen=True)
 class OnWrap:
-    """Cut when a circular column passes `at`.
+    """End a scan when an angle passes `at`.
 
     Args:
         name: the path of an angle field, or the name of a point column. With a field in an array,
@@ -62,7 +64,7 @@ class OnWrap:
 
 @dataclass(frozen=True)
 class OnFlag:
-    """Cut before every packet (or row of an array) with a set flag.
+    """End a scan before every packet, or element of an array, with a set flag.
 
     Args:
         name: the path of the flag's field.
@@ -75,7 +77,7 @@ class OnFlag:
 
 @dataclass(frozen=True)
 class OnChange:
-    """Cut before every packet (or row) in which the field `name` changes.
+    """End a scan before every packet, or element of an array, with a changed value.
 
     Args:
         name: a field path.
@@ -92,7 +94,7 @@ class OnChange:
 
 @dataclass(frozen=True)
 class OnJump:
-    """Cut before every packet (or row) with a large step of the field `name`.
+    """End a scan before every packet, or element of an array, with a large step.
 
     Args:
         name: a field path. Steps of an angle are measured in the shorter direction around the
@@ -107,14 +109,14 @@ class OnJump:
 
 @dataclass(frozen=True)
 class OnRewind:
-    """Cut before every packet in which the field `name` decreases."""
+    """End a scan before every packet in which the field `name` decreases."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Every:
-    """Cut after a number of seconds of packet time."""
+    """End a scan after a number of seconds, by the times of packets."""
 
     seconds: float
 
@@ -128,9 +130,10 @@ class ClockState:
 
     Args:
         meaning: a short description, for example "locked to PTP".
-        locked: whether the clock follows its source of time; None if the manual does not say.
-        epoch: what the clock counts in this state (a key of `EPOCHS`); None for the epoch of the
-            clock.
+        locked: whether the clock follows its source of time; None if the manual does not specify
+            it.
+        epoch: the epoch from which the clock counts in this state, a key of `EPOCHS`; None for the
+            epoch of the clock.
 
     Raises:
         SpecError: for an unknown epoch.
@@ -151,7 +154,7 @@ class ClockStatus:
 
     Args:
         source: the path of the field, or a function of `Fields` that returns an integer for each
-            frame, nan if unknown.
+            frame, or nan if it is unknown.
         states: the meaning of each value.
         frame: the incoming frame type that has the field; "" for the frames with the clock.
 
@@ -192,18 +195,18 @@ class Clock:
             are added, in seconds. Terms are added as integer nanoseconds. `unix_time` converts the
             fields of a date.
         wraps_at: the seconds after which the clock starts again at 0; None if it does not.
-        pace: a function of `Fields` that returns the seconds from a packet to the next one, nan if
-            unknown; None if not declared. Without a counter, lost packets are found by the pace.
-            With a counter, the pace shows how often the counter has wrapped in a gap, and whether a
-            value of the counter is corrupt; it then has to be correct in every mode of the sensor.
-            The pace is also used to distinguish related models.
-        reference: a pair for a clock that starts again: the name of another frame type, which also
-            has the field of the clock, and a function of its `Fields` that returns the date in
-            seconds since 1970, nan if unknown. The first frame with a date is used, in a file for
-            all packets, and for live data for the packets after this frame.
-        epoch: what the clock counts, a key of `EPOCHS`: "boot", "utc", "tai", "gps" or "hour"; ""
-            if the manual does not say. With `status` it is the epoch of a locked clock. The option
-            `epoch` of every sensor replaces it.
+        pace: a function of `Fields` that returns the seconds from a packet to the next packet, or
+            nan if they are unknown; None if not declared. Without a counter, lost packets are found
+            by the pace. With a counter, the pace shows how often the counter has wrapped in a gap,
+            and whether a value of the counter is corrupt. The pace must then be correct in every
+            mode of the sensor. It is also used to distinguish related models.
+        reference: for a clock that starts again at 0, a pair that gives its date: the name of
+            another frame type that has the same clock, and a function of its `Fields` that returns
+            the date in seconds since 1970, or nan if it is unknown. The first frame with a date is
+            used: in a file for all packets, and in live data for the packets after this frame.
+        epoch: the epoch from which the clock counts, a key of `EPOCHS`: "boot", "utc", "tai", "gps"
+            or "hour"; "" if the manual does not specify it. If `status` is given, it is the epoch
+            of a locked clock. The option `epoch` of every sensor overrides it.
         status: the field that shows whether the clock is locked; None if the sensor does not send
             it.
 
@@ -262,7 +265,7 @@ def _check_epoch(epoch: str, path: str) -> None:
 
 @dataclass(frozen=True)
 class PacketCounter:
-    """A counter of packets, whose jumps show lost packets.
+    """A counter of packets. Jumps of the counter show lost packets.
 
     If a clock with a declared pace shows no gap, a jump is not counted as a loss.
 
@@ -272,8 +275,8 @@ class PacketCounter:
         last: the highest value of the counter, or a function of `Fields` that returns it; by
             default the largest value of the field.
         returns: the number of consecutive packets that contain the returns of the same firings, one
-            return each; a number or a function of `Fields`. The first packet of such a group has
-            the counter `first`, or a multiple of `returns` more.
+            return in each packet; a number or a function of `Fields`. The counter of the first
+            packet of such a group is `first` plus a multiple of `returns`.
     """
 
     field: str
@@ -294,7 +297,7 @@ def unix_time(
         year: with its century, for example 2026.
         month: 1 to 12.
         day: 1 to 31.
-        hour, minute, second: the time of day; a value beyond its usual range is added as well.
+        hour, minute, second: the time of day; values beyond their usual range are added as well.
 
     Returns:
         float64, the broadcast shape; whole seconds are exact.

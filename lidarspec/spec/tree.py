@@ -53,7 +53,7 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
 
-#: The name that is displayed for an unnamed constant.
+#: The displayed name of a constant that has no name.
 UNNAMED = "(constant)"
 
 
@@ -68,17 +68,17 @@ def to_exact(number: float | int) -> Fraction:
 class Adapter:
     """Functions that convert between the raw values of a field and decoded values.
 
-    They represent an ExprAdapter or a text of construct. A parsed frame has the decoded values.
-    Columns have them as well, unless `dtype` is uint8.
+    They represent construct's ExprAdapter, or a text. A parsed frame has the decoded values.
+    Columns have decoded values as well, unless `dtype` is uint8.
 
     Attributes:
         decode: a function that decodes an integer, or the bytes of the field.
         encode: a function that encodes a value, given the value and the size of the field in bytes.
         dtype: the dtype of a column; uint8 if columns have the raw bytes.
         allowed: the raw values that can be decoded; None if all values can be decoded, or if only
-            `decode` shows which ones.
+            calling `decode` shows whether a value can be.
         is_partial: whether a frame can be invalid because a raw value cannot be decoded.
-        form: how the value is stored, as text to display; "" for a plain number.
+        form: a text that describes how the value is stored; "" for a plain number.
         decode_bytes: a function that decodes an array of bytes along the last axis, for columns of
             decoded bytes; None if columns have the raw bytes or other values.
     """
@@ -111,7 +111,7 @@ class Adapter:
         return np.asarray(decoded[where]).reshape(shape)
 
     def can_decode(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[np.bool_]:
-        """Return whether each raw value of a column can be decoded, as booleans."""
+        """Return for each raw value of a column whether it can be decoded."""
         values, where, shape = _find_distinct(raw, is_bytes=is_bytes)
         valid = np.zeros(len(values), np.bool_)
         for index, value in enumerate(values):
@@ -156,13 +156,13 @@ class FieldInfo:
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
         docs: the documentation of the field in the plugin.
         bits: the width in bits; 0 if the width is not fixed.
-        const: the value that the field must have; None for any value.
+        const: the value that the field must have; None if any value is valid.
         allowed: the raw values that the field may have (construct's OneOf, NoneOf and Mapping), in
             ascending order; None for any value.
         rebuilt: the formula of the value in a built frame (construct's Rebuild); None if the caller
             supplies the value.
         default: the raw value, or its formula, in a built frame if the caller supplies no value.
-            For bytes, a pattern of one byte that fills the field.
+            For bytes, it is one byte that is repeated to fill the field.
         held: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
         labels: the names of raw values (construct's Enum).
         optional: whether some frames do not have the field.
@@ -218,14 +218,15 @@ class FieldInfo:
     def raw(self, physical: Any) -> Any:
         """Convert physical values to raw values.
 
-        Values of an integer field are rounded to the nearest raw value, or to the even one of two.
+        For an integer field, values are rounded to the nearest raw value; a value halfway between
+        two raw values is rounded to the even one.
 
         Args:
             physical: a number in the field's unit, or an array of any shape.
 
         Returns:
-            An int, or an int64 array of the same shape; floats for a float field. The values may
-            exceed the limits of the field.
+            An int, or an int64 array of the same shape; floats for a float field. The raw values
+            may exceed the limits of the field.
         """
         if isinstance(physical, Fraction):
             steps: Any = (physical - to_exact(self.offset)) / to_exact(self.scale)
@@ -295,11 +296,11 @@ def format_values(values: Sequence[int]) -> str:
 
 @dataclass(frozen=True)
 class Ref:
-    """A reference to the raw value of a field before the formula.
+    """A reference to the raw value of an earlier field.
 
     Attributes:
-        path: the path from the top of the frame. Without indices, it refers to the field in the
-            current element of each array.
+        path: the path from the top of the frame. If it has no indices, it refers to the field in
+            the current element of each array.
         info: the field.
     """
 
@@ -331,7 +332,7 @@ class Untraced:
 
     Attributes:
         reason: the reason, preceded by the path of the field with the expression.
-        text: the expression in the plugin, with whole paths of fields; "?" for a function.
+        text: the expression in the plugin, with the whole paths of fields; "?" for a function.
     """
 
     reason: str
@@ -366,9 +367,9 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def calculate(symbol: str, *args: Formula) -> Formula:
-    """Return an operation as a formula; the result if all arguments are numbers.
+    """Return an operation as a formula.
 
-    Only sums, differences and products are computed.
+    If all arguments are numbers, a sum, difference or product is computed instead.
     """
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))
@@ -440,8 +441,8 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
     Args:
         named: a function that returns the text of a field.
-        operations: the operations that the language writes differently from Python, by symbol, with
-            "{}" for each argument.
+        operations: for each operation that the language writes differently from Python, a format
+            string by symbol, with "{}" for each argument.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -481,7 +482,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return "/" or a float in a formula, which can make it fractional; None without one."""
+    """Return a "/" or a float that makes a formula fractional; None if it has neither."""
     for part in parts(formula):
         if isinstance(part, float):
             return part
@@ -503,7 +504,7 @@ def refs(formula: Formula) -> tuple[Ref, ...]:
     return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
 
 
-#: The maximum number of bits of the values of a formula that is evaluated in 64-bit integers.
+#: The maximum number of bits that values of a formula may have to be computed in 64-bit integers.
 MAX_FORMULA_BITS = 62
 
 
@@ -588,12 +589,12 @@ class Number:
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of bytes of variable size: a terminator, the last byte of a number, or the datagram.
+    """What ends bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
-        size: the number of bytes before the end as a field, for formulas.
-        mark: the bytes of the mark, which is searched in steps of its size; b"" if the bytes end
-            with the datagram.
+        size: a field that represents the number of bytes before the end, for formulas.
+        mark: the bytes of the mark, such as a terminator. It is searched in steps of its size. b""
+            if the bytes end with the datagram.
         mask: the bits of each byte that are compared with the mark.
         is_content: whether the mark belongs to the content, as in a number of variable size.
     """
@@ -609,7 +610,7 @@ class Ending:
         return b"" if self.is_content else self.mark
 
     def find(self, data: bytes) -> int:
-        """Return the number of bytes of the content at the start of `data`; -1 without an end."""
+        """Return the size of the content at the start of `data`; -1 if its end is missing."""
         step = len(self.mark)
         if not step:
             return len(data)
@@ -666,7 +667,7 @@ class Block:
     A block with a single part without names is an integer with an unusual width or byte order.
 
     Attributes:
-        info: the block as a field.
+        info: a description of the whole block as a field.
         size: the size in bytes.
         parts: the integers.
     """
@@ -693,7 +694,7 @@ class Struct:
 
     @property
     def struct(self) -> Struct:
-        """The struct itself, as for `Sealed.struct`."""
+        """The struct itself; the property exists because `Sealed` has it."""
         return self
 
 
@@ -828,7 +829,7 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """A node for each value of a key, and a default node for all other values.
+    """A node for each value of a key, and a node for all other values.
 
     The values are integers, unless the key is `Untraced`.
     """
@@ -848,7 +849,7 @@ class Empty:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """A condition that is not 0 in valid frames.
+    """A condition whose value is not 0 in valid frames.
 
     Attributes:
         axes: the axes of the arrays that contain the condition.
@@ -905,7 +906,8 @@ class Opaque:
         info: the part as a field.
         kind: the name of its construct class, which may be a class of the plugin.
         reason: why it cannot be converted to another node.
-        inside: the nodes in the part, if it is a bit block or a struct. They have no offsets.
+        inside: the nodes inside the part, if it is a bit block or a struct. These nodes have no
+            offsets.
         size: the size in bytes; None if it depends on the content.
         form: how the value is stored, as text to display.
         in_bits: whether the part is a bit block.
@@ -1027,7 +1029,7 @@ def size(node: Node) -> Formula | None:
 
 
 def total(sizes: Iterable[Formula | None]) -> Formula | None:
-    """Return the sum of sizes; None if any of them is None."""
+    """Return the sum of sizes as a formula; None if any size is None."""
     sum_: Formula | None = 0
     for each in sizes:
         sum_ = combine("+", sum_, each)
@@ -1083,14 +1085,14 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
 
 
 class Scope:
-    """The context in which an expression is traced, instead of construct's context.
+    """Replaces construct's context when an expression is traced.
 
     Each field before the expression is a `Symbol`, which records the operations on it.
 
     Args:
         parent: the context of the outer struct, which is "_" in expressions.
         path: the path of the struct.
-        asked: the list to which each field is appended that an expression reads.
+        asked: a list; each field that an expression reads is appended to it.
     """
 
     def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -1098,7 +1100,7 @@ class Scope:
         self.path = path
         self.asked = asked
         self.names: dict[str, Ref | Scope | Value] = {}
-        #: The names that different branches define differently.
+        #: The names that have different definitions in different branches.
         self.ambiguous: set[str] = set()
 
     def add(self, name: str, part: Ref | Scope | Value) -> None:
@@ -1161,7 +1163,7 @@ class RawCopyScope(Scope):
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A computed value, in the form that later expressions read.
+    """A computed value, as later expressions read it.
 
     Attributes:
         content: a formula or a constant; `Untraced` if the value has no formula.
@@ -1207,7 +1209,7 @@ class OuterScope(Scope):
         return value
 
 
-#: The reason why a number that has a name in an Enum equals no parsed value.
+#: The reason why a number that has a name in an Enum is never equal to a parsed value.
 NAME_IS_COMPARED = "construct compares the name of a code"
 
 

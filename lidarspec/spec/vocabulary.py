@@ -1,8 +1,8 @@
 """Functions for `points` functions, in addition to NumPy's ufuncs.
 
 They handle angles, the order of values in the stream, and tables. The functions accept NumPy arrays
-and the columns that the engine passes to `points`. For a column, they respect the borders of
-packets and lost packets. An array counts as one sequence of values.
+and the columns that the engine passes to `points`. For a column, they take the borders of packets
+and lost packets into account. A NumPy array is treated as one sequence of values.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from lidarspec.errors import SpecError
 
 Array = Any
 
-#: A step between blocks may be longer than the fastest one by this factor. In captures of rotating
-#: sensors, steps at a constant speed vary by 5 %.
+#: Steps between blocks may be larger than the step at the highest speed by this factor. In captures
+#: of rotating sensors, steps at a constant speed vary by 5 %.
 STEP_TOLERANCE = 1.25
-#: The NumPy functions that work element by element and keep axes; all others get plain arrays.
+#: The NumPy functions that work element by element, so that their results keep the axes. All other
+#: functions get plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 
 class AlongAxis(NDArrayOperatorsMixin):
     """Numbers for the elements of an array of the frame, which all packets share.
 
-    NumPy's ufuncs combine them with each other and with columns.
+    They can be combined with each other and with columns by NumPy's ufuncs.
 
     Attributes:
-        axes: the names of the arrays, each as a whole path or as the last name of the path.
+        axes: the names of the arrays; each is a whole path, or the last name of a path.
         array: the numbers, with an axis for each array of the frame.
     """
 
@@ -43,7 +44,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         return len(self.array)
 
     def __getitem__(self, which: Any) -> Any:
-        """Return an element or a part of the numbers."""
+        """Return an element, or the elements of a slice, as plain numbers."""
         return self.array[which]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -139,10 +140,11 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
     Args:
         start: the first angle of each packet, (n, 1), in the unit of `full`.
-        end: the last angle of each packet, (n, 1). An end below the start is in the next turn.
+        end: the last angle of each packet, (n, 1). If it is below the start, it is in the next
+            turn.
         count: the number of points of each packet, a number or a column (n, 1). If it is 1, the
             result is `start`.
-        full: a whole turn in the unit of the angles.
+        full: the size of a whole turn, in the unit of the angles.
 
     Returns:
         float64, shape (n, count), not wrapped, so that the angles of a packet increase. If `count`
@@ -151,7 +153,8 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
     Raises:
         SpecError: if start and end differ by whole turns in all packets, so that all points of a
-            packet would have one angle. `full` is then in the wrong unit.
+            packet would have the same angle. The reason is usually that `full` is in the wrong
+            unit.
     """
     turn = end - start
     _refuse_folded(turn, full)
@@ -163,11 +166,11 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 def steps(count: Array) -> Array:
     """Return the index of each sample of a packet: 0, 1, 2 ...
 
-    An example is the time of samples, ``steps(f.count) / RATE``.
+    For example, ``steps(f.count) / RATE`` gives the times of the samples.
 
     Args:
-        count: the number of samples of each packet, a number or a column. It has to be the length
-            of the innermost array.
+        count: the number of samples of each packet, as a number or a column. It has to be the
+            length of the innermost array.
 
     Returns:
         Integers, shape (count,). If `count` is a column, its largest value in the batch is the
@@ -217,7 +220,7 @@ def previous(a: Array, step: int = 1) -> Array:
 
 
 def last(a: Array, where: Array | None = None) -> Array:
-    """Return for each value the last value, up to this one, for which `where` is true.
+    """Return for each value the latest value so far for which `where` is true.
 
     Args:
         a: the values.
@@ -244,16 +247,16 @@ def between_blocks(
 ) -> Array:
     """Return the angle that a rotor turns from each block to the next.
 
-    A step that is longer than the rotor can turn comes from a loss or a masked sector. It is
-    replaced by the last valid step in the stream.
+    A step that is larger than the rotor can turn in this time results from a loss or a masked
+    sector. It is replaced by the last valid step in the stream.
 
     Args:
         azimuth: the azimuth of each block, in the unit of `full`.
         ahead: the azimuth of the next block with another azimuth, for example
             ``following(azimuth)``.
         fastest: the angle from block to block at the highest speed of the sensor, in the unit of
-            `full`. Encoder readings vary, so steps may be up to 25 % longer.
-        repeat: False to return nan instead of the last valid step.
+            `full`. Steps may be up to 25 % larger, because encoder readings vary.
+        repeat: whether to replace an invalid step by the last valid step, or else by nan.
         full: a whole turn in the unit of `azimuth`.
 
     Returns:
@@ -284,7 +287,7 @@ def side_by_side(*arrays: Any) -> Any:
 def running(a: Array) -> Array:
     """Return the cumulative sum along the innermost array.
 
-    It is needed if a frame contains differences of values.
+    It is needed if a frame contains differences of values instead of values.
 
     Returns:
         float64, the shape of `a`.
@@ -370,7 +373,7 @@ def _shift(a: Array, step: int) -> Array:
 
 
 def _apply(function: Callable[..., Any], *values: Array) -> Array:
-    """Return `function` of arrays; if a value is a column, the column applies the function."""
+    """Apply `function` to arrays; if a value is a column, the column applies it."""
     for value in values:
         if hasattr(value, "apply_function"):
             return value.apply_function(function, *values)

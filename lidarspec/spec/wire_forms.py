@@ -4,9 +4,9 @@ A wire form encodes and decodes one frame at a time. `find_end` finds the end of
 `decode` converts it to the bytes of the struct, and `encode` converts the bytes of the struct to
 the encoded frame. All other packages use the bytes of the struct, as for binary frames.
 
-The fields of a text often depend on earlier fields, for example on counts. `decode` therefore
-repeatedly requests the next run of fields, given the bytes that it has decoded so far. A run is one
-text field, or consecutive numbers, whose digits NumPy converts together.
+Which fields a text has often depends on earlier fields, for example on counts. `decode` therefore
+repeatedly requests the next runs of fields, given the bytes that it has decoded so far. A run is
+one text field, or consecutive numbers, whose digits NumPy converts together.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from lidarspec.spec.checksums import Checksum, Xor
 
 Offsets = NDArray[np.intp]
 Values = NDArray[np.uint64]
-#: The bytes of a text; a byte that varies is None.
+#: The bytes of a text; None for a byte that varies.
 Characters = Sequence[int | None]
 
-#: `WireForm.find_end` returns these values if the end has not arrived, and if the bytes do not
-#: begin a frame.
+#: `WireForm.find_end` returns the first value if the end of the frame has not arrived, and the
+#: second value if the bytes do not begin a frame.
 NO_END = 0
 NO_FRAME = -1
 #: The maximum number of digits of a number in a token.
@@ -51,7 +51,7 @@ MINUS = 0x2D
 
 @dataclass(frozen=True)
 class TextRun:
-    """A field of bytes, which is a text in the encoded frame.
+    """A field of bytes, which is text in the encoded frame.
 
     Attributes:
         size: the size of the field in bytes.
@@ -105,7 +105,7 @@ class NumberRun:
 
     @cached_property
     def remaining(self) -> Offsets:
-        """For each byte of the run, the number of bytes of its number after it, (bytes,)."""
+        """For each byte of the run, how many bytes of the same number follow it, (bytes,)."""
         return self.ends[self.owners] - 1 - np.arange(len(self.owners))
 
     @cached_property
@@ -155,9 +155,9 @@ class NumberRun:
 
 
 Run = TextRun | NumberRun
-#: A function that returns the next runs of fields, given the first bytes of a struct, as far as
-#: these bytes determine them. The result is empty if the struct is complete, or if no frame begins
-#: with these bytes.
+#: A function of the first bytes of a struct. It returns the next runs of fields, as far as these
+#: bytes determine them. The result is empty if the struct is complete, or if no frame begins with
+#: these bytes.
 NextRuns = Callable[[bytes], Sequence[Run]]
 
 
@@ -188,8 +188,8 @@ class Decoded:
 
     Attributes:
         struct: the bytes of the struct.
-        spans: pairs of arrays for successive runs: the offset of each field in the encoded frame,
-            and its size in the struct.
+        spans: two arrays for each run: the offset of each of its fields in the encoded frame, and
+            the size of each field in the struct.
         end: the offset in the encoded frame of the first byte after the last field.
         problem: the first error; None if the whole frame was decoded.
     """
@@ -201,12 +201,12 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """For each byte of the struct, the offset of its field in the encoded frame, and `end`."""
+        """For each byte of the struct, the offset of its field in the frame; then `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return the offset in the encoded frame of the field with a byte of the struct.
+        """Return the offset in the encoded frame of the field that contains a struct byte.
 
         Args:
             place: the offset of the byte in the struct.
@@ -218,15 +218,19 @@ class WireForm(Protocol):
     """The encoding of the frames of one type.
 
     Attributes:
-        is_text: whether fields of bytes are printable characters, so that examples have letters.
+        is_text: whether fields of bytes contain printable characters. If so, they contain letters
+            in examples.
     """
 
     is_text: ClassVar[bool]
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of encoded frames, given the first fields of their structs.
+        """Return the first bytes of encoded frames; None for each byte that varies.
 
-        The bytes end before the first byte without a fixed offset. Bytes that vary are None.
+        The bytes end before the first byte that has no fixed offset.
+
+        Args:
+            texts: the first fields of the structs.
         """
 
     def find_end(self, data: bytes) -> int:
@@ -242,17 +246,17 @@ class WireForm(Protocol):
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
         """Return the encoded frame for the bytes of a struct that consists of these runs.
 
-        Values that cannot be encoded may become any bytes, because the caller verifies the frame by
-        decoding it.
+        For a value that cannot be encoded, the result may be any bytes, because the caller verifies
+        the frame by decoding it.
         """
 
     def largest(self, size: int) -> int:
-        """Return the largest number that can be encoded for a field of this size in bytes."""
+        """Return the largest number that can be encoded for a field of `size` bytes."""
 
 
 @runtime_checkable
 class BulkEnds(Protocol):
-    """A wire form that can find the ends of many candidates at once, for speed."""
+    """A wire form that is fast because it finds the ends of many candidates at once."""
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
@@ -272,7 +276,7 @@ class DrawsValues(Protocol):
     """A wire form that cannot encode every value up to `largest`."""
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded, (n,), made from random bits, (n,)."""
+        """Return values that can be encoded, (n,), given random bits as `values`, (n,)."""
 
 
 def find_ends(
@@ -280,7 +284,7 @@ def find_ends(
 ) -> Offsets:
     """Return the size of the frame at each offset, as `BulkEnds.find_ends` does.
 
-    For a form without `find_ends`, `find_end` is called for each candidate.
+    For a wire form without `find_ends`, `find_end` is called for each candidate.
     """
     if isinstance(form, BulkEnds):
         return form.find_ends(buffer, offsets, stops)
@@ -294,7 +298,7 @@ class RunReader(Protocol):
 
     @property
     def position(self) -> int:
-        """The offset of the next field in the frame; after the last field, the end of the frame."""
+        """The offset of the next field in the frame; the end of the frame after the last."""
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
         """Read the fields of a run, up to the first invalid field.
@@ -308,7 +312,8 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the size of the frame including its end mark of one byte; None if the end is missing.
+        size: the size of the frame, including the mark of one byte at its end; None if the end is
+            missing.
     """
     struct = b""
     spans = list[tuple[Offsets, Offsets]]()
@@ -355,8 +360,8 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 def _make_digit_weights(base: int) -> Values:
     """Return the weight of a digit, by its position counted from the end of its token.
 
-    Index 1 is the last digit. The weight is 0 at index 0, for characters that are not digits, and
-    at the last index, for digits that are too far from the end.
+    Index 1 is the last digit. The weight is 0 at index 0, which is used for characters that are not
+    digits, and at the last index, which is used for digits that are too far from the end.
     """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
@@ -398,9 +403,9 @@ class Tokens:
 
     An integer is a token of digits in the given base, which may have leading zeros and lower-case
     digits. An integer with a sign is always decimal. A negative integer may also be sent without a
-    sign, as the digits of its two's complement. In base 16, a float has the digits of its bits. In
-    base 10, a float is a decimal fraction, or nan if the token is empty. A field of bytes is a
-    token with exactly as many characters, which may include the separator.
+    sign, as the digits of its two's complement. In base 16, a float is sent as the digits of its
+    bits. In base 10, a float is sent as a decimal fraction; an empty token means nan. A field of n
+    bytes is a token of exactly n characters, which may include the separator.
 
     Args:
         start: the first byte of a frame.
@@ -410,15 +415,15 @@ class Tokens:
         width: the minimum number of digits of an encoded integer. Decoding accepts any number of
             digits.
         check: the checksum before the end; None without a checksum.
-        formats: the minimum digits of encoded floats by path, in the form of manuals: "hhmmss.ss"
-            means six digits before the point and two after it.
-        joined: the number of fields of bytes that form the first token together.
+        formats: the minimum number of digits of encoded floats, by path, as manuals write it:
+            "hhmmss.ss" means six digits before the point and two digits after it.
+        joined: the number of fields of bytes that together form the first token.
         padded: whether a token may be shorter than its field of bytes, which is then padded with
             zero bytes.
         optional: the number of fields of bytes at the end whose tokens may be missing; requires
             `padded`.
-        rest: whether the field of bytes after the first token contains the whole rest of the frame,
-            including separators; requires `padded`.
+        rest: whether the field of bytes after the first token contains all other characters of the
+            frame, including separators; requires `padded`.
 
     Raises:
         SpecError: if the base is not 10 or 16, if start or separator are not one byte, or if the
@@ -551,7 +556,7 @@ class Tokens:
         return int(256**size - 1)
 
     def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded, which are fractions with few digits."""
+        """Return values that can be encoded; floats become fractions with few digits."""
         if self.base == 16:
             return values
         drawn = values.copy()
@@ -578,8 +583,8 @@ def _bits_of_float(value: float, size: int) -> int:
 def _write_decimal(value: np.floating[Any], form: str) -> bytes:
     """Return a float as a decimal fraction.
 
-    The text has all digits of the float, and at least the digits in `form`. It is empty for nan,
-    which means a missing value.
+    The text has all digits of the float, and at least the number of digits in `form`. It is empty
+    for nan, which means that the value is missing.
     """
     if not np.isfinite(value):
         return b""
@@ -593,7 +598,7 @@ def _write_decimal(value: np.floating[Any], form: str) -> bytes:
 
 
 class _TokenReader:
-    """Reads the tokens of one frame; all numbers are converted in advance.
+    """Reads the tokens of one frame; all numbers are converted when it is made.
 
     Args:
         data: the frame, up to the end of the last token.
@@ -731,7 +736,7 @@ class _TokenReader:
 
 @dataclass(frozen=True)
 class Echoes:
-    """A variable number of echoes for each step, which are joined by a mark.
+    """The encoding of steps with a variable number of echoes, joined by a mark.
 
     In the struct, each step has `most` echoes, and a missing echo is 0. When a step is encoded,
     echoes of 0 at its end are left out, except for the first echo.
@@ -748,7 +753,7 @@ class Echoes:
 
     @cached_property
     def _step(self) -> re.Pattern[bytes]:
-        """The pattern of one step. A mark joins two echoes only if another character follows."""
+        """The pattern of one step; a mark joins two echoes only if characters follow it."""
         mark = re.escape(self.mark)
         echo = b"[^%b].{%d}" % (mark, self.size - 1)
         return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
@@ -762,13 +767,13 @@ class Echoes:
             characters: the characters of the steps.
             offsets: the offsets of the characters in the frame, (n,).
             end: the offset after the last character.
-            zero: the digit that missing echoes consist of.
+            zero: the character that is repeated for a missing echo.
             is_whole: whether these are all characters of the frame.
 
         Returns:
             The characters with all echoes, and the offset of each. A missing echo has the offset of
-            the next character. A mark that joins no echoes is kept, so that it is reported as an
-            invalid number.
+            the next character. A mark that does not join two echoes is kept, and is later reported
+            as an invalid number.
         """
         stride = self.size + len(self.mark)
         step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
@@ -836,13 +841,14 @@ class Echoes:
 class SixBits:
     """Numbers in characters of six bits each, the highest bits first.
 
-    It is used as ``Lines(...) | SixBits()``. The number of characters is the size of the field in
-    bytes: an `Int16ub` has two characters, an `Int24ub` three, and an `Int32ub` four. An `Int8ub`
-    is one character, which may also be a decimal digit.
+    It is used as ``Lines(...) | SixBits()``. A field of n bytes is sent as n characters: an
+    `Int16ub` as two, an `Int24ub` as three, and an `Int32ub` as four characters. An `Int8ub` is
+    sent as one character, which may also be a decimal digit.
 
     Args:
         first: the character for 0.
-        echoes: how steps with echoes after the head are sent; None if all numbers are sent.
+        echoes: how the steps after the head are sent if they have a variable number of echoes; None
+            if all numbers are sent.
 
     Raises:
         SpecError: for invalid `echoes`: a mark that is a digit or not one character, or a size or
@@ -958,13 +964,13 @@ class Lines:
         width: the number of characters of each line after the head, without its check character.
             The last line may be shorter.
         head: the number of characters of each line of the head.
-        bare: the number of lines at the start that have no check character.
+        bare: the number of lines at the start of the frame that have no check character.
         check: a function from a line to its check character, for example `Scip`; None if lines have
             no check characters.
         numbers: how numbers are encoded; None for unchanged bytes.
 
     Raises:
-        SpecError: for lines without a character, and for echoes without a head before them.
+        SpecError: if a line has no characters, or if there are echoes but no head before them.
     """
 
     is_text: ClassVar[bool] = True
@@ -1072,8 +1078,8 @@ class Lines:
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
         """Return the characters of all lines without check characters, and their offsets.
 
-        The characters end before the first line with a wrong length. The third value is the first
-        error in the lines; None if they are valid.
+        The characters end before the first line with a wrong length. The third value of the result
+        is the first error in the lines, or None if all lines are valid.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:
@@ -1136,8 +1142,8 @@ class Escaped:
     """Frames between two flags, with escaped bytes (as in HDLC).
 
     A flag or an escape byte in the content is sent as an escape byte, followed by the byte with
-    some bits inverted. Each frame has its own two flags. Decoding accepts an escape before any
-    byte. Encoding escapes only flags and escape bytes.
+    some bits inverted. Two consecutive frames do not share a flag. Decoding accepts an escape
+    before any byte. Encoding escapes only flags and escape bytes.
 
     Args:
         flag: the byte before and after a frame.

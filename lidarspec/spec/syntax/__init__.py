@@ -7,7 +7,7 @@ struct for the engine, `check_struct` raises an error if the struct is not suppo
 * `replacements`: classes that replace classes of construct, and additional classes.
 * `adapters`: converts adapters and texts to functions of raw values.
 * `raw_checksums`: replaces construct's Checksum of a RawCopy by a struct with a checksum.
-* `structs`: prepares a struct, returns properties of a construct, and draws random values.
+* `structs`: prepares a struct, finds properties of a construct, and draws random values.
 * `refusals`: raises errors for unsupported structs.
 * `meaning`: translates a struct to nodes.
 """

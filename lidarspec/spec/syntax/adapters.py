@@ -1,9 +1,9 @@
 """Convert adapters of construct to functions between raw and decoded values.
 
-The engine calls an adapter with values of its field, without a context. If the adapter needs a
-context, or fails for some numbers, only construct can apply it. To find this out, the adapter is
-tried with all values of a byte, or with several hundred values of a wider field. An adapter is not
-supported if encoding a decoded value does not give the raw value again.
+The engine calls an adapter with values of its field, without construct's context. If the adapter
+needs a context, or fails for some numbers, only construct can apply it. To find this out, the
+adapter is tried with all values of a byte, or with several hundred values of a wider field. An
+adapter is not supported if encoding a decoded value does not give the raw value again.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Trial:
         valid: the raw values that can be decoded.
         values: the decoded values.
         failed: whether some raw values cannot be decoded.
-        lost: a raw value that decoding and encoding does not restore, and the raw value that
-            results instead; None if all values are restored.
+        lost: a raw value that is changed by decoding and encoding, and the raw value that results;
+            None if no value is changed.
     """
 
     valid: tuple[Any, ...]
@@ -64,9 +64,9 @@ class Trial:
 
 
 def int_adapter(con: Construct) -> tree.Adapter | None:
-    """Return an adapter of an integer as functions.
+    """Return the functions of an adapter of an integer.
 
-    Returns None if the construct is no such adapter, or if only construct can apply it.
+    Returns None if the construct is not such an adapter, or if only construct can apply it.
     """
     if not is_int_adapter(con):
         return None
@@ -82,7 +82,7 @@ def int_adapter(con: Construct) -> tree.Adapter | None:
 
 @functools.lru_cache(maxsize=4096)
 def without_int_adapters(con: Construct) -> Construct:
-    """Return a copy of a bit block with plain integers in place of their adapters."""
+    """Return a copy of a bit block with integers in place of adapters of integers."""
     if int_adapter(con) is not None:
         return without_int_adapters(con.subcon)
     if not isinstance(con, Subconstruct | construct.Struct):
@@ -273,7 +273,7 @@ def part_adapter(con: Construct) -> tree.Adapter | None:
 
 
 def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
-    """Return a function that decodes bytes along the last axis; None if their number may change."""
+    """Return a function that decodes arrays of bytes; None if their size may change."""
     xor = _find_xor(con)
     if xor is None or not isinstance(xor.subcon, construct.Bytes | type(construct.GreedyBytes)):
         return None

@@ -76,8 +76,8 @@ def frame_tree(con: Construct) -> tree.Node:
 def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
     """Return the node that `build` makes, and the builder.
 
-    If values of built frames depend on later fields, the node is made a second time, by a builder
-    with the fields and sizes of the first pass.
+    If values of built frames depend on later fields, the node is made a second time. The builder of
+    this second pass has the fields and sizes of the first pass.
     """
     builder = _Builder()
     root = build(builder)
@@ -90,8 +90,8 @@ def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Bu
 def _trace(expression: Any, scope: tree.Scope) -> Any:
     """Return the value of an expression for symbols in place of the fields.
 
-    Expressions of construct are evaluated here and not called, because calling ``~`` evaluates
-    ``not value``, and a symbol has no truth value.
+    This function evaluates construct's expressions itself instead of calling them. The reason is
+    that construct evaluates ``~`` as ``not value``, and a symbol has no truth value.
     """
     if isinstance(expression, BinExpr):
         return expression.op(_trace(expression.lhs, scope), _trace(expression.rhs, scope))
@@ -139,7 +139,7 @@ class _Context:
     """The context of a construct.
 
     Attributes:
-        info: the description of the field by the constructs around it.
+        info: what the surrounding constructs declare about the field.
         scope: the fields that expressions can refer to.
         name: the name of the construct in its struct; "" without a name.
         in_bits: whether the construct is inside a bit block.
@@ -152,8 +152,8 @@ class _Context:
     #: The number of bytes up to the end of the enclosing part, if another field declares its
     #: length.
     room: tree.Formula | None = None
-    #: A function that returns the formula of the offset in the frame, or None if there is no
-    #: formula. The offset of parts is never known.
+    #: A function that returns the formula of the construct's offset in the frame, or None if there
+    #: is no formula. There is never a formula in parts.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
     def with_changes(self, **changes: Any) -> _Context:
@@ -558,10 +558,10 @@ class _Builder:
     def _fill_with_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return the node for the elements that fill a part, or end with a certain element.
+        """Return the node for elements that fill a part, or end with a certain element.
 
-        The node is an array if all elements have the same fixed size, or else a sequence of parts.
-        If neither is possible, only construct can read it.
+        The node is an array if all elements have the same fixed size. Otherwise, it is a sequence
+        of parts. If neither is possible, only construct can read the elements.
         """
         axis = axis_path(place.info)
         element = self.node(
@@ -695,7 +695,7 @@ class _Builder:
     def _make_part_frame(
         self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
-        """Return a part as a frame of its own, and the value of an expression of its fields."""
+        """Return a part as a frame of its own, and the formula of `following` in it."""
 
         def around(builder: _Builder) -> _Context:
             assert place.scope is not None
@@ -712,8 +712,8 @@ class _Builder:
     def _check(self, con: construct.Check, place: _Context) -> tree.Node:
         """Return the node of a condition.
 
-        If the condition uses fields of another array or frame, or may exceed 64 bits, only
-        construct can check it.
+        If the condition uses fields of another array or frame, or if its values may exceed 64 bits,
+        only construct can check it.
         """
         condition = self._formula(con.func, place)
         info = place.info
@@ -937,7 +937,7 @@ def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tr
 
 
 def _ask_predicate(predicate: Any, scope: tree.Scope) -> Any:
-    """Return the value of the predicate of a RepeatUntil for an element.
+    """Return the value of a RepeatUntil's predicate for an element.
 
     The list of the earlier elements is not available.
     """
@@ -947,7 +947,7 @@ def _ask_predicate(predicate: Any, scope: tree.Scope) -> Any:
 
 
 def _return_no_offset() -> None:
-    """Return None, because the offset in an array differs between elements."""
+    """Return None, because an offset in an array is different for each element."""
     return
 
 
@@ -1054,7 +1054,7 @@ _TRANSFORMED_REASON = (
     " 0x55), or use a WireForm"
 )
 
-#: The classes that only construct can read, with a message that suggests a replacement.
+#: The classes that only construct can read, and a message for each that suggests a replacement.
 _OPAQUE_REASONS = {
     "ProcessXor": _TRANSFORMED_REASON.format("ProcessXor"),
     "ProcessRotateLeft": _TRANSFORMED_REASON.format("ProcessRotateLeft"),
@@ -1206,7 +1206,7 @@ def _describe_form(con: Construct) -> str:
 
 
 def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> tree.Ending | None:
-    """Return the end of a field of variable size; None if its size is known from elsewhere.
+    """Return the end of a field of variable size; None if its size is known otherwise.
 
     Args:
         is_bounded: whether the field is in a part of known size.
@@ -1283,7 +1283,7 @@ def _probe_block(con: Construct, size: int) -> list[BitField] | None:
 def _has_fixed_fields(con: Construct) -> bool:
     """Return whether a bit block has the same fields for all bit patterns.
 
-    If a value decides which fields follow, probing with a few patterns could miss a variant.
+    If a value determined which fields follow, probing with a few patterns could miss a variant.
     """
     if isinstance(con, Struct):
         return all(map(_has_fixed_fields, con.subcons))

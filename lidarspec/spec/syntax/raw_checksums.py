@@ -1,8 +1,8 @@
 """Replace construct's Checksum of a RawCopy by a struct with a checksum.
 
 A struct with ``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` is
-converted to a `Checksummed` with the function as its algorithm. The covered part is found by
-calling the expression of the Checksum with an object that records the names that the expression
+converted to a `Checksummed` with the function as its algorithm. To find the covered part, the
+expression of the Checksum is called with an object that records the names that the expression
 reads.
 """
 
@@ -28,7 +28,7 @@ class FunctionChecksum(Checksum):
 
     Attributes:
         function: the function, which returns the checksum as a number or bytes.
-        takes_part: whether the argument of the function is the whole value of a RawCopy, and not
+        takes_part: whether the argument of the function is the whole value of a RawCopy, instead of
             only its bytes.
     """
 

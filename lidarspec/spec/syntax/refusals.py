@@ -1,7 +1,7 @@
 """Raise errors for structs that cannot describe a frame.
 
-Examples are structs with two members of one name, and constructs that lose bits, run code or have
-no end. The error has the path and the reason.
+Examples are structs with two members of the same name, and constructs that lose bits, run code or
+have no end. The error has the path and the reason.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
     ),
 }
 
-#: The constructs that limit a greedy part.
+#: The constructs that give a greedy part an end.
 _BOUNDED_KINDS = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
 
 
@@ -141,7 +141,7 @@ def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
 def _check_ends(
     con: Construct, path: str, *, bounded: bool, is_last: bool = True
 ) -> SpecError | None:
-    """Raise SpecError for greedy parts without an end, and bounded parts that lose bytes.
+    """Raise SpecError for greedy parts without an end, and for parts that lose bytes.
 
     A greedy part reads all available bytes. It is valid as the last part of the frame, or of a part
     that has an end.
@@ -200,7 +200,7 @@ def _check_ends(
 
 
 def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
-    """Return whether a part reads all its bytes, so that the same bytes can be built.
+    """Return whether a part of known size reads all its bytes, and can build them.
 
     Args:
         padded: whether a part that is too short is padded with zeros.

@@ -2,11 +2,12 @@
 
 `prepare` replaces a class of construct if the class loses bytes, does not report the offset of an
 error, or cannot parse without verification. Most frames have a layout and are read without these
-classes. construct uses them to parse and build frames without a layout, one at a time, and the
-examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is missing.
+classes. construct uses the classes to parse and build frames without a layout, one at a time, and
+to build the examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is
+missing.
 
-The additional classes are units, checksums, sizes, fillers and chains of parts, which construct
-does not have. Plugins use them through `lidarspec.spec.fields`.
+The additional classes provide units, checksums, sizes, fillers and sequences of parts, which
+construct does not have. Plugins use them through `lidarspec.spec.fields`.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class WireNaN(float):
 
 
 def is_verifying(context: Any) -> bool:
-    """Return whether this parse checks constants, lengths, checksums and values."""
+    """Return whether parsing checks constants, lengths, checksums and values."""
     return bool(context._params.get("_verify", True))
 
 
@@ -92,7 +93,7 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 
 
 class MarkedStruct(Struct):  # type: ignore[misc]
-    """A Struct with the (start, end) of each member under ``_marks`` when parsed.
+    """A Struct that also parses to the (start, end) of each member, under ``_marks``.
 
     construct's Struct does not keep these offsets. `Checksummed` needs them to find its bytes,
     `SizeOf` and `PaddingField` to measure parts, and `explain` to list the fields of a frame
@@ -164,8 +165,8 @@ class IndexedArray(Array):  # type: ignore[misc]
     """An Array that limits its elements, and reports the index of an invalid element.
 
     construct's Array reports no index, and takes minutes for an invalid count of elements without
-    bytes. All arrays of a frame together may have at most `limit` elements without bytes, because
-    the numbers of elements of nested arrays multiply.
+    bytes. All arrays of a frame together may have at most `limit` elements without bytes. The limit
+    is not applied to each array, because the numbers of elements of nested arrays multiply.
 
     Attributes:
         limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
@@ -200,7 +201,7 @@ class IndexedArray(Array):  # type: ignore[misc]
 
 
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
-    """A GreedyRange that uses all bytes of the part that bounds it.
+    """A GreedyRange that reads all bytes of the part in which it is.
 
     construct's GreedyRange ends without an error at an element that fails, and loses all bytes
     after it.
@@ -344,10 +345,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions the name of a number when a frame is built, too.
+    """An Enum that expressions read as a name, also when a frame is built.
 
-    With construct's Enum, a Switch on a name finds its case when a frame is parsed, but not when it
-    is built from the number, so that other bytes are built.
+    With construct's Enum, a Switch on a name finds its case when a frame is parsed. When the frame
+    is built from the number, the Switch finds another case, so that other bytes are built.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -357,10 +358,10 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 
 
 class RawPart(Construct):  # type: ignore[misc]
-    """A part with its bytes and offsets, as construct's RawCopy.
+    """A part with its bytes and offsets, like construct's RawCopy.
 
-    It is built from its `value`. construct's RawCopy is built from `data`, so that changes of the
-    value of a parsed frame are lost.
+    It is built from its `value`. construct's RawCopy is built from its `data`, so that changes of
+    the `value` in a parsed frame have no effect.
     """
 
     def __init__(self, subcon: Construct) -> None:
@@ -455,7 +456,7 @@ class Reserved(CountedBytes):
 
 
 class DescribedField(Subconstruct):  # type: ignore[misc]
-    """A wrapper that only describes its field, and parses and builds it unchanged."""
+    """A wrapper that only describes its field, and does not affect its bytes."""
 
     def describe(self, info: tree.FieldInfo) -> tree.FieldInfo:
         """Return the description of the wrapped field, extended by this wrapper."""
@@ -468,8 +469,8 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     Attributes:
         fields: the names of the fields with the checksum, low bits first.
         algorithm: the algorithm; None if a hook has to return it.
-        over: the names of the consecutive fields that the checksum covers; None for all bytes
-            without a bit of `fields`.
+        over: the names of the consecutive fields that the checksum covers; None if it covers all
+            bytes that contain no bit of `fields`.
         absent: the values that mean that the sensor has computed no checksum.
     """
 
@@ -478,7 +479,7 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     over: tuple[str, ...] | None
     absent: frozenset[int]
 
-    #: The class for plugins, `Checksummed`, which is also used for construct's Checksum of a
+    #: The class that plugins use, `Checksummed`. It also replaces construct's Checksum of a
     #: RawCopy.
     plugin_class: Callable[..., SealedStruct]
 
@@ -490,9 +491,9 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
     Attributes:
         of: the names that lead from the struct with this field to the part. The name "_" leads to
-            the outer struct; no names mean the struct itself.
+            the outer struct. If there are no names, the part is the struct itself.
         plus: a number that is added to the size.
-        since: the name of an earlier member from which on bytes are counted; "" to count only the
+        since: the name of an earlier member at which the counted bytes begin; "" to count only the
             part.
     """
 
@@ -541,7 +542,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
     def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
         """Add the value to the sizes that the struct with the part has to check.
 
-        If a bit block is probed, there is no such struct.
+        There is no such struct if a bit block is probed.
         """
         for _ in range(self.out):
             context = context.get("_", {})
@@ -588,14 +589,15 @@ class BoundedPart(Subconstruct):  # type: ignore[misc]
 
 
 class PaddingField(CountedBytes):
-    """The bytes that pad consecutive members to a length, or to a multiple of a length.
+    """The bytes that pad consecutive members to a length, or a multiple of a length.
 
     If no value is given, they are built from a pattern.
 
     Args:
         of: the names of the first and the last padded member.
         to: the length in bytes, or None.
-        modulus: the length in bytes to whose multiple the members are padded, or None.
+        modulus: a length in bytes; the members are padded to a multiple of it. None if `to` is
+            given.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Prepare a struct of a plugin, return properties of constructs, draw random values.
+"""Prepare a plugin's struct, find properties of constructs, draw random values.
 
 `prepare` copies a struct and replaces some of construct's classes, for the reasons in
 `replacements`. Lengths, counts and padding that construct hides become members of the struct.
@@ -90,7 +90,8 @@ _TRANSPARENT = (
 #: The LazyBound constructs that are being prepared, to detect recursion.
 _BINDING: list[Construct] = []
 
-#: The attributes of constructs that contain other constructs. "cases" contains them by key.
+#: The attributes in which constructs contain other constructs. The attribute "cases" contains them
+#: by key.
 _INNER = ("subcon", "thensubcon", "elsesubcon", "default", "checksumfield")
 
 
@@ -193,7 +194,7 @@ def _strip_name(con: Construct) -> Construct:
 def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
     """Return the construct of a LazyBound.
 
-    Inside the content of the LazyBound itself, return the LazyBound unchanged.
+    If the LazyBound is inside its own content, it is returned unchanged.
     """
     if con in _BINDING:
         return con
@@ -247,9 +248,9 @@ def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | Non
 def _expand_macro(con: Construct) -> list[Construct]:
     """Return the members that replace a prefixed, padded or aligned member.
 
-    They are the member itself, and a field for the length, count or padding that construct hides. A
-    ProcessXor of a struct in a part of known size becomes one of each member. All other members are
-    returned unchanged.
+    They are the member itself, and a field for the length, count or padding that construct hides.
+    If the member is a ProcessXor of a struct, in a part of known size, the ProcessXor is applied to
+    each member of the struct instead. All other members are returned unchanged.
     """
     inner = _strip_name(con)
     if not con.name:
@@ -297,8 +298,8 @@ def _is_pascal_string(con: Construct) -> bool:
 def _distribute_xor(con: Construct) -> Construct:
     """Return a ProcessXor of a struct as a struct with a ProcessXor of each member.
 
-    Any other construct, or a struct with members that need other fields or have no fixed size
-    before the last, is returned unchanged.
+    Any other construct is returned unchanged. So is a struct with a member that needs other fields,
+    or with a member before the last that has no fixed size.
     """
     if not isinstance(con, construct.ProcessXor) or not isinstance(con.subcon, Struct):
         return con
@@ -394,7 +395,8 @@ def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Constru
     return members
 
 
-#: Numbers of elements for which a count is tried. A mask or a limit changes at least one of them.
+#: Numbers of elements that are tried with the field of a count. If the field has a mask or a limit,
+#: it changes at least one of them.
 COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
 
 
@@ -431,7 +433,7 @@ def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct]
 
 
 class _ComparisonRecorder:
-    """A placeholder for the value of a validator, which records comparisons with it."""
+    """Replaces the value that a validator checks, and records comparisons with it."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -446,8 +448,8 @@ class _ComparisonRecorder:
 def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     """Return the raw values that a validator accepts; None if they are unknown.
 
-    The values that the validator compares with are tried. If it makes no comparisons with integers,
-    all values of up to 16 bits are tried.
+    To find them, the values with which the validator makes comparisons are tried. If it makes no
+    comparisons with integers, all values of up to 16 bits are tried.
     """
     field = unwrap(con)
     subcon = con.subcon
@@ -590,7 +592,8 @@ _INDEPENDENT_KINDS = (
     type(construct.GreedyBytes),
 )
 
-#: The same, and constructs that a frame tree describes itself, which no function has to decode.
+#: The same constructs, and constructs that the frame tree describes, so that no function has to
+#: decode them.
 _DESCRIBED_KINDS = (
     *_INDEPENDENT_KINDS,
     DescribedField,
@@ -616,7 +619,7 @@ def is_independent(con: Construct, kinds: tuple[type, ...] = _INDEPENDENT_KINDS)
 
 
 def to_public(parsed: Any) -> Any:
-    """Return a parsed object as users see it: without private entries, codes as `EnumValue`."""
+    """Return a parsed object for users, without private entries, with `EnumValue`s."""
     if isinstance(parsed, dict):
         return Container(
             {name: to_public(value) for name, value in parsed.items() if not name.startswith("_")}
@@ -633,8 +636,8 @@ def to_public(parsed: Any) -> Any:
 def field_path(path: str | None) -> str:
     """Return a path of construct as a field path.
 
-    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". construct adds a step named
-    "None" for a part that has documentation but no name; these steps are removed.
+    "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". If a part has documentation
+    but no name, construct adds "None" to the path, which is removed.
     """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
@@ -686,7 +689,7 @@ def is_expression(value: object) -> bool:
     return isinstance(value, ExprMixin | Construct)
 
 
-#: Half of the drawn numbers are below one of these limits, because a large number is hardly ever a
+#: Half of the random numbers are below one of these limits, because a large number is hardly ever a
 #: valid count or key.
 SMALL_LIMITS = (1, 6, 40)
 
@@ -790,7 +793,7 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of elements in an element of an array.
+    """Return the number of values in an element of an array.
 
     If the element is itself an array, this is its length. Otherwise, or if the length is not known
     yet, it is 1.
