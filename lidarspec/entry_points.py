@@ -1,8 +1,8 @@
 """Find entry points by group without importing the distributions that declare them.
 
 The folders on `sys.path` are read directly, because importing importlib.metadata takes longer than
-everything else needed to find a sensor. importlib.metadata is used only if something may be
-installed in another form than a folder: in a zip file or an egg, or through an import hook.
+everything else needed to find a sensor. importlib.metadata is used only if a distribution may be
+installed in a zip file or an egg, or through an import hook.
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ def _list_names(path: str) -> list[str]:
 def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group that one distribution declares.
 
-    If its file is not UTF-8 and the group is `GROUP`, the first entry has no module, and its `load`
-    raises the error.
+    If the distribution's file is not UTF-8 and the group is `GROUP`, the first entry has no module,
+    and its `load` raises the error.
     """
     text = _text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP

@@ -1,10 +1,10 @@
 """The exceptions of lidarspec: one class for each party that may be at fault.
 
-``SpecError`` means a mistake of a plugin's author, ``WireError`` bytes that are not the expected
-frame, ``UsageError`` a mistake of the caller, ``SourceError`` a failure of the system,
-``CommandError`` a failure of the device. Noise in a stream is not an error: decoders count it. Each
-exception builds its message from typed arguments, so that programs can read the details from its
-attributes.
+``SpecError`` reports a mistake of a plugin's author, and ``UsageError`` a mistake of the caller.
+``WireError`` reports bytes that are not the expected frame, ``SourceError`` a failure of the
+system, and ``CommandError`` a failure of the device. Noise in a stream is not an error: decoders
+count it. Each exception builds its message from typed arguments, so that programs can read the
+details from its attributes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class SpecError(LidarSpecError):
     """A sensor's description is wrong: the fault of the plugin's author.
 
     Attributes:
-        path: field path, or name of the part of the spec; "" if the error concerns the whole spec.
+        path: the field path, or the name of another item of the spec; "" if the error concerns the
+            whole spec.
         reason: the fault.
         sensor: the id; "" if unknown.
         rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
@@ -43,12 +44,12 @@ class SpecError(LidarSpecError):
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 
-#: Packages that a plugin calls. The line at fault is never in them.
+#: Packages that a plugin calls. They never contain the line at fault.
 _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
-    """Return the error for an exception of an expression or checksum in a struct."""
+    """Return the error for an exception from an expression or checksum in a struct."""
     reason = f"an expression of the struct raised {type(error).__name__}: {error}"
     return SpecError(reason, path=path, sensor=sensor, rule="LS115")
 
@@ -92,8 +93,8 @@ class PluginError(SpecError):
 
         Args:
             what: a description of the function, such as "points of data".
-            function: the function. Its first line is the location if no code of the plugin was
-                running.
+            function: the function. If no code of the plugin was running, the first line of this
+                function is the location.
         """
         from traceback import format_exception  # only needed after a failure
 
@@ -145,7 +146,7 @@ def printable(text: str) -> str:
 
 
 def shown_path(file: str) -> str:
-    """Return a path relative to the working directory if it is below, else unchanged."""
+    """Return a path below the working directory as a relative path, others unchanged."""
     if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
         return os.path.relpath(file)
     return file
@@ -283,7 +284,7 @@ def did_you_mean(
     Args:
         name: the unknown name.
         known: the valid names.
-        alike: minimum share of letters that both names have in common, from 0 to 1.
+        alike: minimum similarity of a suggested name to the unknown name, from 0 to 1.
         aliases: alias -> the name to suggest instead of it.
         max_parts: the maximum number of suggested names that contain `name`.
     """
@@ -316,7 +317,7 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """Add a note to an error with the command to type next, unless it has one."""
+    """Add a note to an error with the command to type next, unless it has such a note."""
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error
@@ -341,8 +342,8 @@ class UnknownName(UsageError):
     """An unknown name; the message suggests similar names, or lists all names.
 
     Attributes:
-        alike: minimum share of letters that a suggested name has in common with it.
-        max_parts: maximum number of suggested names that contain it.
+        alike: minimum similarity of a suggested name to the unknown name, from 0 to 1.
+        max_parts: maximum number of suggested names that contain the unknown name.
         max_listed: maximum number of names that are listed if none is suggested.
     """
 
@@ -379,8 +380,8 @@ class UnknownSensor(UnknownName):
     """No installed sensor has this id or alias.
 
     Attributes:
-        distribution: the distribution that has the sensor, if it is known, and is not installed or
-            failed to load; otherwise "".
+        distribution: the distribution that has the sensor, if it is known that this distribution is
+            not installed or failed to load; otherwise "".
         failure: the reason why the installed distribution failed to load; otherwise "".
     """
 
@@ -483,7 +484,7 @@ class SourceTimeout(SourceError, TimeoutError):
 
 
 class WriteError(SourceError):
-    """Writing a recording has failed; it ends here.
+    """A recording could not be written, and has ended.
 
     Attributes:
         reason: the reason, without the path.
@@ -520,7 +521,7 @@ def system_errors(place: object) -> Iterator[None]:
 
 
 def failure_reason(place: object, error: OSError) -> str:
-    """Return the reason of the system's error for a path, such as a missing folder."""
+    """Return the reason for an OSError at a path, such as a missing folder."""
     folder = os.path.dirname(str(place))
     if isinstance(error, FileNotFoundError) and folder and not os.path.isdir(folder):
         return f"folder {folder} does not exist"

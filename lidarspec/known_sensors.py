@@ -29,7 +29,7 @@ class KnownLink(NamedTuple):
 
     Attributes:
         kind: "serial", "udp", "tcp" or another kind.
-        numbers: its baud rates or ports, the likeliest first.
+        numbers: its baud rates or ports, the most likely first.
     """
 
     kind: str
@@ -105,7 +105,8 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
     """Return the rows that describe installed entry points exactly.
 
-    The distribution must be installed in the version of the row, with the names of the row.
+    A row describes an entry point if the distribution is installed in the row's version, and its
+    entry points have the row's names.
     """
     offered: dict[tuple[str, str], dict[str, set[str]]] = {}
     for entry in entries:
@@ -122,7 +123,7 @@ def list_described_sensors() -> list[KnownSensor] | None:
     """Return a row for each installed sensor, sorted by id; None if rows are missing.
 
     Rows are missing if a plugin has hooks, belongs to another project, or has the same name as
-    another plugin. Then the plugins must be loaded.
+    another plugin. In this case, the plugins must be loaded.
     """
     if entry_points(GROUP):
         return None
@@ -154,8 +155,8 @@ def _letters(name: str) -> str:
 def install_command(*distributions: str, extra: str = "") -> str:
     """Return the command that installs distributions of this project.
 
-    The distributions are not on a package index yet. If lidarspec runs from a checkout, the command
-    names folders of the checkout, otherwise the repository.
+    The distributions are not on a package index yet. The command therefore names folders of the
+    checkout from which lidarspec runs, or else the repository.
     """
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
@@ -190,14 +191,14 @@ def unknown_sensor_error(
     aliases: Mapping[str, str],
     failures: Mapping[str, str],
 ) -> UnknownSensor:
-    """Return the error for an unknown sensor; it has the install command if known.
+    """Return the error for an unknown sensor, with the install command if it is known.
 
     Args:
         name: an id or alias.
         installed: the ids of the installed sensors.
         aliases: alias -> id of an installed sensor.
-        failures: distribution -> the reason why its plugin failed to load, if its sensors are
-            unknown.
+        failures: the distributions whose plugin failed to load so that their sensors are unknown,
+            and the reason for each.
     """
     row = find_known_sensor(name)
     if row is not None:

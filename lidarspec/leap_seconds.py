@@ -1,10 +1,10 @@
 """Leap seconds: the offsets of TAI and GPS time from UTC.
 
-TAI and GPS time count all seconds; at each leap second, UTC falls behind them by one second. GPS
-time is always 19 s behind TAI. The dates are in a table of the operating system or of the package
-tzdata, in one of two formats: `leapseconds` (the time zone compiler's) and `leap-seconds.list`
-(NTP's). The table with the latest expiry date is used. Without a table, the offsets since 2017
-apply to all times.
+TAI and GPS time count all seconds. At each leap second, UTC falls behind them by one more second.
+GPS time is always 19 s behind TAI. The dates of the leap seconds are read from a table of the
+operating system or of the package tzdata. The table has the format `leapseconds` of the time zone
+compiler, or the format `leap-seconds.list` of NTP. The table with the latest expiry date is used.
+Without a table, the offset since 2017 is used for all times.
 
 Source: IERS Bulletin C; tz database, `leapseconds`; NIST, `leap-seconds.list`.
 """
@@ -24,12 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: TAI minus UTC since 2017, and before the first leap second in 1972, s.
+#: TAI minus UTC since 2017; the next constant is TAI minus UTC before the first leap second in
+#: 1972, s.
 CURRENT_TAI_OFFSET_S = 37
 FIRST_TAI_OFFSET_S = 10
 #: TAI minus GPS time, s.
 TAI_MINUS_GPS_S = 19
-#: Seconds from 1900, where NTP counts from, to 1970.
+#: Seconds from 1900, the start of NTP time, to 1970.
 NTP_EPOCH_S = 2_208_988_800
 FILES = ("leapseconds", "leap-seconds.list")
 
@@ -39,10 +40,10 @@ class LeapSeconds:
     """The offset of TAI from UTC at any time since 1972.
 
     Attributes:
-        starts_s: the times from which on the offsets apply, seconds since 1970, ascending.
-        offsets_s: TAI minus UTC from each of these times on, s.
-        expires_s: the time from which on the table may lack a leap second, seconds since 1970; None
-            if it does not expire.
+        starts_s: the times at which the offsets begin to apply, seconds since 1970, ascending.
+        offsets_s: TAI minus UTC after each of these times, s.
+        expires_s: the time after which the table may lack leap seconds, seconds since 1970; None if
+            the table does not expire.
         path: the file with the table; "" for the built-in offset.
     """
 
@@ -96,7 +97,7 @@ BUILT_IN = LeapSeconds((0,), (CURRENT_TAI_OFFSET_S,))
 
 @functools.lru_cache(maxsize=1)
 def read_leap_seconds() -> LeapSeconds:
-    """Return the table of this computer that expires last, or the built-in offset."""
+    """Return this computer's table that expires last; without a table, `BUILT_IN`."""
     tables = list[LeapSeconds]()
     for path in _iter_files():
         try:

@@ -1,7 +1,7 @@
 """The methods with which notebooks display values.
 
-IPython calls a method of the value, which calls a function of `lidarspec.view.notebook`. That
-module imports the classes of all values, so it is only imported when a value is displayed.
+IPython calls a method of the value, and this method calls a function of `lidarspec.view.notebook`.
+That module imports the classes of all values, so it is imported only when a value is displayed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Optional libraries: the oldest usable version of each, and the extra with it.
 
 An extra is a set of libraries that `pip install lidarspec[EXTRA]` installs. All optional libraries
-are imported by `import_library`. It first compares the installed version with `EXTRAS`, because the
-import of an old version may succeed, and fail later for lack of a name.
+are imported by `import_library`. It first compares the installed version with `EXTRAS`, because an
+old version may be imported without an error, but lack a function that is needed later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Requirement(NamedTuple):
     least_version: str
 
 
-#: Extra -> module -> requirement. pyproject.toml declares the same, and a test compares both.
+#: Extra -> module -> requirement. pyproject.toml declares the same requirements, and a test
+#: compares both.
 EXTRAS: dict[str, dict[str, Requirement]] = {
     "arrow": {"pyarrow": Requirement("pyarrow", "14.0")},
     "dask": {"dask": Requirement("dask", "2024.8")},
@@ -89,8 +90,8 @@ def import_library(module: str, extra: str) -> Any:
 def find_requirement(module: str, extra: str) -> Requirement | None:
     """Return the requirement of a module's library; None if `EXTRAS` does not have it.
 
-    Modules of the standard library, such as `compression.zstd`, are not in `EXTRAS`, nor are
-    libraries that another library requires, such as `distributed`.
+    `EXTRAS` has no modules of the standard library, such as `compression.zstd`, and no libraries
+    that another library requires, such as `distributed`.
     """
     for name, requirement in EXTRAS[extra].items():
         if module == name or module.startswith(f"{name}."):
@@ -105,7 +106,7 @@ def check_version(requirement: Requirement, extra: str) -> None:
     A library that is missing, or has no metadata, passes.
 
     Raises:
-        LibraryError: with both versions.
+        LibraryError: if the version is too old; the message has both versions.
     """
     installed = installed_version(requirement.distribution)
     if installed and release_numbers(installed) < release_numbers(requirement.least_version):

@@ -1,11 +1,10 @@
 """Plugins: their hooks, and the registry of installed plugins.
 
-    A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry
-    for each id and alias, so that a request for one sensor loads only one plugin. The registry
-    reads the aliases of a sensor from these entries. Modules with other hooks are in the group
-    ``lidarspec`` and are loaded
-before any sensor is returned. A hook is a function with one of the names below, marked with
-``@hookimpl``.
+A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry for
+each id and alias, so that a request for one sensor loads only one plugin. The registry reads the
+aliases of a sensor from these entries. Modules with other hooks are in the group ``lidarspec`` and
+are loaded before any sensor is returned. A hook is a function with one of the names below, marked
+with ``@hookimpl``.
 
 Each plugin is loaded separately. If a plugin cannot be imported, has an unknown hook or adds an
 invalid sensor, none of its hooks and sensors are used, and it is reported with its distribution and
@@ -101,11 +100,13 @@ def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
 
 @hookspec(firstresult=True)
 def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
-    """Return a transport for a URL scheme that the package does not support, or None.
+    """Return a transport for a URL scheme, or None.
+
+    It is called for schemes that lidarspec itself does not support.
 
     Args:
         url: the source as the user typed it.
-        sensor: the sensor that sends; None if unknown.
+        sensor: the sensor that sends the data; None if unknown.
     """
 
 
@@ -160,11 +161,11 @@ def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
     """Return the file formats that the plugin adds."""
 
 
-#: Seconds after which a plugin that is still loading is reported.
+#: If loading a plugin takes more than this time in seconds, a message is printed.
 LOAD_WARNING_S = 5.0
-#: Seconds after which a plugin that is still loading counts as hanging.
+#: If loading a plugin takes more than this time in seconds, it is treated as hanging.
 LOAD_TIMEOUT_S = 10.0
-#: Module whose import hangs -> the reason.
+#: The modules whose import hangs, and the error for each.
 _hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
@@ -195,12 +196,13 @@ class Plugin:
     Attributes:
         distribution, version, entry_point: where it is declared.
         sensors: the ids that it adds.
-        error: the reason why the plugin or one of its ids is not available; "" if all are.
+        error: the reason why the plugin or one of its ids is not available; "" if everything is
+            available.
         rule: the code of the rule of `lidarspec check` that explains the error; "" if there is
             none.
         failed_sensor: the id that the error concerns; "" if it concerns the whole plugin.
         traceback: the traceback of the error.
-        remark: a description of side effects of loading it, such as printed text.
+        remark: a description of side effects of loading the plugin, such as printed text.
     """
 
     distribution: str
@@ -226,20 +228,21 @@ class Registry:
 
     Several plugins may claim the same name (an id or an alias). Claims by an entry point with this
     name, or by a module that is always loaded, have priority over claims by a sensor that only
-    declares the name. If several distributions remain, the name belongs to its owner: the
-    distribution that the user's own settings name, or `lidarspec-VENDOR` for ids that begin with
-    this vendor and for the aliases of these sensors. If one distribution has two modules with the
-    name, it belongs to the first. A request for a name without an owner is an error. A plugin that
-    loses a name keeps its other names.
+    declares the name. If several distributions remain, the name belongs to its owner. The owner is
+    the distribution that the user's own settings name. Without such a setting, `lidarspec-VENDOR`
+    owns the ids that begin with this vendor, and the aliases of these sensors. A request for a name
+    without an owner is an error. If one distribution has two modules with the name, the name
+    belongs to the first module. A plugin that loses a name keeps its other names.
 
-    If two threads load the same sensor at the same time, it is added twice, with the same result.
+    If two threads load the same sensor at the same time, it is added twice, which has the same
+    result as adding it once.
 
     Args:
         modules: entry points of modules with hooks, which are loaded immediately.
-        offered: entry points of sensors, which are loaded on request; each is named by an id or
+        offered: entry points of sensors, which are loaded on request. The name of each is an id or
             alias.
-        owners: returns the distributions that the user names as owners, by id. It is called if
-            several distributions claim a name.
+        owners: a function that returns the distributions that the user's settings name as owners,
+            by id. It is called if several distributions claim a name.
     """
 
     def __init__(
@@ -301,8 +304,8 @@ class Registry:
         """Register a module or object with hooks, and return the ids that it adds.
 
         Raises:
-            SpecError: for an unknown hook, a wrong signature, or an invalid sensor. Then nothing is
-                registered.
+            SpecError: for an unknown hook, a wrong signature, or an invalid sensor. In this case,
+                nothing is registered.
         """
         _check_hooks(plugin, name)
         try:
@@ -513,11 +516,11 @@ class Registry:
     def sensor(self, name: str) -> Sensor:
         """Return a sensor by id or alias, with its hooks applied.
 
-        Upper case, other separators and missing separators are also accepted.
+        The name may also be in upper case, and have other separators or none.
 
         Raises:
-            UnknownSensor: with a suggestion, or with the packages to install if no sensor is
-                installed.
+            UnknownSensor: if no sensor has this name. The message suggests similar names, or the
+                packages to install if no sensor is installed.
             UsageError: if several distributions claim the name, and none owns it.
         """
         if name in self._ready:
@@ -555,7 +558,7 @@ class Registry:
         return None
 
     def _failed_modules(self) -> dict[str, str]:
-        """Return distribution -> error of the modules with hooks that failed to load.
+        """Return the modules with hooks that failed to load: distribution -> error.
 
         It is not known which sensors such a module would have added.
         """
@@ -587,7 +590,7 @@ class Registry:
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
-        """Return a frame with the checksum of the first hook that returns a checksum.
+        """Return a frame with the checksum of the first hook that provides a checksum.
 
         If a hook raises an exception, the error is recorded and the next hook is called.
         """
@@ -741,7 +744,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
 
 def _describe_location(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER" of the module that a thread is importing, or ""."""
+    """Return " at FILE, line NUMBER", where a thread imports a module; "" if unknown."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -819,7 +822,7 @@ def registry() -> Registry:
 
 
 def try_plugins() -> list[Plugin]:
-    """Load each plugin in another process, then in this process; return all plugins.
+    """Load each plugin in another process, and then in this one; return all plugins.
 
     Plugins that hang or end the other process are not loaded in this process.
     """
@@ -859,8 +862,8 @@ def _modules() -> list[EntryPoint]:
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
     """Return the result of `_trial` for each plugin.
 
-    First, one process loads all plugins. If there is a problem, each plugin is loaded in a process
-    of its own.
+    First, one process loads all plugins. If this fails, each plugin is loaded in a process of its
+    own.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -872,7 +875,7 @@ def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
 
 
 def _trial(*homes: Home) -> tuple[str, str]:
-    """Load plugins in another process; return their error and side effects, or ""."""
+    """Load plugins in another process; return (error, side effects), each "" if none."""
     import subprocess
 
     mark = f"{os.urandom(8).hex()}:"
@@ -981,7 +984,7 @@ def sensor(name: str | Path | Sensor) -> Sensor:
     `Sensor` is returned unchanged.
 
     Raises:
-        UnknownSensor: with a suggestion.
+        UnknownSensor: if no sensor has this name; the message suggests similar names.
         SourceError, SpecError: for a file that cannot be read, or describes no sensor.
     """
     if isinstance(name, Sensor):
@@ -1036,7 +1039,7 @@ def import_file(file: Path) -> ModuleType:
 
     Raises:
         SourceError: if the file is missing.
-            SpecError: if it cannot be imported.
+        SpecError: if it cannot be imported.
     """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
@@ -1068,7 +1071,7 @@ def _faults_of(file: Path) -> Iterator[None]:
 
 
 def rebuild_sensor(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-    """Return an installed sensor with options; pickle calls this to load a sensor."""
+    """Return an installed sensor with options; pickle calls this to unpickle a sensor."""
     installed = sensor(sensor_id)
     return installed.configure(**options) if options else installed
 

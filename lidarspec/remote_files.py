@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, cast
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
 from lidarspec.optional_libraries import import_library
 
-#: URL scheme -> the library that fsspec requires for it; "" if it needs none.
+#: URL scheme -> the library that fsspec requires for it; "" if it requires none.
 DRIVERS = {
     **dict.fromkeys(("file", "ftp", "memory"), ""),
     **dict.fromkeys(("s3", "s3a"), "s3fs"),
@@ -31,7 +31,7 @@ DRIVERS = {
     "smb": "smbprotocol",
     "hdfs": "pyarrow",
 }
-#: Number of bytes at the beginning and at the end of a file from which its hash is computed.
+#: The hash of a file is computed from this number of bytes at its beginning and at its end.
 DIGESTED_END_BYTES = 1 << 16
 
 
@@ -131,7 +131,7 @@ def files_in(folder: str) -> set[str]:
 def normalise_path(path: object) -> str:
     """Return a normalised path or URL for comparison.
 
-    The results for memory:///a and memory://a are equal, as are those for ./a and a.
+    For example, memory:///a and memory://a give equal results, and so do ./a and a.
     """
     if is_remote(path):
         return str(path).partition("://")[2].lstrip("/")
@@ -139,9 +139,9 @@ def normalise_path(path: object) -> str:
 
 
 def read_stamp(path: str) -> dict[str, Any]:
-    """Return the `size` of a file, and the time when it was `modified`.
+    """Return the `size` of a file, and the time at which it was `modified`.
 
-    Some stores give a tag instead of the time.
+    Some stores provide a tag instead of the time.
 
     Raises:
         SourceError: if there is no such file.
@@ -173,7 +173,7 @@ def digest(path: str) -> str:
 
 
 def upload(local: Path, url: str) -> None:
-    """Copy a file or folder to a store; a file appears there only when complete.
+    """Copy a file or folder to a store, where a file appears when it is complete.
 
     Raises:
         SourceError: if that fails.

@@ -34,9 +34,10 @@ class Sensor(SensorDescription):
         frames: all frame types by name, in both directions. If bytes match several types, the first
             in this order is chosen.
         points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
-            has a function of its own, or if the sensor has no points (no frame with ``data=True``).
+            has a function of its own, or if the sensor has no points, which means that no frame has
+            ``data=True``.
         scan: the rule by which a scan ends and the next one begins; None without points.
-        links: the links by name. Data is received on the link "data"; each command names the link
+        links: the links by name. Data is received on the link "data". Each command names the link
             on which it is sent.
         commands: the commands by name.
         clock: the sensor's clock, if it has one.
@@ -47,27 +48,28 @@ class Sensor(SensorDescription):
         configure: a function of the sensor and its options (keyword arguments) that returns another
             sensor. The annotations of its parameters are the possible values of the options.
         recognise: a function that is needed if data frames do not contain their own layout. Its
-            argument is a list of datagrams; it returns the options of `configure` that decode them,
-            or {} if the datagrams are not from such a sensor.
+            argument is a list of datagrams. It returns the options of `configure` with which the
+            datagrams can be decoded, or {} if they are not from such a sensor.
         on_open, on_close: names of the commands that are sent when a device is opened or closed.
         range_limits: the shortest and the longest range in metres that the sensor can measure; None
             without points.
         vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
             of forward, back, left, right, up and down.
         beams: number of points of a scan, if it is constant.
-        returns: the names of the returns of a firing, by return index, if they are not in the
-            order of their distance: "first", "last", "strongest", "second strongest", or "varying"
-            if a setting of the sensor decides. `Selection` chooses by them.
+        returns: the names of the returns of a firing, by return index, if they are not in the order
+            of their distance. A name is "first", "last", "strongest", "second strongest", or
+            "varying" if it depends on a setting of the sensor. `Selection` uses these names.
         turn: the lowest and the highest number of scans per second.
-        relatives: ids of related models, installed or not, with the difference: a text if the pace
-            of the clock or the model in `info` shows it, a `Relative` if single packets show it.
+        relatives: ids of related models, installed or not, and how each differs from this sensor.
+            The difference is a text if it is found from the speed of the clock or the model in
+            `info`, and a `Relative` if it is found in single packets.
         info: fields with information about the device: name -> "frame.path", or a `Reported`. The
             names "serial", "firmware", "model" and "temperature" have a meaning for all sensors.
         status: how the description was verified: "manual", "vectors", "capture" or "hardware".
         source: the manual with its revision and sections, and the captures, from which it was
             written.
-        aliases: other ids of the sensor. An installed plugin declares them as entry points, which
-            are added here; give them if there are no entry points, such as in a script.
+        aliases: other ids of the sensor. The aliases that an installed plugin declares as entry
+            points are added. Pass aliases only if there are no entry points, such as in a script.
         api: the version of this interface that the description was written for.
         acknowledged: findings of `lidarspec check` about the sensor as a whole that are accepted:
             "LS401" -> the reason.
@@ -88,9 +90,9 @@ class Sensor(SensorDescription):
 
         Args:
             frame: the name of its type; by default it is identified.
-            verify: with False, wrong constants, a wrong checksum and trailing bytes are accepted.
-            units: return physical values, which ``build(units=True)`` accepts: scaled fields in
-                their units, other fields unchanged.
+            verify: if False, wrong constants, a wrong checksum and trailing bytes are accepted.
+            units: whether to return physical values, which ``build(units=True)`` accepts. Scaled
+                fields are then in their units, and other fields unchanged.
 
         Raises:
             WireError: if the bytes are not such a frame. The error has the sensor, the offset, the
@@ -111,7 +113,7 @@ class Sensor(SensorDescription):
             units: whether values are physical; they are rounded to the nearest raw value.
 
         Raises:
-            UsageError: for a missing or unknown field, or a value that a field cannot hold.
+            UsageError: for a missing or unknown field, or a value that a field cannot represent.
         """
         from lidarspec.frames.build import build
 
@@ -142,11 +144,11 @@ class Sensor(SensorDescription):
         return build_command(self, name, arguments)
 
     def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
-        """Return a new decoder, to which received bytes are fed as they arrive.
+        """Return a new decoder for bytes that are received one after another.
 
         Args:
-            stream: True if the bytes are a stream, False if each `feed` gets one datagram; the
-                default depends on the data link.
+            stream: True if the bytes are a stream, False if each call of `feed` gets one datagram.
+                The default depends on the data link.
             backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
@@ -185,15 +187,15 @@ class Sensor(SensorDescription):
         return [found for frames in decode_all(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
-        """Return the data frames, or those of another type, as columns.
+        """Return the data frames, or the frames of another type, as columns.
 
         Invalid bytes do not raise.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            frame: the name of a frame type; by default the data frame, of several the type that
-                arrives first.
+            frame: the name of a frame type; by default the data frame. If the sensor has several
+                types of data frames, the default is the type that arrives first.
             backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
@@ -207,7 +209,7 @@ class Sensor(SensorDescription):
     def _decode(
         self, data: Any, frame: str | None, backend: str
     ) -> tuple[Packets, WaitingSamples | None]:
-        """Return the packets of a frame type; if no type is named, also IMU samples."""
+        """Return the packets of a frame type, and IMU samples if no type is named."""
         from lidarspec.framing.decoder import decode_all, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 

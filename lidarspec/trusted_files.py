@@ -49,8 +49,9 @@ def find_distrust(path: Path) -> str:
     """Return the reason why a file is not the user's own; "" if it is.
 
     An example is "/tmp belongs to user 0". The file and its folder must belong to the user, and
-    must not be writable by all users. The group may be able to write, because it often has no other
-    members. On systems without file owners, all files in the user's folder are the user's own.
+    must not be writable by all users. They may be writable by the group, because a user's group
+    often has no other members. On systems without file owners, all files in the user's folder are
+    the user's own.
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
@@ -96,7 +97,7 @@ def is_trusted(folder: Path) -> bool:
 
 
 def trust(folder: str | Path) -> Path:
-    """Trust the files of a folder: they may name Python files, and paths anywhere.
+    """Trust the files of a folder: they may refer to Python files and to any path.
 
     Returns:
         The absolute path of the folder.
@@ -122,7 +123,7 @@ def trust(folder: str | Path) -> Path:
 
 
 def resolve_beside(folder: Path, value: object) -> Path:
-    """Return the path of a file, in `folder` or below, that another file there names.
+    """Return the path of a file in a folder or below, which another file there names.
 
     Raises:
         UsageError: for any other path, or if it is not a regular file.
