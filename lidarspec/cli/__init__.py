@@ -1,18 +1,18 @@
 """The command line. Each verb calls a public function of the package.
 
-In: the arguments of a command. Out: text or JSON, and an exit code. A failure prints one message,
-which suggests the next command. Modules in reading order:
+The input is the arguments of a command. The output is text or JSON, and an exit code. A failure
+prints one message, which suggests the next command. Modules in reading order:
 
 * `root`: the list of verbs, and the entry point `main`. A verb is imported when it is used.
 * `completion`: completion of arguments in the shell.
-* `options`, `inputs`: options that several verbs share, and the input of verbs that read bytes.
-* `terminal`, `output`, `failures`: print to standard output and error; format results as text,
-  tables or JSON; report a failure as one message and an exit code.
-* `listing`: the lines of an explanation, in colours.
+* `options`: options that several verbs share. `inputs`: the input of verbs that read bytes.
+* `terminal`: prints to standard output and standard error. `output`: formats results as text,
+  tables or JSON. `failures`: reports a failure as one message and an exit code.
+* `listing`: prints the lines of an explanation, in colours.
 * `sensors`, `frames`, `build`: list the installed sensors, print the fields of frames, build a
   frame.
 * `read`, `view`: print a live sensor's data as rows or statistics, or draw it.
-* `clock`: report what the clocks of sensors count, and their faults.
+* `clock`: diagnose the clocks of sensors.
 * `recordings`: record a source into a file, and replay it.
 * `convert`, `info`, `plot`: convert files, describe their contents, draw them.
 * `sim`: simulate a sensor on a port or in a file.

@@ -1,4 +1,4 @@
-"""`build` and `send`: build a frame from field=value; send a command."""
+"""`build` and `send`: build a frame from the values of its fields; send a command."""
 
 from __future__ import annotations
 

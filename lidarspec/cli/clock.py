@@ -24,7 +24,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.live_scans import LOOK_S
 
-#: Codes of findings about a clock that nothing synchronizes.
+#: Codes of findings that say that nothing synchronizes a clock.
 UNSYNCHRONIZED_CODES = ("not_locked", "unsynchronized", "wrong_date")
 DEFAULT_DURATION_S = 12.0  # the drift is known after ten seconds
 
@@ -35,7 +35,7 @@ class SourceClock:
     Args:
         device: the open device; it is not closed.
         source: the SOURCE, as the user has written it.
-        drift_limit_ppm: the drift above which the clock is at fault.
+        drift_limit_ppm: the drift above which the clock is reported as faulty.
 
     Attributes:
         ended: whether the input has ended.
@@ -127,9 +127,9 @@ def clock(
 
 
 def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) -> Diagnosis | None:
-    """Return the finding of `doctor` about the clock of a source that sends valid data.
+    """Return the finding of `doctor` about the clock of a source with valid data.
 
-    A clock that nothing synchronizes is no problem: many sensors are used so.
+    It is not a problem if nothing synchronizes the clock, because many sensors are used this way.
 
     Returns:
         None if the sensor sends no time, or cannot be opened again.
@@ -167,7 +167,7 @@ def _read_all(clocks: Sequence[SourceClock], duration: float | None) -> None:
 
 
 def _find_limit_s(source_clock: SourceClock, duration: float | None) -> float:
-    """Return the time after which a source is no longer read, in seconds."""
+    """Return how long a source is read, in seconds."""
     if duration is not None:
         return duration
     if source_clock.device.is_live:

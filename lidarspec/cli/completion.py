@@ -31,7 +31,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.ports import list_serial_ports
 
-#: The environment variable that holds the request of the shell.
+#: The environment variable with the request of the shell.
 VARIABLE = "_LIDARSPEC_COMPLETE"
 #: The characters at which bash splits words.
 BREAKS = ":="
@@ -67,7 +67,7 @@ class BashCompletion(BashComplete):
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return a completion without the part of the word that bash does not replace."""
+        """Return a completion without the beginning of the word, which bash keeps."""
         return f"{item.type},{item.value.removeprefix(self._bash_prefix)}"
 
 
@@ -81,7 +81,7 @@ def complete(group: click.Command, instruction: str) -> int:
 
 
 def attach(command: click.Command) -> None:
-    """Add completion to the parameters of a verb, chosen by their names."""
+    """Add completion to the parameters of a verb, by the names of the parameters."""
     for param in command.params:
         list_names = BY_NAME.get(param.name or "")
         if list_names is not None and isinstance(param.type, click.types.StringParamType):
@@ -135,9 +135,9 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _find_sensor(ctx: click.Context) -> Sensor | None:
-    """Return the sensor that the words before the cursor give; None if they give none.
+    """Return the sensor that the words before the cursor select; None if they do not.
 
-    They give a sensor by -s, by a device of lidarspec.toml, or by a simulated source.
+    They select a sensor by -s, by the name of a device in lidarspec.toml, or by a simulated source.
     """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
@@ -213,7 +213,7 @@ def _sensors_and_distributions(ctx: click.Context, incomplete: str) -> Iterable[
     return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
 
 
-#: Functions for parameters that do not accept files.
+#: The functions for parameters that do not accept files.
 WITHOUT_FILES = (_frames, _commands, _assignments, _verbs, _columns, _formats)
 #: name of a parameter -> function that returns its possible values.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {

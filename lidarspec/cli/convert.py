@@ -422,7 +422,7 @@ def _select_frames(
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
-    """Return the packets of a frame type, and their parts, that are among some types."""
+    """Return packets by type: the packets and their parts, as far as in `types`."""
     found = dict[str, Packets]()
     for name in types:
         frame, _, path = name.partition(".")
@@ -522,7 +522,7 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
 def _follow_batch(
     records: Iterable[tuple[batch.Record, bool]], folder: str, file_count: int, *, as_json: bool
 ) -> None:
-    """Print the progress and the result of a batch; exit with 1 if a piece failed."""
+    """Print the progress and the result of a batch; exit with 1 if a piece has failed."""
     totals: Counter[str] = Counter()
     failed: list[batch.Record] = []
     done_before = 0

@@ -23,8 +23,8 @@ NO_DATA = 4
 DEVICE = 5
 INTERRUPTED = 130
 
-#: (error class, exit code, next command). The first entry with the class of an error applies.
-#: "{sensor}" and "{verb}" are filled in.
+#: (error class, exit code, next command). The first entry whose class matches an error is used.
+#: "{sensor}" and "{verb}" are replaced.
 CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
     (
@@ -97,7 +97,7 @@ def _format_message(error: Exception) -> str:
 def _find_next_command(error: Exception, command: str, verb: str) -> str:
     """Return the command to suggest after an error.
 
-    For an unknown sensor, this is `lidarspec plugins` if a plugin fails to load, because that
+    If a sensor is unknown and a plugin fails to load, it is `lidarspec plugins`, because that
     plugin may provide the sensor.
     """
     from lidarspec.plugins import registry

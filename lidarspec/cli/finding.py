@@ -53,7 +53,7 @@ from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, list_serial_ports
 from lidarspec.transports.protocol import no_bytes
 
-#: A match with fewer bits of evidence may be coincidence.
+#: A match with fewer bits of evidence may be a coincidence.
 WEAK_BITS = 12
 #: Maximum number of matches to print.
 MAX_PRINTED_MATCHES = 4
@@ -331,7 +331,7 @@ def detect(
 def _find_exit_code(source: str | None, verdicts: Sequence[Verdict]) -> int:
     """Return the exit code if no sensor fits.
 
-    It is `DEVICE` if no live source sent any data, else `NO_DATA`.
+    It is `DEVICE` if the source is live and no data arrived, else `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
     is_silent = is_live and not any(verdict.sample.size for verdict in verdicts)
@@ -381,7 +381,7 @@ def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
 
 
 def _find_structure(verdicts: Sequence[Verdict]) -> FrameStructure | None:
-    """Return the structure of bytes that no sensor fits; None if none is found."""
+    """Return the structure of the largest sample of bytes; None if none is found."""
     sample = max(
         (verdict.sample for verdict in verdicts), key=lambda sample: sample.size, default=None
     )
@@ -513,7 +513,7 @@ def _iter_conclusions(
 
 
 def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return the known sensors, not installed, that may have sent the largest sample.
+    """Return sensors that are not installed but may have sent the largest sample.
 
     Returns an empty list if an installed sensor fits.
     """
@@ -537,7 +537,7 @@ def _find_verb(verdict: Verdict) -> str:
 
 
 def _find_next_command(source: str | None, unknown: FrameStructure | None) -> str:
-    """Return the command to suggest for bytes that no sensor fits."""
+    """Return the command to suggest if the bytes fit no installed sensor."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
     if unknown is None or unknown.checksums:
@@ -550,7 +550,7 @@ def _find_next_command(source: str | None, unknown: FrameStructure | None) -> st
 
 
 def _format_source(verdict: Verdict) -> str:
-    """Return the SOURCE of a verdict with its baud rate and sender, for a command."""
+    """Return the SOURCE of a verdict, with baud rate and sender, for use in a command."""
     source = verdict.sample.source
     sample = verdict.sample
     link = data_link(verdict.sensor, Serial)

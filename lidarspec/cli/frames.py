@@ -76,7 +76,7 @@ def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
 
 
 def _iter_names(parsed: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the path and the name of each code in a parsed frame; "" for an unknown code."""
+    """Yield (path, name) of each enum value in a parsed frame; "" for an unknown one."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             yield from _iter_names(value, f"{path}.{name}" if path else name)
@@ -184,7 +184,7 @@ def listing(
     every: bool = False,
     verdicts: bool = False,
 ) -> Iterator[Line]:
-    """Yield the lines of explained pieces; each piece has a title.
+    """Yield the lines of explained pieces of the input; each piece has a title.
 
     Args:
         at: the offset of a byte; the title names the field at this offset.
@@ -218,14 +218,14 @@ def listing(
 
 
 class FrameSelection:
-    """Selects the pieces of an input to show, and counts all pieces.
+    """Selects which pieces of an input to show, and counts all pieces.
 
     Args:
         frame: show only this frame type.
-        count: maximum number of frames; with `bad`, of damaged frames.
+        count: maximum number of frames to show; with `bad`, maximum number of damaged frames.
         bad: show only damaged pieces.
         at: show only the byte at this offset.
-        stretch: show only the bytes in this range, "FROM:TO".
+        stretch: show only the bytes in this range of offsets, "FROM:TO".
 
     Attributes:
         valid: number of valid frames.
@@ -274,7 +274,7 @@ class FrameSelection:
         """Yield the selected pieces with their explanations, as they are found.
 
         Raises:
-            WireError: if no part of the input begins like a frame.
+            WireError: if nothing in the input begins like a frame.
         """
         for piece in pieces:
             if piece.offset >= self._to:
@@ -312,7 +312,7 @@ class FrameSelection:
             raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
-        """Print the numbers of frames and bytes of an input after it was shown.
+        """Print the numbers of frames and bytes of an input after showing it.
 
         Raises:
             UsageError: if the input ends before the selected bytes.
@@ -421,7 +421,7 @@ def _compare(
 def _find_sensor(
     sample: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
-    """Return the named sensor or a fitting sensor, and the ids of all fitting sensors."""
+    """Return the named or a fitting sensor, and the ids of all fitting sensors."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
     from lidarspec.detect.identification import (
@@ -462,7 +462,7 @@ def _raw_text(raw: Any) -> str:
 def plain(parsed: Any) -> Any:
     """Return a parsed frame as JSON values.
 
-    Bytes become hexadecimal text, nan and infinity null.
+    Bytes become hexadecimal text. NaN and infinity become null.
     """
     if isinstance(parsed, dict):
         return {name: plain(value) for name, value in parsed.items() if not name.startswith("_")}

@@ -26,7 +26,7 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     has_unknown_file = False
 
     def iter_texts() -> Iterator[str]:
-        """Yield the texts about the files, and record whether one has no known sensor."""
+        """Yield a text about each file, and record whether any file has no known sensor."""
         nonlocal has_unknown_file
         for file in files:
             contents = read_contents(file)

@@ -1,8 +1,8 @@
 """Read the input of verbs, and explain why it contains no frame.
 
-The input is hexadecimal text, a file, standard input or a configured device. Verbs that read
-hexadecimal text of a named sensor do not need the modules for sources, files and detection.
-Functions therefore import these modules, so that these verbs start faster.
+The input is hexadecimal text, a file, standard input or a configured device. The modules for
+sources, files and detection are imported inside functions. Verbs that only read hexadecimal text of
+a named sensor do not need these modules, and start faster without them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MAX_REPEATED_CHARS = 400
 MAX_QUOTED_CHARS = 64
 #: Maximum number of bytes that `read` returns.
 MAX_INPUT_BYTES = 1 << 20
-#: Timeout for the first frame of a device, in seconds.
+#: Maximum time to wait for the first frame of a device, in seconds.
 FIRST_FRAME_TIMEOUT_S = 10.0
 #: Polling interval for a source that sends nothing, in seconds.
 POLL_S = 0.1
@@ -75,7 +75,7 @@ def open_input(
 
     Args:
         words: the arguments: hexadecimal text, "-", a file name, or a device of lidarspec.toml.
-        times: the part of a file to read, by arrival time.
+        times: the range of arrival times to read, if the input is a file.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -182,7 +182,7 @@ def read(words: Sequence[str]) -> SampleBytes:
 
 
 def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
-    """Return the error for arguments that are neither a file nor hexadecimal digits."""
+    """Return the error for arguments that are neither files nor hexadecimal digits."""
     from lidarspec.transports.open_url import live_address
 
     text = " ".join(words)
@@ -207,7 +207,7 @@ def refuse_overwriting(
 
     Args:
         target: the output file or files.
-        inputs: SOURCEs, file names, and sensors with options that may be file names.
+        inputs: SOURCEs, file names, and sensors whose options may be file names.
         force: whether existing files that are not inputs may be overwritten.
 
     Raises:
@@ -293,7 +293,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
 def nearest_fault_error(sample: SampleBytes) -> WireError:
     """Return the error for an input that no sensor fits.
 
-    It is the error of the sensor that parsed the most bytes, or a general error.
+    It is the error of the sensor whose frames match the most bytes, or else a general error.
     """
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -333,8 +333,8 @@ def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
 def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Return the error for a source without a scan.
 
-    It gives the cause: the plugin raised an exception, a file has no data frames, a device sent
-    nothing, or the bytes are not frames.
+    The error names the cause: the plugin raised an exception, a file has no data frames, a device
+    has sent nothing, or the bytes are not frames.
     """
     sensor = device.sensor
     stats = device.stats
@@ -381,7 +381,7 @@ def conclude(device: Device) -> None:
     """Print values that the sensor reported, and warnings, after reading a source.
 
     Raises:
-        PluginError: if plugin code raised for some packets.
+        PluginError: if the plugin raised an exception for some packets.
         click.exceptions.Exit: with exit code 1, if a part of the source was corrupt and could not
             be read.
     """

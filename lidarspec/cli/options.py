@@ -30,7 +30,8 @@ def sensor_option(function: Function) -> Function:
 def configuring(function: Function) -> Function:
     """Add ``-O`` and ``--calibration``.
 
-    The verb gets `sensor_id`: the id, or the sensor that the options configure.
+    The verb gets the argument `sensor_id`, which is the id, or the sensor that the options
+    configure.
     """
 
     @functools.wraps(function)
@@ -51,8 +52,8 @@ def configuring(function: Function) -> Function:
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `sensor_option`, without configuring the sensor.
 
-    The verb gets the texts `sensor_id`, `options` and `calibration`, the arguments of
-    `configure_sensor`.
+    The verb gets the arguments `sensor_id`, `options` and `calibration`, as texts, and can pass
+    them to `configure_sensor`.
     """
     return _add_sensor_option(_optional(function))
 
@@ -106,8 +107,8 @@ def configure_sensor(
 def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
     """Return the value of an option given as text.
 
-    A number or boolean is parsed as in `lidarspec.toml` if the option accepts this type. Any other
-    value stays a text.
+    If the option accepts a number or boolean, it is parsed as in `lidarspec.toml`. Any other value
+    remains a text.
     """
     try:
         value = tomllib.loads(f"value = {text}")["value"]
@@ -145,12 +146,13 @@ def colour_option(function: Function) -> Function:
 
 
 class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
-    """A type of option for one or two numbers with a special syntax.
+    """The type of an option whose value is one or two numbers in a special syntax.
 
     Args:
         name: the name of the type, for help pages.
-        parse: converts a text to a number. It raises ValueError or UsageError for an invalid text.
-        form: the expected syntax in words, for error messages.
+        parse: a function that converts a text to a number. It raises ValueError or UsageError for
+            an invalid text.
+        form: a description of the expected syntax, for error messages.
     """
 
     def __init__(self, name: str, parse: Callable[[str], Any], form: str) -> None:
@@ -253,7 +255,7 @@ def _parse_distances(text: str) -> tuple[float, float]:
     return low or 0.0, math.inf if high is None else high
 
 
-#: Seconds, from "10s", "500ms", "2min", "1h" or a bare number.
+#: Seconds, from a text such as "10s", "500ms", "2min", "1h" or "10".
 DURATION = NumberType(
     "duration", _parse_duration, "a duration above 0, such as 10s, 500ms, 2min or 1h"
 )
@@ -336,7 +338,7 @@ def selecting(*names: str) -> Callable[[Function], Function]:
     """Add options that select scans. The verb gets a `Selection`.
 
     Args:
-        names: the arguments of `Selection` to add options for, keys of `SELECTING`.
+        names: the arguments of `Selection` for which options are added; keys of `SELECTING`.
     """
 
     def options(function: Function) -> Function:

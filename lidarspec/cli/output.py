@@ -28,8 +28,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 #: Seconds between two updates of the progress line.
 UPDATE_PERIOD_S = 0.2
-#: Number of spaces between the columns of a table. The next constants are the indentation of prose
-#: below its row, and the minimum width of a column of prose, in characters.
+#: Number of spaces between the columns of a table. The next constants are the indentation of text
+#: below a row, and the minimum width of a last column with text, in characters.
 COLUMN_GAP = 2
 PROSE_INDENT = 6
 MIN_PROSE_WIDTH = 24
@@ -45,7 +45,7 @@ def output_options(function: Function) -> Function:
 def output_option(function: Function) -> Function:
     """Add ``-o/--output`` to a verb.
 
-    The output file must not be one that the verb reads.
+    The output file must not be a file that the verb reads.
     """
 
     @functools.wraps(function)
@@ -110,7 +110,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         """Run a task, print its remarks, and show progress while it runs.
 
         Args:
-            remarks: iterating it runs the task. It yields texts to print; an empty text only
+            remarks: an iterator that runs the task. It yields texts to print; an empty text only
                 updates the progress.
             text: returns the progress text.
         """
@@ -200,7 +200,7 @@ def emit(content: str | bytes, output: str | None) -> None:
 def emit_parts(
     parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None
 ) -> None:
-    """Write each text or each piece of bytes when it is made, like `emit`.
+    """Write texts or bytes as soon as each is made; otherwise like `emit`.
 
     Args:
         parts: texts of one or more lines, or bytes.
@@ -234,7 +234,7 @@ def emit_json(value: Any, output: str | None) -> None:
 def emit_json_list(
     head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
 ) -> None:
-    """Write a JSON object with a list, each item when it is made, like `emit`.
+    """Write a JSON object with a list, each item as soon as it is made, like `emit`.
 
     Args:
         head: the entries before the list.
@@ -258,9 +258,9 @@ def _iter_items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
     """Format rows as aligned columns, fitted to the width of a terminal.
 
-    Cells are folded between words, so that ids and paths are not split. If the last column is then
-    narrower than `MIN_PROSE_WIDTH`, its cells are printed on separate lines below each row. Without
-    a terminal, each row is one line.
+    Cells are folded only between words, so that ids and paths are not split. If this makes the last
+    column narrower than `MIN_PROSE_WIDTH`, its cells are printed on separate lines below each row.
+    Without a terminal, each row is one line.
     """
     lines = [headers, *rows]
     if output is None and sys.stdout.isatty():
@@ -312,7 +312,7 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 def render(what: Text) -> str:
     """Convert a text of rich to a string with colour codes.
 
-    Rich does not print the text itself, because it ends the process if the pipe is closed.
+    rich is not used to print the text, because it ends the process if the pipe is closed.
     """
     from rich.console import Console
 

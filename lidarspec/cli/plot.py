@@ -155,7 +155,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
 def _draw_over_time(
     device: Device, source: str, selection: Selection, kind: str, end_s: float
 ) -> Any:
-    """Return a figure of the data that arrives until `end_s` on `time.monotonic`."""
+    """Return a figure of the data that arrives until `end_s`, by `time.monotonic`."""
     title = f"{device.sensor.id}, {Path(source).name if device.progress else source}"
     if kind == "rates":
         rates = matplotlib_figures.RateSeries(LiveScans(device, select=selection), end_s)

@@ -55,8 +55,8 @@ POINT_FORMATS = {
         "column": (6, 0),
     },
 }
-#: Number of significant digits of a packet's field. The next constants are the number of digits of
-#: a further column in float32, and the minimum width of a column in characters.
+#: Number of significant digits of a packet's field. The next constants are the number of
+#: significant digits of a further float32 column, and the minimum width of a column in characters.
 FIELD_DIGITS = 10
 FLOAT32_DIGITS = 7
 MIN_COLUMN_WIDTH = 8
@@ -148,9 +148,9 @@ def _iter_lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator
 
 
 def _iter_points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
-    """Yield (units, row) for each point of the complete scans.
+    """Yield (units, row) for each point.
 
-    Also yields the points of incomplete scans at the beginning and the end.
+    Points of incomplete scans at the beginning and at the end are included.
     """
     units: Units = UNITS
     for number, scan in enumerate(scans):
@@ -171,7 +171,7 @@ def _iter_packets(
     patience: FirstFrameTimeout,
     selection: Selection,
 ) -> Iterator[tuple[Units, Row]]:
-    """Yield (units, row) for each packet; the row has its fields in units."""
+    """Yield (units, row) for each packet; the row has the fields in their units."""
     if replace(selection, times=(None, None), time="sensor") != Selection():
         raise UsageError("packets can be selected only by --slice and --time")
     wanted = TimeSlice(selection.times)
@@ -240,7 +240,7 @@ def _format_row(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _to_json(value: Any) -> Any:
-    """Return a value for JSON: null for nan and infinity, whole numbers as integers."""
+    """Return a value for JSON: None for nan and infinity, whole floats as integers."""
     if isinstance(value, np.ndarray):
         return [_to_json(item) for item in value]
     if isinstance(value, np.generic):
@@ -287,7 +287,7 @@ class StatsPrinter:
     printed: int = 0
 
     def interval(self, at: float | None, reading: MeterReading) -> None:
-        """Print the values of an interval that ended `at` seconds after the beginning."""
+        """Print the values of an interval that ended `at` seconds after the start."""
         if self.as_json:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
             return

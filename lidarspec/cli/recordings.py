@@ -130,7 +130,7 @@ def record(
 
 
 def _slice_error(source: str, target: str, times: str) -> UsageError:
-    """Return the error for --slice, with the command that copies a part of a file."""
+    """Return the error for --slice, which suggests the command that copies a part."""
     if is_live(source):
         return suggest(
             UsageError("--slice requires a recording; for a live source, use -t"),
@@ -152,7 +152,7 @@ def _print_recording(task: SourceRecording) -> None:
 
 
 def _describe_recording(task: SourceRecording, recorder: BackgroundWriter) -> str:
-    """Return the number of records and bytes in words."""
+    """Return a text with the number of packets, records and bytes, and the duration."""
     packets = f"{task.packets} packets, " if task.packets else ""
     return f"{packets}{recorder.records} records, {size(recorder.bytes)} in {task.elapsed:.1f} s"
 
@@ -200,7 +200,8 @@ def _sum_up_recording(
 def _describe_damage(stats: Counters) -> str:
     """Format the counters of lost and damaged input.
 
-    Counters of decoded data are omitted, because the file does not contain all decoded data.
+    Counters of the decoded data are left out, because more data may be decoded than the file
+    contains.
     """
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):
@@ -359,7 +360,7 @@ def _announce(file: str, target: str, sensor: Sensor | None, *, as_json: bool) -
 
 
 def _view_words(sensor: Sensor | None, target: str) -> str:
-    """Return the words after `lidarspec` that show the data of a source."""
+    """Return the arguments of `lidarspec` that show the data of a source."""
     if sensor is None:
         return f"detect {shlex.quote(target)}"
     return f"{verb_to_show(sensor)} {shlex.quote(target)} -s {sensor.id}"

@@ -111,7 +111,7 @@ SEPARATE_VERBS = {"ros2": "lidarspec-ros2"}
 
 
 def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Option:
-    """Return an option that sets the loudness of remarks."""
+    """Return an option that sets how many remarks are printed."""
 
     def set_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value:
@@ -120,7 +120,7 @@ def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Optio
     return click.Option(names, is_flag=True, expose_value=False, callback=set_verbosity, help=help)
 
 
-#: Options that every verb has, unless the verb has its own option with the same name.
+#: Options of every verb. A verb's own option with the same name has priority.
 COMMON_OPTIONS = (
     _make_verbosity_option(
         -1,
@@ -212,7 +212,7 @@ class Verbs(click.Group):
     def main(  # type: ignore[override]
         self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any
     ) -> NoReturn:
-        """Run one verb, and exit with its code; no exception but SystemExit is raised."""
+        """Run one verb, and exit with its code; raises no exception except SystemExit."""
         if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
             from lidarspec.cli.completion import complete
 
@@ -248,7 +248,7 @@ def _run(group: click.Group, words: list[str]) -> int:
 
 
 def _format_cost(seconds: float) -> str:
-    """Format the time of a verb, and the memory it used if the system reports it."""
+    """Format the duration of a verb, and its memory use if the system reports it."""
     try:
         import resource
     except ImportError:

@@ -25,15 +25,16 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
 
-#: Number of simulated packets for which a plan is made. Some packets of a revolution may be
-#: shorter, so a single packet is not enough.
+#: Number of simulated packets for which a plan is made. A single packet is not enough, because some
+#: packets of a revolution may be shorter.
 PLANNED_PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
     """Return facts about each installed sensor, and the plugins that failed to load.
 
-    Most plugins need not be loaded, because their facts are stored.
+    Most plugins are not loaded for this, because the facts about their sensors are stored in a
+    table.
     """
     is_fresh = (
         "lidarspec.plugins" not in sys.modules
@@ -211,7 +212,7 @@ def _format_unit(sensor: Sensor, path: str) -> str:
 
 
 def _list_plan(sensor: Sensor, frame: str) -> list[str]:
-    """Return the lines of the plan of a data frame, or the reason why it has no plan."""
+    """Return lines about how a frame's points are computed, or why they cannot be."""
     from lidarspec.frames.frame_table import CompiledTable
     from lidarspec.framing.results import Counters, Found, pack_found
     from lidarspec.packets.stream import PacketStream

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 #: Default duration of a file, in seconds.
 FILE_DURATION_S = 10.0
-#: Maximum width of the picture in characters. The next constants are its maximum height, and the
-#: number of lines for the summary.
+#: Maximum width of the picture in characters. The next constants are the maximum height of the
+#: picture, and the number of lines that are kept free for the summary.
 MAX_PICTURE_COLUMNS = 100
 MAX_PICTURE_LINES = 42
 SUMMARY_LINES = 8

@@ -1,8 +1,8 @@
 """Print to standard output and standard error.
 
-Addresses, file names and texts of devices and plugins are not trusted: characters that control a
-terminal are escaped. If a remark cannot be printed, the verb continues, so that a recording is not
-lost. If data cannot be printed, an error is raised.
+Addresses, file names and texts from devices and plugins are not trusted. Characters in them that
+control a terminal are escaped. If a remark cannot be printed, the verb continues, so that a
+recording is not lost. If data cannot be printed, an error is raised.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         content: text, in which characters that control a terminal are escaped; or bytes, which are
             written unchanged.
         nl: whether to end the output with a line break.
-        colour: whether to print the colours of a text that lidarspec has coloured: True also in a
-            pipe, False never. None for a text without colours; all escape sequences are then
-            escaped.
+        colour: for a text that lidarspec has coloured, True to print the colours also in a pipe,
+            and False to remove them. None for a text without colours, in which all escape sequences
+            are escaped.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.

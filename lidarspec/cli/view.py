@@ -210,7 +210,7 @@ def _open_in_browser(server: PageServer) -> bool:
 
 
 def parse_address(address: str | None) -> tuple[str, int]:
-    """Return the host and the port of the page; 0 lets the system choose a port.
+    """Return the host and the port of the page; port 0 means any free port.
 
     Raises:
         UsageError: if the port is not a number.
