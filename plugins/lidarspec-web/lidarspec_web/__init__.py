@@ -6,22 +6,23 @@
 
 Modules in reading order:
 
-* `source_server`: a source, read and served; `lidarspec view --web` runs it.
-* `broadcast`: a source that is read once and shown to any number of pages; files are played.
-* `recent_bytes`: the newest bytes of the source, frame by frame, and damaged bytes.
-* `scan_message`: one scan as the binary message that a page draws.
-* `page_messages`: all other messages to a page, as JSON.
+* `source_server`: reads a source and serves its page; `lidarspec view --web` runs it.
+* `broadcast`: reads a source once and shows it to any number of pages; files are played.
+* `recent_bytes`: stores the newest frames and the newest damaged bytes of the source.
+* `scan_message`: converts a scan to the binary message that a page draws.
+* `page_messages`: makes all other messages to a page, as JSON.
 * `command_forms`: the commands of the sensor, as forms of the page.
-* `open_page`: one page that is open: its socket, its requests and what is sent to it.
+* `open_page`: serves one open page: receives its requests, and sends scans and replies.
 * `page_requests`: limits on the requests of one page, and the threads that serve them.
-* `server`: the HTTP server of the page's files, its sockets and saved scans.
-* `access`: the token, host and origin that a request needs.
-* `connections`: limits on the connections to the server.
-* `scan_files`: scans that pages save as files.
+* `server`: the HTTP server, which serves the files of the page, sockets and saved scans.
+* `access`: checks the token, the host and the origin of a request.
+* `connections`: limits the connections to the server.
+* `scan_files`: saves scans as files for pages.
 * `temporary_folder`: the temporary folder of the server.
-* `viewer`: a source in a cell of a notebook, drawn by the code of the page.
+* `viewer`: shows a source in a cell of a notebook, with the code of the page.
 
-The folder `page` has the page and the notebook widget as `make page` builds them from TypeScript.
+The folder `page` contains the page and the notebook widget, which `make page` builds from
+TypeScript.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Access to the page: the token of its link, and the Host and Origin headers.
 
-Each server makes a token, and each request needs it in its query: pages, scripts, downloads,
-socket. Other users of this computer can connect to the server, but do not know the token. It is not
-kept in a cookie: browsers send the cookies of one port to all ports of this computer, so a server
-of another user would receive it. Host and Origin stop other pages in the same browser, including
-pages with a name that was made to point to this computer.
+Each server makes a token. Each request must have the token in its query, whether it is for a page,
+a script, a download or the socket. Other users of this computer can connect to the server, but do
+not know the token. The token is not kept in a cookie, because browsers send the cookies of one port
+to all ports of this computer, so a server of another user would receive it. The checks of the
+headers Host and Origin refuse requests from other pages in the same browser, including pages at a
+name that was made to point to this computer.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-#: Random bytes of a token.
+#: Number of random bytes in a token.
 TOKEN_BYTES = 24
 #: Names of this computer in its own browser.
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
@@ -61,10 +62,10 @@ def make_token() -> str:
 
 
 class Guard:
-    """Passes on the requests of the page itself, and adds security headers.
+    """Passes on requests only if they come from the page, and adds security headers.
 
     Args:
-        app: the application that serves them.
+        app: the application that serves the requests.
         host: address on which the server listens.
         name: the host in the printed link.
         port: port on which the server listens.
@@ -134,8 +135,8 @@ class Guard:
     def _is_own_host(self, host: str) -> bool:
         """Return whether a Host header names this server.
 
-        A server at all interfaces accepts each address, but only its own name: other names can be
-        made to point here.
+        A server that listens on all interfaces accepts any IP address, but only its own name,
+        because other names can be made to point to this computer.
         """
         name, _, port = host.rpartition(":") if host.rpartition("]")[2] else (host, "", "")
         if (port or "80") != str(self._port):
@@ -162,10 +163,10 @@ def add_token(page: str, token: str) -> str:
 
 
 def write_opening_page(folder: Path, link: str) -> Path:
-    """Write a page that leads to the link, readable only by the user; return its path.
+    """Write a page that redirects to the link, and return its path.
 
-    A browser is started with this file: other users see the command lines of all programs, and
-    would find the token of the link there.
+    Only the user can read this page. A browser is started with it, because other users see the
+    command lines of all programs, and would find the token of the link in them.
     """
     path = folder / "open.html"
     address = escape(link)

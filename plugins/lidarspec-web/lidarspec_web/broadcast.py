@@ -1,11 +1,11 @@
-"""A source that is read once and shown to any number of viewers.
+"""Read a source once, and show it to any number of viewers.
 
-One thread reads (`run`); other threads use the newest scan, the figures, and the newest bytes.
-A file is played: it can be paused, moved through, and played at another speed, for all viewers
-together. A live source does not depend on its viewers.
+One thread reads the source (`run`). Other threads use the newest scan, the statistics, and the
+newest bytes. A file is played: it can be paused, read from another position, or played at another
+speed, which affects all viewers. Viewers do not affect a live source.
 
-Requests of other threads (`seek`, `step`, `play`) are only stored; the reading thread carries them
-out at its next turn.
+Other threads only store their requests (`seek`, `step`, `play`). The reading thread performs them
+in the next pass of its loop.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from lidarspec.view.live_scans import DEFAULT_STEP_S, LOOK_S, LiveScans
 from lidarspec_web.recent_bytes import RecentBytes
 from lidarspec_web.scan_message import make_scan_message
 
-#: Duration of the stored figures.
+#: Duration for which statistics are stored.
 HISTORY_S = 60.0
-#: Period between two readings of the figures.
+#: Time between two readings of the statistics.
 FIGURES_PERIOD_S = 1.0
 #: Limits of the speed of a file, relative to real time.
 MIN_SPEED = 0.01
 MAX_SPEED = 100.0
-#: Period between checks of a paused file.
+#: Time between two checks for requests while a file is paused.
 PAUSED_CHECK_S = 0.25
 
 
@@ -43,10 +43,11 @@ class ShownScan:
     """A scan that viewers show.
 
     Attributes:
-        scan: its points.
+        scan: the scan.
         number: number of the shown scan, from 0.
         position: seconds from the first scan of the source.
-        sent: arrival of its last packet, for a file the time when it was shown; seconds since 1970.
+        sent: arrival time of its last packet, or for a file the time when it was shown, seconds
+            since 1970.
     """
 
     def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
@@ -80,21 +81,21 @@ class Broadcast:
     Args:
         source: the source as typed by the user.
         device: an open device.
-        reopen: opens the source again; called to move through a file.
+        reopen: a function that opens the source again; called to seek in a file.
         select: the scans to show; by default all.
         switch: records the source, if it is live.
 
     Attributes:
-        shown: the newest scan; None before the first.
+        shown: the newest scan; None before the first scan.
         backlog: the newest bytes.
         paused: whether a file is paused.
         speed: speed of a file, relative to real time.
         warnings: warnings of the device.
         info: facts about the device, for example its serial number, by name.
-        clock: the sensor's clock in words; "" if the sensor sends no time.
-        history: the figures of the last minute, one dict for each second.
-        failure: the error that ended the reading, None while it continues.
-        news: called in the reading thread if there is anything new.
+        clock: a description of the sensor's clock; "" if the sensor sends no time.
+        history: the statistics of the last minute, one dict for each second.
+        failure: the error that ended the reading; None if there was no error.
+        news: a function that the reading thread calls if there is anything new to show.
     """
 
     def __init__(
@@ -148,9 +149,9 @@ class Broadcast:
 
     @property
     def can_seek(self) -> bool:
-        """Whether the source is a file that can be moved through.
+        """Whether the source is a file that supports seeking.
 
-        This is False if its scans were selected by number.
+        It does not support seeking if its scans are selected by number.
         """
         return not self.is_live and not self._select.is_counted and self.source != "-"
 
@@ -188,11 +189,11 @@ class Broadcast:
         return self._first_scan.host_ns
 
     def now(self) -> float:
-        """Return the time in seconds since 1970, by the clock that stamps arrivals."""
+        """Return the time in seconds since 1970, by the clock for arrival times."""
         return self._clock.now() * 1e-9
 
     def find_scan(self, number: int) -> ShownScan | None:
-        """Return a scan by its number, None if no page holds it."""
+        """Return a scan by its number; None if it is no longer stored."""
         return self._by_number.get(number)
 
     def pause(self) -> None:
@@ -217,7 +218,7 @@ class Broadcast:
         self._has_request.set()
 
     def step(self) -> None:
-        """Show the next scan of a file, and pause there.
+        """Show the next scan of a file, and pause at this scan.
 
         Raises:
             UsageError: if the source is live.
@@ -231,7 +232,7 @@ class Broadcast:
         """Continue a file at a time in seconds from its first scan.
 
         Raises:
-            UsageError: if the source cannot be moved through.
+            UsageError: if the source does not support seeking.
         """
         if not self.can_seek:
             raise UsageError(f"cannot seek in {self.source}")
@@ -253,7 +254,7 @@ class Broadcast:
         """Read until a time of `time.monotonic`, or until `stop`.
 
         Raises:
-            LidarSpecError: if the source fails; `failure` is this error then.
+            LidarSpecError: if the source fails; `failure` is set to this error.
         """
         try:
             while not self._is_stopped and time.monotonic() < until:
@@ -274,7 +275,7 @@ class Broadcast:
         self.device.close()
 
     def _read_or_wait(self) -> None:
-        """Carry out one request, read briefly, or wait briefly."""
+        """Perform one stored request, read for a short time, or wait for a short time."""
         feed = self._feed
         target = self._seek_target
         if target is not None:
@@ -298,7 +299,8 @@ class Broadcast:
     def _read(self, read: Callable[[], None]) -> None:
         """Read from the feed.
 
-        A move beyond the end of a file selects no packets, which is not an error here.
+        If the source was moved beyond the end of a file, no packets are selected, which is not an
+        error.
         """
         try:
             read()
@@ -307,7 +309,7 @@ class Broadcast:
                 raise
 
     def _move(self, target: float) -> None:
-        """Open a file again, and show its first scan from a time on."""
+        """Open a file again, and show the first scan at or after a time."""
         device = self._reopen()
         self.device.close()
         self.device = device
@@ -325,7 +327,7 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Store a new scan, new figures, and the end of a file, and announce changes."""
+        """Store a new scan, new statistics and the end of a file; call `news` on changes."""
         has_news = self._update_scan()
         if self._update_figures():
             has_news = True
@@ -351,7 +353,7 @@ class Broadcast:
         return True
 
     def _update_figures(self) -> bool:
-        """Read the figures once a second, and return whether they were read."""
+        """Read the statistics once a second, and return whether they were read."""
         now = time.monotonic()
         duration_s = now - self._measured_at
         if duration_s < FIGURES_PERIOD_S:
@@ -364,7 +366,7 @@ class Broadcast:
         return True
 
     def _update_end(self) -> bool:
-        """Return whether a file has ended or begun again since the last turn."""
+        """Return whether a file has ended or begun again since the last call."""
         ended = self._feed.ended
         if ended == self._has_ended:
             return False
@@ -406,7 +408,7 @@ class Broadcast:
         return clock.offset_s - samples[0].offset_s
 
     def _arrival(self, scan: Scan) -> float:
-        """Return the arrival of a scan's last packet, seconds since 1970; for a file: now."""
+        """Return the arrival time of a scan's last packet, s since 1970; for a file, now."""
         if self.is_live and len(scan):
             host_ns = scan.provenance(len(scan) - 1).host_ns
             if host_ns:
@@ -414,10 +416,10 @@ class Broadcast:
         return self.now()
 
     def _position(self, scan: Scan) -> float:
-        """Return the seconds from the first scan.
+        """Return the seconds from the first scan to a scan.
 
-        They come from the arrival if the source is live, or from the times of a file's scans.
-        Without times they come from the number of the scan.
+        They are computed from arrival times if the source is live, and from the times of the scans
+        of a file. If a file has no times, they are computed from the number of scans.
         """
         first = self._first_scan
         assert first is not None

@@ -24,9 +24,10 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
 
 
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
-    """Return the commands that stop the data and start it again, as on opening.
+    """Return the commands that stop the data and start it again.
 
-    Returns None if the sensor has none without arguments.
+    The commands for opening are preferred. Returns None if there are no such commands without
+    arguments.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]
@@ -40,7 +41,8 @@ def find_restart(sensor: Sensor) -> dict[str, str] | None:
 def _group(sensor: Sensor, name: str) -> str:
     """Return the group of a command: "switch", "ask" or "set".
 
-    "switch" commands start or stop the data, "ask" commands change nothing.
+    "switch" commands start or stop the data, "ask" commands read a value, and "set" commands change
+    a setting.
     """
     command = sensor.commands[name]
     if command.starts or command.stops:
@@ -51,7 +53,7 @@ def _group(sensor: Sensor, name: str) -> str:
 
 
 def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
-    """Return the input of an argument."""
+    """Return the description of the input field for an argument."""
     kind = sensor.commands[name].arguments[argument].kind
     info = argument_slot(sensor, name, argument).info
     field = {"name": argument, "unit": info.unit, "default": None}

@@ -1,9 +1,9 @@
 """Limits on connections to the server, so that it stays reachable.
 
-A connection waits until one of its requests has the token. It is closed if that takes too long, or
-if there are too many connections and it is the oldest that waits. So idle connections of others
-always make room for a browser, which sends its request at once. Connections with the token are
-closed by their pages, or by the timeouts of the server.
+A connection is pending until one of its requests has the token. A pending connection is closed if
+this takes too long. The oldest pending connection is closed if there are too many connections. Idle
+connections of other users therefore never block a browser, which sends its request at once.
+Connections with the token are closed by their pages, or by the timeouts of the server.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 #: Maximum number of connections, with and without the token.
 MAX_CONNECTIONS = 128
-#: Number of connections that the system accepts before the server does. Each needs a descriptor.
+#: Number of connections that the system accepts for the server in advance. Each of them needs a
+#: file descriptor.
 BACKLOG = 64
-#: Timeout for the token of a connection.
+#: Time after which a connection without the token is closed.
 TOKEN_TIMEOUT_S = 10.0
 CHECK_PERIOD_S = 1.0
 
@@ -29,7 +30,7 @@ Client = tuple[str, int]
 
 @dataclass
 class PendingConnection:
-    """A connection without the token so far."""
+    """A connection that has not sent the token yet."""
 
     transport: asyncio.Transport
     since: float = field(default_factory=time.monotonic)
@@ -39,7 +40,8 @@ class Connections:
     """The connections of a server. All methods run in its event loop.
 
     Args:
-        report: called once with a line if connections had to be closed for others.
+        report: called once, with a line of text, if connections had to be closed because there were
+            too many.
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:
@@ -49,7 +51,7 @@ class Connections:
         self._admitted: dict[Client, asyncio.Transport] = {}
 
     def protocol_class(self) -> type[asyncio.Protocol]:
-        """Return the protocol with which uvicorn serves a connection."""
+        """Return the protocol class with which uvicorn serves a connection."""
         connections = self
 
         class LimitedProtocol(H11Protocol):
@@ -65,7 +67,7 @@ class Connections:
         return LimitedProtocol
 
     def admit(self, client: Client | None) -> None:
-        """Mark a connection as having the token; None means that it is already closed."""
+        """Record that the connection of a client has sent the token; ignore None."""
         if client in self._waiting:
             self._admitted[client] = self._waiting.pop(client).transport
 
@@ -136,7 +138,7 @@ class Connections:
 
 
 class ErrorReporter:
-    """Reports errors of the event loop, each kind once and in one line.
+    """Reports errors of the event loop: each kind of error once, in one line.
 
     Args:
         report: called with the line.
@@ -147,7 +149,7 @@ class ErrorReporter:
         self._reported: set[str] = set()
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Report the error of a context, as `loop.set_exception_handler` calls it."""
+        """Report an error; the signature is that of a handler of `set_exception_handler`."""
         text = str(context.get("message"))
         if text in self._reported:
             return

@@ -1,11 +1,13 @@
 """One open page: its requests, and the messages to it.
 
-A page asks for each scan after it has drawn the previous one, and gets the newest. So a slow or
-hidden page costs nothing, and no page falls behind. Requests are JSON objects with the name of the
-handler in `do`; slow requests run in threads (`page_requests`). Between scans the page is sent
-replies, the state of the source twice a second and, while its bytes are shown, the newest frame.
+A page requests each scan after it has drawn the previous scan, and receives the newest scan. A slow
+or hidden page therefore causes little work, and no page shows old data. Requests are JSON objects;
+the entry `do` is the name of the handler. Slow requests run in threads (`page_requests`). Between
+scans, the page is sent replies and, twice a second, the state of the source. While the page shows
+bytes, it is also sent the newest frame.
 
-A live source continues while a page is paused: the page keeps the bytes of that time (`_frozen`).
+While a page is paused, a live source continues. A copy of the bytes at the time of the pause is
+kept for this page (`_frozen`).
 """
 
 from __future__ import annotations
@@ -37,20 +39,21 @@ from lidarspec_web.recent_bytes import RecentBytes
 
 #: Number of unsent replies above which no further request is read.
 MAX_REPLIES = 16
-#: Period between checks of a page with too many requests.
+#: Time between two checks of whether a page with too many requests can be served.
 BUSY_CHECK_S = 0.05
 STATE_PERIOD_S = 0.5
 FRAME_PERIOD_S = 0.5
-#: Timeout after which a page that does not read is disconnected.
+#: A page that does not read a message within this time is disconnected.
 SEND_TIMEOUT_S = 20.0
-#: Maximum wait for a first scan before the page gets its first message.
+#: Maximum time that the first message to a page waits for a first scan.
 GREETING_TIMEOUT_S = 3.0
 GREETING_CHECK_S = 0.05
-#: Codes with which browsers close a socket.
+#: The codes with which browsers close a socket.
 CLOSE_CODES = (1000, 1001, 1012)
 #: Maximum number of points that a page may request.
 MAX_POINTS = 1 << 24
-#: Number of scans that a page may ask about: the drawn scan, and the scan that is being sent.
+#: Number of scans whose points a page may ask about: the drawn scan, and the scan that is being
+#: sent.
 HELD_SCANS = 2
 #: The largest number in a request.
 MAX_NUMBER = 1e12
@@ -87,7 +90,7 @@ class OpenPage:
         self._frame_due = math.inf
 
     async def serve(self) -> str:
-        """Serve the page until it is closed, and return the reason of its end."""
+        """Serve the page until it is closed, and return the reason why it was closed."""
         await self._socket.accept()
         works = (
             self._receive_requests(),
@@ -105,7 +108,7 @@ class OpenPage:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def notify(self) -> None:
-        """Check for messages to the page."""
+        """Make `serve` check for new messages to the page."""
         self._has_news.set()
 
     # Messages to the page.
@@ -154,7 +157,7 @@ class OpenPage:
             await self._socket.send_text(json.dumps(message, allow_nan=False))
 
     async def _next_message(self) -> bytes | dict[str, Any] | None:
-        """Return the message to send now, or None."""
+        """Return the message to send next; None if there is none."""
         if self._replies:
             return self._replies.popleft()
         return (
@@ -217,7 +220,7 @@ class OpenPage:
         return state
 
     def _recording(self) -> tuple[str, str]:
-        """Return the name of the file being written, and the error of the last one."""
+        """Return the name of the file that is being recorded, and the last error."""
         switch = self._broadcast.switch
         if switch is None:
             return "", ""
@@ -225,7 +228,7 @@ class OpenPage:
         return current[0] if current is not None else "", switch.trouble
 
     def _unseen_scan(self) -> ShownScan | None:
-        """Return the newest scan, None if the page has it or is paused."""
+        """Return the newest scan; None if the page has it already, or is paused."""
         shown = self._broadcast.shown
         if shown is None or self._frozen is not None:
             return None
@@ -258,7 +261,7 @@ class OpenPage:
         return len(self._replies) > MAX_REPLIES or self._questions.is_full or self._commands.is_full
 
     def _handle(self, text: str) -> None:
-        """Handle a request, or refuse it with the reason."""
+        """Handle a request, or reply with the reason why it is refused."""
         word = ""
         try:
             request = json.loads(text)
@@ -402,7 +405,7 @@ class OpenPage:
 
 
 def describe_bug(error: Exception) -> str:
-    """Return the message for an exception that is a bug."""
+    """Return the message for an exception that only a bug can cause."""
     return f"a bug in lidarspec: {type(error).__name__}: {error}"
 
 
@@ -410,7 +413,7 @@ def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> f
     """Return a number of a request.
 
     Raises:
-        UsageError: if it is no number, or out of range.
+        UsageError: if the value is not a number, or out of range.
     """
     value = request.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -422,7 +425,7 @@ def _command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """Return the name of a command, and its non-empty arguments as text.
 
     Raises:
-        UsageError: if they are of another type.
+        UsageError: if the request has no such values.
     """
     name = request.get("command")
     arguments = request.get("arguments", {})

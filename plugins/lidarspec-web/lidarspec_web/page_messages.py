@@ -1,7 +1,7 @@
-"""The messages to a page, as dicts for JSON; `is` names the kind of each.
+"""The messages to a page, as dicts for JSON.
 
-Scans are binary messages (`scan_message`). `page/src/protocol.ts` declares the same messages for
-the page.
+The entry `is` of a message is its kind. Scans are sent as binary messages (`scan_message`).
+`page/src/protocol.ts` declares the same messages for the page.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PageMessages:
 
     Attributes:
         duration: duration of a file, in seconds; None if it is unknown.
-        why_no_control: the reason why no commands are sent; "" if they are.
+        why_no_control: the reason why commands cannot be sent; "" if they can.
     """
 
     def __init__(self, broadcast: Broadcast, *, control: bool) -> None:
@@ -74,8 +74,8 @@ class PageMessages:
 
         Args:
             frozen: whether the page has paused a live source.
-            since: the number of damaged pieces that the page knows.
-            at: the scan that the page is paused at; by default the newest.
+            since: the number of damaged pieces that the page has received so far.
+            at: the scan at which the page is paused; by default the newest scan.
         """
         broadcast = self.broadcast
         switch = broadcast.switch
@@ -115,8 +115,9 @@ class PageMessages:
 
         Args:
             stored: the frame.
-            why: the reason why it is shown: "last", "number" or "point".
-            point_origin: origin of the point that the page asked for.
+            why: the reason why the frame is shown: "last", "number" or "point".
+            point_origin: the origin of the point that the page has requested; None for a frame that
+                was not requested by a point.
         """
         explanation = self._explain(stored.frame, stored.data)
         value = None
@@ -142,7 +143,7 @@ class PageMessages:
     def origin(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
-        """Return the frame that a point of a scan came from, with the path of its field."""
+        """Return the frame that contained a point of a scan, with the path of its field."""
         if shown is None or index >= len(shown.scan):
             return _discarded_reply(f"point {index} of scan {number}")
         point_origin = shown.scan.provenance(index)
@@ -184,7 +185,7 @@ class PageMessages:
         return {"is": "composed", "command": name, "hex": data.hex(), "explanation": explanation}
 
     def send_command(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
-        """Send a command, and return the reply in words.
+        """Send a command, and return the reply as text.
 
         Raises:
             UsageError: if commands are not sent, or an argument is missing or invalid.
@@ -209,14 +210,14 @@ class PageMessages:
         return piece.verdict(self.broadcast.device.sensor)
 
     def _position(self, at: int) -> float | None:
-        """Return the seconds from the first scan to an arrival (ns since 1970)."""
+        """Return the seconds from the first scan to an arrival time, ns since 1970."""
         began_ns = self.broadcast.began_ns
         if at <= 0 or not began_ns:
             return None
         return (at - began_ns) * 1e-9
 
     def _list_damaged(self, since: int) -> list[dict[str, Any]]:
-        """Return the newest damaged pieces, from a number on."""
+        """Return the newest damaged pieces whose number is at least `since`."""
         backlog = self.broadcast.backlog
         return [
             {
@@ -257,7 +258,7 @@ def _is_planar(shown: ShownScan | None) -> bool:
 
 
 def _duration(broadcast: Broadcast) -> float | None:
-    """Return the duration of a file in seconds, None if finding it would take long."""
+    """Return the duration of a file in seconds; None if it cannot be found quickly."""
     if not broadcast.can_seek:
         return None
     try:
@@ -267,7 +268,7 @@ def _duration(broadcast: Broadcast) -> float | None:
 
 
 def _describe_no_control(broadcast: Broadcast, *, control: bool) -> str:
-    """Return the reason why no commands are sent, "" if they are."""
+    """Return the reason why commands cannot be sent; "" if they can."""
     sensor = broadcast.device.sensor
     if not sensor.commands:
         return f"{sensor.id} has no commands"

@@ -1,8 +1,8 @@
 """The requests of one page: their rate limit, and the threads for slow requests.
 
-A page that sends requests without end delays itself: the server reads its next message later. The
-slow requests of a page run in threads one after another, so that no page has more than its share of
-the threads.
+If a page sends too many requests, only this page is delayed: the server waits before it reads the
+next message of the page. The slow requests of a page run in threads, one after another, so that no
+page uses more than its share of the threads.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-#: Number of messages of a page that are read at once, and in each second.
+#: Number of messages of a page that are read without a delay after a pause; the next constant is
+#: the number of messages per second.
 MESSAGES_AT_ONCE = 100
 MESSAGES_PER_S = 100.0
 #: Number of waiting requests above which no message of the page is read.
@@ -40,10 +41,10 @@ class Workers:
 
 
 class RateLimit:
-    """The delay of messages that arrive faster than allowed.
+    """Calculates how long to delay messages that arrive faster than allowed.
 
     Args:
-        at_once: number of messages without a delay after a pause.
+        at_once: number of messages that are not delayed after a pause.
         per_second: number of messages per second.
     """
 
@@ -64,8 +65,8 @@ class PageRequest:
 
     Attributes:
         word: the name of the request.
-        command: the command of the sensor that it concerns, "" for none.
-        work: returns the reply, None for none.
+        command: the command of the sensor that the request concerns; "" if there is none.
+        work: a function that handles the request. It returns the reply; None for no reply.
     """
 
     word: str
@@ -92,7 +93,7 @@ class RequestQueue:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further request should be added for now."""
+        """Whether the queue is full, so that no request should be added."""
         return self._requests.qsize() >= MAX_WAITING
 
     def add(self, request: PageRequest) -> None:

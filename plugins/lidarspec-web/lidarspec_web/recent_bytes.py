@@ -1,9 +1,9 @@
-"""The newest bytes of a source: frames by number and offset, and damaged bytes.
+"""Stores the newest bytes of a source: its frames, and damaged bytes.
 
-A decoder passes the backlog its input and the frames that it found (`DecoderObserver`). Both are
-stored unchanged, up to a limit, so that reading is not slowed down; a frame is cut out on request.
-Bytes that the decoder skipped are cut out at once, because their input is dropped soon: they are
-explained when a page asks for them.
+A decoder passes its input, and the frames that it has found, to `RecentBytes` (a
+`DecoderObserver`). Both are stored unchanged, up to a limit, so that reading is not slowed down.
+The bytes of a frame are copied only on request. Bytes that the decoder has skipped are copied at
+once, because their input is soon dropped. They are explained when a page requests it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lidarspec.explaining.input_segments import InputPiece, explain_piece
 from lidarspec.framing.results import Frames, Numbers, to_array
 from lidarspec.scans.provenance import PointOrigin
 
-#: Maximum bytes of stored input.
+#: Maximum number of bytes of stored input.
 MAX_INPUT_BYTES = 1 << 23
 #: Maximum number of stored results of the decoder.
 MAX_RESULTS = 1024
@@ -36,15 +36,15 @@ MAX_DAMAGED_BYTES = 1 << 13
 
 @dataclass(frozen=True)
 class DamagedBytes:
-    """Bytes in no frame: a damaged frame, or other bytes.
+    """Bytes outside valid frames: a damaged frame, or other bytes.
 
     Attributes:
         number: number of the damaged piece, from 0.
         offset: offset in the input.
-        size: in bytes.
-        at: arrival of the frame after them, ns since 1970; -1 if it is unknown.
-        data: the bytes, or the first of them.
-        datagram: whether they are one whole datagram.
+        size: number of bytes.
+        at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
+        data: the bytes; if there are too many, only the first.
+        datagram: whether the bytes are one whole datagram.
     """
 
     number: int
@@ -70,7 +70,7 @@ class StoredFrame:
     """One frame of the backlog.
 
     Attributes:
-        number: number of the frame, from 0; None if only its scan holds the frame.
+        number: number of the frame, from 0; None if the frame is only stored in its scan.
         frame: its type.
         at: arrival, ns since 1970; -1 if it is unknown.
         data: its bytes.
@@ -88,8 +88,9 @@ class _DecoderInput:
 
     Attributes:
         offset: offset of its first byte in the whole input.
-        buffer: contains its bytes, and maybe others.
-        starts: offset of each part in the buffer: one for a stream, one for each datagram.
+        buffer: an array that contains its bytes, and may contain others.
+        starts: the offset of each part in the buffer. A stream has one part; otherwise, each
+            datagram is a part.
         sizes: sizes of the parts, in bytes.
     """
 
@@ -105,7 +106,7 @@ class _DecoderInput:
 
 @dataclass(frozen=True)
 class _Result:
-    """Frames from one input of the decoder, and the number of the first."""
+    """The frames in one input of the decoder, and the number of the first frame."""
 
     first_number: int
     frames: Frames
@@ -199,7 +200,7 @@ class RecentBytes:
         return self._frame_count - 1
 
     def frame(self, number: int) -> StoredFrame | None:
-        """Return a frame by its number, None if it is no longer stored."""
+        """Return a frame by its number; None if it is no longer stored."""
         with self._lock:
             following = bisect_right(self._results, number, key=lambda one: one.first_number)
             result = self._results[following - 1] if following else None
@@ -208,9 +209,10 @@ class RecentBytes:
         return result.take(number - result.first_number)
 
     def find_point_frame(self, point_origin: PointOrigin) -> StoredFrame | None:
-        """Return the frame that a point came from.
+        """Return the frame that contained a point.
 
-        Returns None if it is no longer stored and the scan does not have its original bytes.
+        Returns None if the frame is no longer stored, and the scan does not have its original bytes
+        either.
         """
         with self._lock:
             following = bisect_right(self._results, point_origin.offset, key=lambda one: one.offset)
@@ -225,16 +227,16 @@ class RecentBytes:
         return StoredFrame(None, point_origin.frame, point_origin.host_ns or -1, point_origin.data)
 
     def find_damaged(self, number: int) -> DamagedBytes | None:
-        """Return a damaged piece by its number, None if it is no longer stored."""
+        """Return a damaged piece by its number; None if it is no longer stored."""
         return next((piece for piece in self.list_damaged(number) if piece.number == number), None)
 
     def list_damaged(self, number: int) -> list[DamagedBytes]:
-        """Return the stored damaged pieces from a number on."""
+        """Return the stored damaged pieces whose number is at least `number`."""
         with self._lock:
             return [piece for piece in self._damaged if piece.number >= number]
 
     def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
-        """Return one explanation of a damaged piece, as `Explanation.to_dict`.
+        """Return the explanation of a damaged piece, as `Explanation.to_dict` returns it.
 
         It has the rows of each damaged frame in the piece, with the change that would explain the
         damage, and the rows of the bytes between these frames.

@@ -1,7 +1,8 @@
-"""Save scans: a thread writes them to temporary files, which are then sent.
+"""Save scans as files: a thread writes temporary files, which are then sent.
 
-Only a few scans are saved at a time, so that saving takes little time from open pages, and little
-space on the disk. A file is removed after it was sent, or if its client does not read it.
+Only a few scans are saved at a time, so that saving takes little processor time from open pages,
+and little space on the disk. A file is removed after it was sent, or if the client does not read
+it.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class ScanSaver:
             path.unlink()
 
     async def _write(self, path: Path, shown: ShownScan) -> None:
-        """Write a scan after the previous one and a pause of the same duration for pages."""
+        """Write a scan, after the previous one and an equally long pause for open pages."""
         loop = asyncio.get_running_loop()
         async with self._writing:
             await asyncio.sleep(self._rests_until - time.monotonic())
@@ -115,7 +116,7 @@ class _SavedScan(Response):
 
 
 def write_file(path: Path, shown: ShownScan) -> None:
-    """Write a scan to a file, by its suffix."""
+    """Write a scan to a file, in the format of the file's suffix."""
     if path.suffix == ".svg":
         points = shown.scan.points
         text = svg(
@@ -132,7 +133,7 @@ async def _send_file(path: Path, name: str, send: Send) -> None:
     """Send a file as a download.
 
     Raises:
-        TimeoutError: if the client does not read it.
+        TimeoutError: if the client does not read the file.
     """
     headers = {
         "content-type": "application/octet-stream",

@@ -1,12 +1,12 @@
 """A scan as the binary message that a page draws.
 
-The message is, in this order:
+The message consists of, in this order:
 
 1. the length of the header, 4 bytes, little-endian;
-2. the header, JSON, with spaces up to the next multiple of 8 bytes of the message;
-3. each column that the header names, as in memory, with zeros up to the next multiple of 8 bytes.
+2. the header in JSON, padded with spaces so that the message so far is a multiple of 8 bytes;
+3. each column that the header names, as in memory, padded with zeros to a multiple of 8 bytes.
 
-So the page uses its typed arrays on the received bytes without a copy.
+Because of the padding, the page can use typed arrays on the received bytes without copying them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lidarspec import PointCloud, Scan
 from lidarspec.points.conventions import UNITS
 
-#: Header and columns begin at a multiple of this in the message.
+#: Each column begins at a multiple of this size in the message.
 ALIGNMENT_BYTES = 8
 #: The columns in a message; intensity and ring only if the sensor has them.
 COLUMNS = ("x", "y", "z", "range", "intensity", "ring")
@@ -39,11 +39,11 @@ def make_scan_message(
 
     Args:
         scan: the scan.
-        number: number of the scan, by which the page asks for the frame of a point.
-        position: position of its first point, seconds since the first packet of the source.
-        sent: arrival of its last packet, seconds since 1970 by this computer's clock.
-        max_points: maximum number of points; if there are more, an even selection is sent, always
-            the same.
+        number: number of the scan; the page uses it to request the frame of a point.
+        position: time of the first point, seconds since the first packet of the source.
+        sent: arrival time of the last packet, seconds since 1970 by this computer's clock.
+        max_points: maximum number of points. If there are more, an evenly distributed selection is
+            sent, which is always the same.
     """
     points = scan.points
     points.load(*COLUMNS, "valid")
@@ -75,13 +75,13 @@ def make_scan_message(
 
 
 def thin_out(indices: NDArray[np.intp], max_points: int) -> NDArray[np.intp]:
-    """Return an even selection of at most `max_points` indices, in their order."""
+    """Return an evenly distributed selection of at most `max_points` indices."""
     fractions = np.arange(len(indices)) * _GOLDEN_SECTION % 1
     return indices[fractions < max_points / len(indices)][:max_points]
 
 
 def _padding(size: int) -> int:
-    """Return the bytes from the end of a part to the next multiple of the alignment."""
+    """Return the number of padding bytes after a part of this size."""
     return -size % ALIGNMENT_BYTES
 
 

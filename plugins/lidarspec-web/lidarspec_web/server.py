@@ -1,6 +1,6 @@
 """The HTTP server of the page: its files, a WebSocket for each open page, and saved scans.
 
-One event loop in a separate thread serves all pages of a source. `access` decides which requests
+One event loop in a separate thread serves all pages of a source. `access` determines which requests
 are served, `open_page` serves the sockets, and `scan_files` writes and sends scans.
 """
 
@@ -33,13 +33,13 @@ from lidarspec_web.page_requests import Workers
 from lidarspec_web.scan_files import ScanSaver
 from lidarspec_web.temporary_folder import TemporaryFolder, remove_stale_folders
 
-#: The built page.
+#: The folder of the built page.
 PAGE = Path(__file__).parent / "page"
 MAX_PAGES = 64
 #: The longest request of a page.
 MAX_REQUEST_BYTES = 1 << 16
 PING_PERIOD_S = 10.0
-#: Shutdown timeout for open pages.
+#: Maximum time that open pages have to close when the server ends.
 SHUTDOWN_TIMEOUT_S = 1
 #: Maximum number of digits of a scan's number.
 MAX_NUMBER_DIGITS = 12
@@ -60,7 +60,7 @@ class PageSite:
         link: the URL of the page, with its token.
 
     Raises:
-        SourceError: if the server cannot listen there.
+        SourceError: if the server cannot listen on this address and port.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class PageSite:
         return HTMLResponse(add_token(text, self._token))
 
     async def _serve_page(self, socket: WebSocket) -> None:
-        """Serve one page, from its opening until it is closed."""
+        """Serve one page until it is closed."""
         if len(self._open_pages) >= MAX_PAGES:
             await socket.close()
             return

@@ -83,20 +83,20 @@ class SourceServer:
 
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
-        """Path of each recording of the pages, and the number of received bytes in it."""
+        """(path, number of received bytes) of each recording that was made from a page."""
         if self.switch is None:
             return ()
         return self.switch.written
 
     @property
     def trouble(self) -> str:
-        """The error of the last recording, "" if there was none."""
+        """The error of the last recording; "" if there was none."""
         if self.switch is None:
             return ""
         return self.switch.trouble
 
     def opening_page(self) -> str:
-        """Return the URL of a file that leads to the link, to start a browser with.
+        """Return the URL of a file that redirects to the link, for starting a browser.
 
         Raises:
             OSError: if it cannot be written.
@@ -104,7 +104,7 @@ class SourceServer:
         return self.site.opening_page()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Read the source for some time; None: until `broadcast.stop`, or an interrupt.
+        """Read the source for `duration_s`; None to read until `broadcast.stop`.
 
         Raises:
             LidarSpecError: if the source fails.

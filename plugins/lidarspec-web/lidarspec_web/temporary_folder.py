@@ -1,8 +1,8 @@
 """The temporary folder of a server; after a crash, the next server removes it.
 
 Each server locks its folder. The system releases the lock when the process ends for any reason, so
-a folder that can be locked no longer belongs to a server. On systems without file locks (Windows) a
-folder is removed by its own server only.
+a folder that can be locked no longer belongs to a server. On systems without file locks (Windows),
+a folder is removed only by its own server.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """A source in a cell of a notebook, drawn by the code of the page.
 
-A thread reads the source. The cell asks for each scan after it has drawn the previous one (`next`),
-as a page does, and sends `hello` when it is shown. `page_messages` makes the messages to it.
+A thread reads the source. The cell works like a page: it sends `hello` when it is shown, and
+requests each scan by `next` after it has drawn the previous scan. `page_messages` makes the
+messages to the cell.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lidarspec.view.live_scans import LOOK_S
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.page_messages import PageMessages
 
-#: The built widget.
+#: The file of the built widget.
 SCRIPT = Path(__file__).parent / "page" / "widget.js"
 HEIGHT_PIXELS = 420
 STATE_PERIOD_S = 0.5
@@ -35,7 +36,7 @@ class Viewer:
 
     Args:
         source: port, socket, file or ``sim:`` URL.
-        sensor: by default the detected one.
+        sensor: the sensor, or its id; by default it is detected.
         select: the scans to show; by default all.
         height: height of the picture, in pixels.
 
@@ -82,7 +83,7 @@ class Viewer:
 
     @property
     def failure(self) -> str:
-        """The reason why the source cannot be read, and the next step; "" if it can."""
+        """The reason why the source cannot be read, and what to do next; "" if it can."""
         return self._failure
 
     def close(self) -> None:
@@ -97,7 +98,7 @@ class Viewer:
         return self._widget._repr_mimebundle_()
 
     def _read(self) -> None:
-        """Read the source until it ends, and send the reason to the cell."""
+        """Read the source until it ends, and send the reason of its end to the cell."""
         try:
             self._show_source()
         except LidarSpecError as error:
@@ -116,7 +117,7 @@ class Viewer:
                 broadcast.run(math.inf)
 
     def _handle(self, message: Mapping[str, Any]) -> None:
-        """Handle a message of the cell."""
+        """Handle a message from the cell."""
         word = message.get("do")
         broadcast = self._broadcast
         if word == "next":
@@ -142,7 +143,7 @@ class Viewer:
                 self._send({"is": "ended", "text": self._ending})
 
     def _send_scan(self, broadcast: Broadcast, answers: PageMessages) -> None:
-        """Send the newest scan, after hello and state if they are due."""
+        """Send the newest scan; before it, send `hello` and the state if they are due."""
         shown = broadcast.shown
         if shown is None:
             return
