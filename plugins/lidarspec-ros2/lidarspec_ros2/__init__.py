@@ -3,15 +3,15 @@
 The driver is a lifecycle node that reads a `Device`, as every verb does. ROS is imported when the
 node starts, not earlier. Modules in reading order:
 
-* `command`: the verb and the executable; the search for ROS.
-* `parameters`: the table of parameters, and the values of one configuration.
-* `ros_arguments`: the parameters on the command line, before the node exists.
-* `shared_memory`: the shared memory of Fast DDS, large enough for the clouds of the sensor.
-* `node`: the lifecycle, services, and the thread that reads.
-* `topics`: the published messages.
-* `packets`: packets as a topic, and as a source.
+* `command`: the verb and the executable, which find and import ROS.
+* `parameters`: the table of parameters, and their values in one configuration.
+* `ros_arguments`: reads the parameters on the command line before the node exists.
+* `shared_memory`: enlarges the shared memory of Fast DDS for the clouds of the sensor.
+* `node`: the lifecycle node, its services, and the thread that reads the sensor.
+* `topics`: publishes messages.
+* `packets`: publishes packets on a topic, and reads packets from a topic.
 * `diagnostics`: the state of the sensor for /diagnostics.
-* `clock`: stamps in ROS's time, and the sensor's clock converted to the host's.
+* `clock`: stamps in ROS's time, and the conversion of the sensor's clock to the host's clock.
 """
 
 from __future__ import annotations

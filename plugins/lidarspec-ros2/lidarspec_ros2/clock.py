@@ -1,4 +1,4 @@
-"""The stamps of messages in ROS's time, by the sensor's clock or by arrival times."""
+"""The stamps of messages, in ROS's time, from the sensor's clock or arrival times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Times = NDArray[np.int64]
 
 
 def describe_jump(clock: DeviceClock) -> str:
-    """Return a warning about a change of the sensor's clock, "" if there was none lately."""
+    """Return a warning about a recent change of the sensor's clock; "" without one."""
     if clock.jump is None:
         return ""
     return f"the sensor's clock was changed by {clock.jump.change_ns / 1e9:+.3f} s"
@@ -23,8 +23,9 @@ class MessageStamps:
     """The stamps of one sensor's messages, in ROS's time.
 
     Args:
-        wall: the clock of the computer, for a live sensor. Arrival times continue evenly if that
-            clock is set, but ROS's time jumps. None if a recording is played.
+        wall: the host's clock, for a live sensor; None if a recording is played. If the computer's
+            clock is set, ROS's time jumps, but arrival times continue evenly. This clock shows the
+            difference.
 
     Attributes:
         clock: converts the sensor's clock to the host's.
@@ -36,7 +37,7 @@ class MessageStamps:
         self._wall_step_ns = 0
 
     def learn(self, device_ns: Times, host_ns: Times) -> None:
-        """Update the conversion with packets, and note a step of the computer's clock.
+        """Update the conversion with packets, and record a step of the computer's clock.
 
         Args:
             device_ns, host_ns: as for `DeviceClock.observe`; packets with an unknown arrival
@@ -51,7 +52,7 @@ class MessageStamps:
     def stamp_scan(self, device_ns: int, host_ns: int, settings: Settings) -> int:
         """Return the stamp of the next scan, ns.
 
-        It follows from the sensor's time and the arrival time of the first point.
+        The stamp is calculated from the sensor's time and the arrival time of the first point.
         """
         return self._choose_stamp(
             device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings
@@ -61,8 +62,8 @@ class MessageStamps:
         """Return the stamp of an IMU sample, ns.
 
         Args:
-            time_ns: its time, by the sensor's clock or the host's.
-            by_clock: whether the time is by the sensor's clock; otherwise it is the arrival time.
+            time_ns: the time of the sample, by the sensor's clock or by the host's clock.
+            by_clock: whether `time_ns` is by the sensor's clock; otherwise it is the arrival time.
         """
         host_ns = time_ns
         if by_clock:

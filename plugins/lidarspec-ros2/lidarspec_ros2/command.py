@@ -1,7 +1,7 @@
 """The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a separate process.
 
-If there are several ROS installations, the node uses the one that Python imports: a sourced
-installation is in PYTHONPATH, before the wheels of the extra `ros2`.
+If there are several ROS installations, the node uses the installation that Python imports. A
+sourced installation is in PYTHONPATH, and is therefore found before the wheels of the extra `ros2`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def import_ros() -> None:
     """Import ROS, to check that it is installed.
 
     Raises:
-        UsageError: if it is not, with the ways to install it.
+        UsageError: if ROS is not installed; the message explains how to install it.
     """
     try:
         importlib.import_module("rclpy")
@@ -101,7 +101,7 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
     Args:
         given: parameters, by name.
-        ros_args: the words of the command line for ROS.
+        ros_args: the words of the command line that are for ROS.
 
     Raises:
         LidarSpecError: if ROS is missing, a parameter is invalid, or the sensor cannot be read.
@@ -117,7 +117,7 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
     nodes = list[LidarNode]()
 
     def handle_signal(number: int, frame: object) -> None:
-        """Note the signal, and interrupt only a node that waits for a sensor."""
+        """Record the signal; interrupt the node only while it waits for a sensor."""
         signals.append(number)
         if any(node.opening for node in nodes):
             raise KeyboardInterrupt
@@ -174,10 +174,10 @@ def _log_shared_memory(node: LidarNode, memory: SharedMemory) -> None:
 
 
 def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
-    """Serve until the node ends or a signal arrives, then close the node.
+    """Run the node until it ends or a signal arrives, and then close it.
 
     Raises:
-        Exception: the node's failure, if it starts automatically.
+        Exception: the failure of the node, if the node starts automatically.
     """
     serving = threading.Thread(target=executor.spin, name="executor")
     try:

@@ -10,7 +10,7 @@ from lidarspec.cli.read import FIGURES
 from lidarspec.device.device import Device
 from lidarspec.view.rate_meter import MeterReading
 
-#: States of a device that sends nothing.
+#: The states of a device that sends nothing.
 LOST_STATES = ("disconnected", "silent")
 
 
@@ -25,7 +25,7 @@ def make_status(
 
     Args:
         name: the name of the node.
-        reading: the figures of the last second.
+        reading: the statistics of the last second.
         device_warnings: warnings in addition to those of the device.
         more: further values.
     """

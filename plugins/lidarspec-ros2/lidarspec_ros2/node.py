@@ -1,8 +1,9 @@
-"""The lifecycle node: it opens the sensor on configure, publishes while active, closes on cleanup.
+"""The lifecycle node.
 
-One thread reads the device and publishes messages. The executor's thread serves transitions,
-parameters and commands. On request of the reading thread it also publishes diagnostics once a
-second, and deactivates the node while the sensor is gone.
+The node opens the sensor on configure, publishes while it is active, and closes the sensor on
+cleanup. One thread reads the device and publishes messages. The executor's thread serves
+transitions, parameters and commands. At the request of the reading thread, it also publishes
+diagnostics once a second, and deactivates the node while the sensor is disconnected.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ class LidarNode(LifecycleNode):
     """A sensor as a node.
 
     Args:
-        given: parameters that precede those of the command line and of files.
+        given: parameters that have priority over parameters of the command line and of files.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
-        failure: why the node could not be configured, or the sensor can no longer be read; None
-            without failure.
-        ended: set when the node will do nothing more by itself.
-        opening: whether it waits for a sensor to be found, and to reply.
+        failure: the error that prevented the configuration, or that ended reading; None without an
+            error.
+        ended: an event that is set when the node does nothing more by itself.
+        opening: whether the node waits for the sensor to be found or to reply.
 
     Raises:
         UsageError: if a parameter is invalid.
@@ -234,7 +235,7 @@ class LidarNode(LifecycleNode):
                 topics.publish(scan)
 
     def _check_connection(self, device: Device) -> None:
-        """Deactivate the node while a sensor that has sent data is gone."""
+        """Deactivate the node while a sensor that has sent data is disconnected."""
         is_lost = device.state in LOST_STATES and bool(device.stats.frames)
         if is_lost != self._was_lost and (self._was_lost or self._is_active):
             self._run_in_executor(self._handle_loss if is_lost else self._handle_return)
@@ -299,7 +300,7 @@ class LidarNode(LifecycleNode):
             self.get_logger().error(f"{error}{f'; next: {following}' if following else ''}")
 
     def _apply_parameters(self, parameters: Sequence[RosParameter]) -> SetParametersResult:
-        """Apply parameters that are set at run time, or return why not."""
+        """Apply parameters that are set at run time, or return the reason for a refusal."""
         ours = {
             parameter.name: parameter.value for parameter in parameters if parameter.name in NAMED
         }
@@ -322,14 +323,14 @@ class LidarNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _warn_of_unknown_parameters(self) -> None:
-        """Log the given parameters that this node does not have, which ROS ignores."""
+        """Log parameters that this node does not have, because ROS ignores them silently."""
         for name in self._parameter_overrides:  # rclpy has no public way to list them
             if not self.has_parameter(name) and not name.startswith("qos_overrides."):
                 close = did_you_mean(name, [parameter.name for parameter in PARAMETERS])
                 self.get_logger().warning(f"unknown parameter {name!r} is ignored{close}")
 
     def _create_command_services(self, device: Device) -> None:
-        """Create a service per command, and a parameter per argument of a command.
+        """Create a service for each command, and a parameter for each of its arguments.
 
         The node's own services, for example get_state, keep their names.
         """
@@ -376,7 +377,8 @@ class LidarNode(LifecycleNode):
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
     """Return the time of `time.monotonic` at which to wake for the end of the next scan.
 
-    The time is a little too early. If a scan is late, the result is the normal polling time.
+    The result is slightly before the expected end. If a scan is late, it is the normal polling
+    time.
     """
     now = time.monotonic()
     for scan in feed.scans:

@@ -1,7 +1,7 @@
-"""Packets over a topic: a node publishes received packets, and `ros2:/TOPIC` reads them.
+"""Publish received packets on a topic, and read the packets of a topic.
 
-So a node can decode packets that another node or `ros2 bag play` publishes, with their original
-arrival times.
+The SOURCE `ros2:/TOPIC` reads them. A node can therefore decode packets that another node or `ros2
+bag play` publishes, with their original arrival times.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NODE_NUMBERS = itertools.count()
 
 
 class PacketLog:
-    """A traffic log that publishes received packets instead of recording them.
+    """A `TrafficLog` that publishes received packets instead of recording them.
 
     Attributes:
         publish: the function that publishes a chunk.
@@ -42,14 +42,14 @@ class PacketLog:
             self.publish(chunk)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Ignore an event, which the diagnostics report."""
+        """Ignore an event, because the diagnostics report events."""
 
     def close(self) -> None:
         """Do nothing, because no file is open."""
 
 
 class PacketTransport(LiveTransport):
-    """The packets of a topic, in a separate ROS context.
+    """Reads the packets of a topic, in a separate ROS context.
 
     Args:
         label: the source as the user wrote it.

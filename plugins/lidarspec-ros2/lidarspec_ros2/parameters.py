@@ -1,7 +1,7 @@
-"""The parameters of the node: the table for their declaration, checks and documentation.
+"""The parameters of the node, and a table to declare, check and document them.
 
-`Settings` are the values of one configuration. They are checked by the code of the command line,
-with the same messages.
+`Settings` has the values of the parameters in one configuration. The values are checked by the same
+functions as the options of the command line, and with the same messages.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Parameter:
         default: the default value, which also defines the type.
         text: its description.
         low, high: the limits of a number.
-        live: whether it can be changed while the node is configured; the others are read during
-            configuration.
+        live: whether it can be changed while the node is configured. All other parameters are read
+            only during configuration.
     """
 
     name: str
@@ -220,7 +220,7 @@ PARAMETERS = (
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
 DECODING_PERIOD_S = 0.002  # near the expected end of a scan
-#: The name of the node, unless it is renamed.
+#: The default name of the node.
 NODE_NAME = "lidar"
 QOS_NAMES = ("best_effort", "reliable")
 
@@ -294,13 +294,13 @@ class Settings:
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configured_sensor(self) -> Sensor | None:
-        """Return the sensor of the parameters with its options; None if they name none."""
+        """Return the sensor that the parameters name, with its options; else None."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)
 
     def find_mount(self) -> Mount | None:
-        """Return the mount of the parameters or of `lidarspec.toml`; None if neither."""
+        """Return the mount in the parameters or else in `lidarspec.toml`; None if neither."""
         mount = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
         if mount != Mount():
             return mount
@@ -311,7 +311,8 @@ class Settings:
         """Return the open device.
 
         Args:
-            record: makes the log that publishes packets, if the parameters request it.
+            record: a function that makes the log that publishes packets; used if the parameters
+                request it.
 
         Raises:
             LidarSpecError: as on the command line.

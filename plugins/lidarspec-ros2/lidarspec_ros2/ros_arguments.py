@@ -1,8 +1,9 @@
-"""The parameters in ROS's part of the command line, read before the node exists.
+"""Read the parameters in ROS's part of the command line before the node exists.
 
-rclpy passes parameters to an existing node. Some decisions come earlier: the transports of the
-middleware are set when the first node is created. This module reads the same words and files. It
-ignores everything that it cannot read, because rclpy reads it again and reports invalid values.
+rclpy passes parameters only to an existing node. Some of them are needed earlier, because the
+transports of the middleware are set when the first node is created. This module therefore reads the
+same words and files as rclpy. It ignores everything that it cannot read, because rclpy reads it
+again and reports invalid values.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ _REMAP_OPTIONS = ("-r", "--remap")
 def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
     """Return the parameters that the command line and its files give to a node.
 
-    As in ROS, values of one pattern of node names replace earlier values; patterns apply in the
-    order in which they appear first.
+    As in ROS, a later value for the same pattern of node names replaces an earlier value. The
+    patterns are applied in the order in which they first appear.
 
     Args:
         arguments: the words of the command line; only words after ``--ros-args`` count.
-        node_name: the name of the node, unless the words rename it.
+        node_name: the default name of the node, which the command line can change.
     """
     options = list(itertools.pairwise(_ros_words(arguments)))
     values_by_pattern: dict[str, dict[str, Any]] = {}

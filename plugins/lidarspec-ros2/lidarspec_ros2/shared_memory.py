@@ -1,16 +1,17 @@
-"""The shared memory of Fast DDS, large enough for the clouds of the sensor.
+"""Enlarge the shared memory of Fast DDS for the clouds of the sensor.
 
-Fast DDS passes messages to other processes of the same computer in a segment of shared memory of
-the publisher. It has 512 KiB, unless a profile sets another size. A cloud of megabytes is sent in
-fragments that overwrite each other there, and with best effort most clouds are lost. The node
-brings a profile with a larger segment. Subscribers need no profile.
+Fast DDS passes messages to other processes on the same computer in a segment of shared memory,
+which the publisher owns. The segment has 512 KiB, unless a profile sets another size. A cloud of
+several megabytes is sent in fragments, which overwrite each other in this segment. With best
+effort, most clouds are then lost. The node therefore provides a profile with a larger segment.
+Subscribers need no profile.
 
-Fast DDS reads the profile from a file in an environment variable, once, when the first participant
-of a process is created. `use_profile` sets the variable for that moment only.
+An environment variable names the file with the profile. Fast DDS reads this file once, when the
+first participant of a process is created. `use_profile` sets the variable only for that time.
 
-The profile lists the transports that Fast DDS would use anyway, shared memory and UDP. If discovery
-is limited to this computer, ROS adds its own UDP transport to the profile, which then contains only
-shared memory. If there are two transports of one kind, Fast DDS sends with the first.
+The profile lists the transports that Fast DDS uses by default, shared memory and UDP. If discovery
+is limited to this computer, ROS adds its own UDP transport. The profile then lists only shared
+memory, because Fast DDS sends with the first of two transports of the same kind.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from lidarspec.scans.limits import longest_scan_s
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import frame_simulation, make_opening_frame, simulate
 
-#: The variable that names the file of profiles, of Fast DDS 3 (Kilted and later) and Fast DDS 2.
+#: The environment variable that names the file of profiles, for Fast DDS 3 (Kilted and later). The
+#: next constant is the variable for Fast DDS 2.
 PROFILE_VARIABLE = "FASTDDS_DEFAULT_PROFILES_FILE"
 OLD_PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 #: Variables with which users configure the transports of Fast DDS.
@@ -40,25 +42,28 @@ USER_VARIABLES = (
     "FASTDDS_ENVIRONMENT_FILE",
     "RMW_FASTRTPS_USE_QOS_FROM_XML",
 )
-#: Files that Fast DDS reads from the working directory.
+#: The files of profiles that Fast DDS reads from the working directory.
 USER_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 DEFAULT_SEGMENT_BYTES = 512 * 1024
 MIN_SEGMENT_BYTES = 4_000_000
 SEGMENT_STEP_BYTES = 1_000_000
-#: Minimum clouds that fit into a segment: one is read while the next is written.
+#: Minimum number of clouds that must fit into a segment, because one cloud is read while the next
+#: is written.
 MIN_CLOUDS = 2
-#: Number of single-return clouds for which a new segment has room; FEWER_CLOUDS if memory is short.
-#: With dual return, clouds are larger and the room is for half as many.
+#: Number of single-return clouds that fit into a new segment; FEWER_CLOUDS if memory is short. With
+#: dual return, half as many clouds fit.
 CLOUDS = 8
 FEWER_CLOUDS = 4
-#: The size of clouds if no sensor is named: 78,000 points a scan.
+#: The assumed size of clouds if no sensor is named: 78,000 points a scan.
 ASSUMED_CLOUD_BYTES = 2_500_000
-#: Free shared memory that is needed, in segments: the node may open a second participant.
+#: Amount of free shared memory that is needed, in segments, because the node may open a second
+#: participant.
 FREE_SEGMENTS = 2
 SHARED_MEMORY_DIR = "/dev/shm"
-#: Packets from which the size of a cloud is calculated if the scan rate is declared.
+#: Number of packets from which the size of a cloud is calculated if the scan rate is declared.
 PROBED_PACKETS = 16
-#: Seconds and packets that are simulated to see a scan if no scan rate is declared.
+#: Number of seconds, and maximum number of packets, that are simulated to find a scan if no scan
+#: rate is declared.
 PROBED_S = 0.25
 MAX_PROBED_PACKETS = 1000
 
@@ -68,10 +73,10 @@ class SharedMemory:
     """How the node uses the shared memory of Fast DDS.
 
     Attributes:
-        segment_bytes: size of the segment in the node's profile; 0 if the node brings no profile.
+        segment_bytes: size of the segment in the node's profile; 0 if the node provides no profile.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
-        notice: text for the log about the node's profile; "" if there is none.
-        warning: text for the log about the loss of clouds; "" if they are not lost.
+        notice: a message for the log about the node's profile; "" if there is no profile.
+        warning: a message for the log that clouds may be lost; "" if they will not be lost.
     """
 
     segment_bytes: int = 0
@@ -87,8 +92,8 @@ def choose_shared_memory(
 
     Args:
         rmw: identifier of the middleware, for example rmw_fastrtps_cpp.
-        find_sensor: returns the sensor, or None if it is not known yet. It is called only if the
-            node may bring a profile.
+        find_sensor: a function that returns the sensor, or None if it is not known yet. It is
+            called only if the node may provide a profile.
         is_serial: whether the sensor is on a serial line, which is too slow for large clouds.
     """
     free = free_bytes()
@@ -105,7 +110,7 @@ def choose_shared_memory(
 
 
 def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
-    """Return the shared memory for clouds of this size, None if the size is unknown."""
+    """Return the shared memory for clouds of a size; the size is None if unknown."""
     assumed = ASSUMED_CLOUD_BYTES if cloud_bytes is None else cloud_bytes
     if MIN_CLOUDS * assumed <= DEFAULT_SEGMENT_BYTES:
         return SharedMemory(max_cloud_bytes=DEFAULT_SEGMENT_BYTES // MIN_CLOUDS)
@@ -138,12 +143,12 @@ def _round_segment_bytes(size: int) -> int:
 
 
 def format_megabytes(size: int) -> str:
-    """Return a number of bytes in megabytes, as "2.5 MB"."""
+    """Return a number of bytes as text in megabytes, for example "2.5 MB"."""
     return f"{size / 1e6:.1f} MB".replace(".0 ", " ")
 
 
 def free_bytes() -> int | None:
-    """Return the bytes of free shared memory; None if this system does not show it."""
+    """Return the bytes of free shared memory; None if the system does not report it."""
     try:
         status = os.statvfs(SHARED_MEMORY_DIR)
     except (AttributeError, OSError):
@@ -160,7 +165,7 @@ def has_user_profile() -> bool:
 def profile_variable() -> str:
     """Return the environment variable for the profile of the loaded Fast DDS.
 
-    Later versions of ROS read the variable of Fast DDS 2 too, but warn that it is deprecated.
+    Later versions of ROS also read the variable of Fast DDS 2, but warn that it is deprecated.
     """
     libraries = Path("/proc/self/maps").read_text(encoding="utf-8")
     return OLD_PROFILE_VARIABLE if "libfastrtps.so" in libraries else PROFILE_VARIABLE
@@ -169,7 +174,7 @@ def profile_variable() -> str:
 def largest_cloud_bytes(sensor: Sensor) -> int | None:
     """Return the size of a sensor's largest cloud, from simulated packets.
 
-    It is the cloud of the slowest scan, with single return. None if the specification is
+    It is the cloud of a scan at the lowest speed with single return. Returns None if the spec is
     incomplete.
 
     Raises:
@@ -201,7 +206,7 @@ def make_profile(segment_bytes: int, environment: Mapping[str, str]) -> str:
 
     Args:
         segment_bytes: size of the segment of shared memory.
-        environment: variables, which may limit discovery to this computer.
+        environment: the environment variables, which may limit discovery to this computer.
     """
     udp = "" if _is_local(environment) else "<transport_id>udp</transport_id>"
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -239,8 +244,8 @@ def _is_local(environment: Mapping[str, str]) -> bool:
 def use_profile(memory: SharedMemory) -> Iterator[None]:
     """Make Fast DDS read the profile when it creates its first participant.
 
-    That has to happen within the context. Neither the file nor the environment variable remains
-    afterwards.
+    The participant has to be created within the context. At the end of the context, the file and
+    the environment variable are removed.
     """
     if not memory.segment_bytes:
         yield

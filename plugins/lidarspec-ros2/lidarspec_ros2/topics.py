@@ -1,6 +1,6 @@
-"""The topics of a sensor.
+"""Publish the messages of a sensor on its topics.
 
-Messages are published as bytes, in the encoding of log files.
+Messages are published as bytes, in the same encoding as in log files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ TOPICS = {
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
-#: Settings that users can change with ROS's `qos_overrides./scan.publisher.depth` and similar.
+#: QoS settings that users can change with parameters such as `qos_overrides./scan.publisher.depth`.
 _QOS_OVERRIDES = QoSOverridingOptions.with_default_policies()
 
 
@@ -61,9 +61,9 @@ class Topics:
 
     Attributes:
         stamps: the times of messages.
-        sent: how many messages were published, by topic.
+        sent: the number of published messages, by topic.
         active: whether messages are published.
-        fault: why the requested planar scan cannot be made, "" if it can.
+        fault: the reason why the requested planar scan cannot be made; "" if it can.
         latency_s: seconds from the arrival of the last packets of a scan to its publication.
 
     Raises:
@@ -186,7 +186,7 @@ class Topics:
     def _publisher(self, kind: str) -> Any:
         """Return the publisher of a kind of messages, created on first use.
 
-        So `scan` has a publisher only after the first planar scan.
+        The topic `scan` therefore has a publisher only after the first planar scan.
         """
         if kind not in self._publishers:
             topic, message, depth = TOPICS[kind]
@@ -248,7 +248,7 @@ class Topics:
 
 
 def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
-    """Return the transform from the frame of the carrier to that of the points."""
+    """Return the transform from the frame of the carrier to the frame of the points."""
     mount = settings.find_mount() or Mount()
     roll, pitch, yaw = (
         math.radians(angle) / 2
