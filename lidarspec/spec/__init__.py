@@ -18,8 +18,8 @@ Modules in reading order:
 * `wire_forms`: the encodings of frames without fixed field offsets: tokens, lines, escapes.
 * `links`: the connections of a sensor.
 * `timing`: clocks, dates, counters, and the rules that end scans.
-* `results`: the values that `points` functions return. `vocabulary`: functions that `points`
-  functions can call.
+* `results`: the values that `points` functions return.
+* `vocabulary`: functions that `points` functions can call.
 * `tree`: a frame type as a tree of nodes.
 * `syntax`: converts a construct struct to the tree.
 * `bits`: finds the layout of bit blocks by probing.
