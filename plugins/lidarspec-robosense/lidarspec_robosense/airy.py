@@ -1,7 +1,8 @@
 """RoboSense Airy: rotating lidar of 96 lasers from the horizon to the zenith over UDP, with an IMU.
 
-A pair of blocks of 48 lasers has one azimuth. The first block has the lower half of the lasers.
-With dual return, two such pairs have one azimuth.
+A packet has pairs of blocks with 48 lasers each. Both blocks of a pair have the same azimuth, and
+the first block has the lower half of the lasers. With dual return, two consecutive pairs have the
+same azimuth.
 
 Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C
 (registers of DIFOP). From the vendor's rs_driver (decoder_RSAIRY.hpp): the optical centre, firing
@@ -199,7 +200,7 @@ def plausible(f: Fields) -> Any:
 
 
 def is_plausible_imu(f: Fields) -> Any:
-    """Return whether ranges and data rate are known."""
+    """Return whether the codes of the measuring ranges and of the data rate are known."""
     return (f.acceleration_range <= 3) & (f.rotation_range <= 3) & (f.data_rate <= 4)
 
 

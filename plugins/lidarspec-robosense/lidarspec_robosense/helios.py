@@ -5,22 +5,22 @@ The angles of a unit are in its device information (DIFOP).
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
 decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, offset of the horizontal
-angles, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its lasers,
-which reproduce the azimuths of its published point clouds to the last digit.
+angles, the times of 32 lasers. From nebula's former decoder of the 16P: the firing times of its
+lasers, which reproduce the azimuths in nebula's published point clouds to the last digit.
 
-The manual has errors. Its example of a distance, 320 steps of 0.25 cm, is 0.8 m and not 8 m. Its
-vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the result for its horizontal angle 01
-01 96 is -4.06 degrees. The second part of a time is in nanoseconds in appendix B.13, but in
-microseconds in Table 9 and the capture. The type is at byte 31 in the manual of the Helios-1610,
-but at byte 30 in rs_driver and the capture. In rs_driver, the second firing of a 16P is 27.68 us
-after the first. According to the manual, its azimuth is half a step further, and blocks are about
-100 us apart, which requires 55.56 us. The times of 32 lasers are from rs_driver, 1.73 us apart;
-nebula has other times, up to 48 us.
+The manual has errors. The distance in its example, 320 steps of 0.25 cm, is 0.8 m and not 8 m. In
+its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the
+horizontal angle 01 01 96 is -4.06 degrees. The second part of a time is in nanoseconds in appendix
+B.13, but in microseconds in Table 9 and the capture. The type is at byte 31 in the manual of the
+Helios-1610, but at byte 30 in rs_driver and the capture. In rs_driver, the second firing of a 16P
+is 27.68 us after the first. According to the manual, the azimuth of the second firing is half a
+step further, and blocks are about 100 us apart, which requires 55.56 us. The firing times of 32
+lasers are from rs_driver, 1.73 us apart; nebula has other times, up to 48 us.
 
 The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its
-DIFOP has 32 different angles with single return. If it is decoded as a 16P, as it was published,
-the second half of each block has the directions of wrong lasers, and the times in a packet extend
-over twice the duration of the packet.
+DIFOP has 32 different angles with single return. If the capture is decoded as a 16P, as it was
+published, the points in the second half of each block get the directions of wrong lasers, and the
+times in a packet extend over twice the duration of the packet.
 """
 
 from __future__ import annotations
@@ -188,14 +188,15 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether two blocks have one azimuth, as with two returns of 32 lasers."""
+    """Return whether two blocks have the same azimuth, as two returns have."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 
 def has_equal_halves(f: Fields) -> Any:
     """Return whether the halves of most blocks are equal.
 
-    Such blocks contain two returns of 16 lasers, which are equal for beams with one echo.
+    Such blocks contain two returns of 16 lasers. Both returns are equal for a beam with a single
+    echo.
     """
     distance = np.asarray(f.blocks.channels.distance)
     first = distance[..., :16]

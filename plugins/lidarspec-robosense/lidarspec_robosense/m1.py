@@ -6,18 +6,18 @@ model.
 Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages
 9 to 14 (header, tail, formulas, worked example), with which the vendor's rs_driver agrees.
 
-Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset",
-and is the packet's timestamp plus time_offset; the offset 32768 of the angles is only on the M1P's
-next page; z of the worked example is printed as 2.17 and is 2.1647; the formula raw - 80 of
-mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept unless the option
-`firmware` names the formula; 750 000 points per second do not agree with 630 packets in a frame
-(787 500).
+Known errors and gaps of the guides: The time of a group of points is printed as "titime_offset"; it
+is the packet's timestamp plus time_offset. The offset 32768 of the angles is only on the next page
+of the M1P guide. In the worked example, z is printed as 2.17, but is 2.1647. The formula raw - 80
+for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept unless the option
+`firmware` selects a formula. The 750 000 points per second in the guide do not agree with 630
+packets in a frame, which result in 787 500 points.
 
-DIFOP has three layouts from byte 28 on, without a number that identifies them: that of rs_driver
-since December 2023 (`difop`), that of the driver before, with the field of view (`difop_fov`), and
-that of the M1P user guide (`difop_guide`). A packet is read by the first of these layouts with
-possible values of return mode, synchronisation mode and status, and microseconds. If none fits, it
-is `difop_other`.
+From byte 28 on, DIFOP has one of three layouts, and no number that identifies the layout: the
+layout of rs_driver since December 2023 (`difop`), the layout of the driver before, which contains
+the field of view (`difop_fov`), and the layout of the M1P user guide (`difop_guide`). A packet is
+read with the first of these layouts in which the return mode, the synchronisation mode and status,
+and the microseconds have possible values. If no layout fits, the packet is `difop_other`.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def pace(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return range and direction as on the wire, which has REP-103 axes.
+    """Return range and direction as sent; the sent angles have REP-103 axes.
 
     The column is the number of the firing in its frame. Two returns of a firing have the same
     column and ring.
@@ -229,8 +229,8 @@ def simulated_angles(number: int) -> tuple[Any, Any]:
     Each channel scans a fifth of 120 degrees, forth and back, in lines from +12.5 to -12.5 degrees.
     `number` counts the packets of a frame from 0, with single return.
 
-    Source: field of view, number of packets and directions of the channels are the guide's; the
-    lines are assumed.
+    Source: the field of view, the number of packets and the directions of the channels are from the
+    guide; the lines are assumed.
     """
     line, firing = np.divmod(number * BLOCKS + np.arange(BLOCKS), SIMULATED_LINE_FIRINGS)
     across = (firing + 0.5) / SIMULATED_LINE_FIRINGS - 0.5

@@ -9,8 +9,8 @@ Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hp
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
 layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-If a field of view is configured, blocks after the gap are really later than their times in the
-points, which is not corrected.
+If a field of view is configured, there is a gap between blocks. The blocks after the gap are then
+measured later than the times of their points say, which is not corrected.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def make_angles(lasers: int, step: float = 0.01) -> Construct:
 #: Codes of DIFOP of most models, and of the packets of an M1 (user guides).
 SYNC_MODES = {"internal": 0, "PPS": 1, "PTP": 2, "gPTP": 3}
 SYNC_STATES = {"none": 0, "locked": 1, "timeout": 2}
-#: The mode and the status, of one byte each, make one code: mode * CODES_PER_MODE + status.
+#: The mode and the status, of one byte each, are combined into one value: mode * CODES_PER_MODE +
+#: status.
 CODES_PER_MODE = 256
 WAVE_MODES = {"dual": 0, "strongest": 4, "last": 5, "first": 6}
 RETURN_NUMBERS = {"single": 0, "first": 1, "second": 2}
@@ -126,7 +127,7 @@ SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
 def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
     """Return the state of the clock in DIFOP, from the mode and the status of synchronization.
 
-    `sources` are the names of the modes, "" for a mode that does not exist.
+    `sources` has the name of each mode; "" for a mode that does not exist.
 
     Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP. PPS comes with a
     GPRMC sentence, whose time is UTC.
@@ -237,7 +238,7 @@ class Rotor:
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """The number of each laser, counted from the one with the lowest elevation, (lasers,)."""
+        """The number of each laser, counted from the lowest elevation, (lasers,)."""
         return np.argsort(np.argsort(self.vertical))
 
     def make_default_state(self, **others: Any) -> dict[str, dict[str, Any]]:
@@ -317,8 +318,8 @@ def make_points(
 ) -> Polar:
     """Return the points of lasers with an optical centre away from the axis.
 
-    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step between
-    shots follows from the speed in DIFOP until the first good step.
+    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). Until the first
+    valid step between the azimuths of shots, the step is computed from the speed in DIFOP.
 
     Args:
         lasers: elevation, and the clockwise angle from the rotor's direction, in degrees.

@@ -1,16 +1,16 @@
 """RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP.
 
-Their DIFOP has the first layout.
+Their DIFOP packets have the first layout, see `rotor`.
 
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); angles of an example unit of
-each, ros_rslidar. The date of a packet is read as UTC, but rs_driver reads it as the local time of
-the computer. In the test of the RS-LiDAR-16, a comment has angles in steps of 0.001 degrees, and
-the result has steps of 0.0001.
+each, ros_rslidar. This module reads the date of a packet as UTC, but rs_driver reads it as the
+local time of the computer. In rs_driver's test of the RS-LiDAR-16, a comment mentions steps of
+0.001 degrees for angles, but the result has steps of 0.0001 degrees.
 
-As in rs_driver, it is assumed that the type in byte 30 is 2 only in packets of an RS-LiDAR-32 and 1
-only in packets of an RS-LiDAR-16, and that bytes 31 and 32 identify a Bpearl of version 4. It is
-assumed to have the nominal angles of other Bpearls.
+As in rs_driver, it is assumed that the type in byte 30 is 2 only in packets of an RS-LiDAR-32, and
+1 only in packets of an RS-LiDAR-16, and that bytes 31 and 32 identify a Bpearl of version 4. A
+Bpearl of version 4 is assumed to have the nominal angles of other Bpearls.
 """
 
 from __future__ import annotations
@@ -157,8 +157,8 @@ def is_plausible(f: Fields, lidar_type: int) -> Any:
 def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
     """Return whether azimuths, type and version are those of a Bpearl.
 
-    Azimuths have to be below 360 degrees, and the type must not be that of another model. `v4` is
-    whether version 4 is required.
+    Azimuths have to be below 360 degrees, and the type must not be the type of another model. `v4`
+    is whether the version has to be 4.
     """
     is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (
@@ -184,7 +184,7 @@ def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
 def points_16(f: Fields) -> Polar:
     """Return the points of blocks with two firings of 16 lasers each.
 
-    DIFOP has only vertical angles, without signs, which are the same in every unit.
+    DIFOP contains only vertical angles, and no signs. The signs are the same in every unit.
     """
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
     return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))

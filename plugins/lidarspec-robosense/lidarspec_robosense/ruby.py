@@ -1,23 +1,25 @@
 """RoboSense RS-Ruby and RS-Ruby Plus: rotating lidars of 48 to 128 lasers over UDP.
 
 The RS-Ruby models are RS-LiDAR-128, -80 and -48. The RS-Ruby Plus models have 128, 80, 80 (80V) or
-48 lasers. Both series send the same packets, which have 3, 4 or 8 blocks of all lasers. With dual
-return, three blocks contain one and a half shots: A A B, then B C C.
+48 lasers. Both series send the same packets, which have 3, 4 or 8 blocks; a block contains all
+lasers. With dual return, a shot has two blocks, so a packet of three blocks contains one and a half
+shots: A A B, and the next packet B C C.
 
 Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
 manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and
 the RSP variants: firing times, optical centre, DIFOP).
 
 The sources disagree. Series and model are at bytes 31 and 32 in the manual, and at 30 and 31 in
-rs_driver, so both are read. In the manuals, the return mode is in every packet; rs_driver reads it
-from DIFOP, with other codes for each model. This module follows the manuals. In early units the
-time is in seconds and nanoseconds. With dual return, the first return is the last one and the
-second is the strongest, according to the manual.
+rs_driver, so both positions are read. In the manuals, the return mode is in every packet; rs_driver
+reads it from DIFOP, with other codes for each model. This module follows the manuals. Early units
+send the time in seconds and nanoseconds. According to the manual, with dual return the first value
+of a pair is the last return, and the second value is the strongest return.
 
-No table of nominal angles was found. They are assumed to be evenly spaced over 40 degrees, which
-the data sheets of 128 and 80 lasers give, with the lowest laser first. Clouds are marked as nominal
-before the first DIFOP packet. It is also assumed that no RS-Ruby has the series number of the Ruby
-Plus, 5. The range limits are those of rs_driver and are the same for all models.
+No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
+which is the field of view in the data sheets for 128 and 80 lasers, with the lowest laser first.
+Clouds are marked as nominal until the first DIFOP packet arrives. It is also assumed that no
+RS-Ruby has 5, the series number of the Ruby Plus. The range limits are from rs_driver, and are the
+same for all models.
 """
 
 from __future__ import annotations
@@ -125,8 +127,8 @@ def is_plus(f: Fields) -> Any:
 def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
     """Return the points of a packet.
 
-    With dual return, the first block may have the second return of a shot. `variant` has the delays
-    of an 80V in seconds.
+    With dual return, the first block may contain the second return of a shot from the previous
+    packet. `variant` contains the firing times of an 80V in seconds.
     """
     late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
@@ -173,7 +175,8 @@ def make_rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
 
 
 # fmt: off
-#: Firing times of a Ruby Plus in microseconds, and lasers that fire at each (rs_driver).
+#: Firing times of a Ruby Plus in microseconds, and the number of lasers that fire at each time
+#: (rs_driver).
 TIMES_128_US = (
     0, 1.13, 2.13, 3.26, 4.26, 5.38, 6.38, 7.51, 8.51, 10.01, 11.38, 13.31, 15.11, 17.04, 18.85, 21.14, 23.31, 25.61, 27.78, 30.07, 32.24,
     34.54, 36.7, 38.64, 40.44, 41.94, 43.3, 44.8, 46.17, 47.66, 49.03, 50.53, 53.771,

@@ -1,15 +1,16 @@
-"""RoboSense M2, MX and E1: solid-state lidars over UDP; each point has a radius and a unit vector.
+"""RoboSense M2, MX and E1: solid-state lidars over UDP.
 
-Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their
-number in a frame, limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
+Each point has a radius and a unit vector. Source: the vendor's rs_driver (decoder_RSM2.hpp,
+decoder_RSMX.hpp, decoder_RSE1.hpp: packets, packets per frame, limits); E1 user manual, Tables 4 to
+9 (packets, tail, DIFOP).
 
-In the manual of the E1, packets are counted from 0, and dual return has the modes 9 to 11; in
-rs_driver, dual return has the mode 0. The CRCs at the end of packets are not verified, because the
-bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2E profile 4. It is
+In the manual of the E1, packets are counted from 0, and the return modes 9 to 11 mean dual return;
+in rs_driver, the mode 0 means dual return. The CRCs at the end of packets are not verified, because
+the bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2E profile 4. It is
 assumed that the other models count packets from 1, as the M1 does, and that frames with dual return
 have twice as many packets, except for the MX, whose points have two radii. The IMU of the E1 is
-assumed to measure in g and rad/s, as that of the Airy does, because rs_driver reads both in the
-same way; its bytes are reserved in the manual.
+assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads both in the same
+way. In the manual, the bytes of the IMU are reserved.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def make_packet(
     Args:
         model: the model.
         offset: the type of a block's time offset.
-        parts: the fields of a block between time offset and channels.
+        parts: the fields of a block between the time offset and the channels.
         channel: the fields of a channel.
         tail: the fields after the blocks.
     """
@@ -218,9 +219,9 @@ def common_columns(f: Fields) -> dict[str, Any]:
 def points(f: Fields, returns: bool = False) -> Polar:
     """Return a point of each channel.
 
-    The range is multiplied by the length of the vector, which is 1 except for rounding, as in
-    rs_driver. `returns` is whether blocks have the number of the return. If so, two packets contain
-    the returns of the same firings, which is assumed from the M1.
+    As in rs_driver, the range is multiplied by the length of the vector, which is 1 except for
+    rounding. `returns` is whether blocks contain the number of the return. If they do, two packets
+    contain the returns of the same firings, which is assumed because it is so for the M1.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
