@@ -1,18 +1,19 @@
-"""Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth.
+"""Hesai AT128: protocol 4.3, packets of 2 blocks of 128 channels.
 
 A packet has 1086 bytes, 1118 with a signature. A mirror with three faces sweeps the beams over 120
 degrees to the front, and a scan is the sweep of one face. The azimuth of a block is the angle of
-the mirror, and the beam turns by twice as much. The azimuth of a point is therefore twice the
+the mirror, and the beam turns by twice this angle. The azimuth of a point is therefore twice the
 mirror's angle from the start of the face, plus the azimuth of the channel, plus a correction for
-the channel from the unit's file, which has steps of two degrees of the mirror. Between faces the
-sensor sends nothing, and the azimuth jumps by about 60 degrees.
+the channel. The unit's file has the corrections for every two degrees of the mirror. Between faces,
+the sensor sends nothing, and the azimuth jumps by about 60 degrees.
 
-The CRCs are probably those of a QT128. No captured packet was available, so they are not verified.
+The CRCs are probably the same as in packets of a QT128. No captured packet was available, so they
+are not verified.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump
 of 10 degrees, axes as in its code; correction files of an AT128E2X); tier4/nebula (times, 1 to 180
 m, three scans in each revolution at 200 rpm). The SDK interpolates the corrections in halves of a
-step, nebula linearly, as here.
+step. Nebula and this module interpolate them linearly.
 """
 
 from __future__ import annotations
@@ -195,7 +196,7 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Return the points of a packet; the last shot is at the packet's time (tier4/nebula).
+    """Return the points of a packet. The last shot is at the packet's time (nebula).
 
     Azimuths are measured from the start of the last face, clockwise from the left.
     """

@@ -66,7 +66,7 @@ class Calibration:
         elevation: (channels,) degrees.
         azimuth: (channels,) degrees, clockwise as in the vendor's files.
         firing: (channels,) seconds after the time of the block.
-        nominal: whether the angles are the model's, not the unit's.
+        nominal: whether the angles are those of the model, instead of those of the unit.
     """
 
     elevation: Table
@@ -78,7 +78,7 @@ class Calibration:
         return len(self.elevation)
 
     def with_file(self, path: str | Path | Learned) -> Calibration:
-        """Return a copy with the angles of one unit, from a correction file or its reply.
+        """Return a copy with the angles of a unit, from a correction file or its reply.
 
         Raises:
             UsageError: if the file cannot be read, or belongs to another model. The error has the
@@ -125,7 +125,7 @@ def configure(
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
         calibration: a CSV file with the columns Channel (or Laser id), Elevation and Azimuth, in
-            degrees, in any order; the binary file of a model that has one; or the unit's reply.
+            degrees and in any order; or a binary file, if the model has one; or the unit's reply.
         firing_times: a CSV file with the columns Channel and Fire time, in microseconds.
 
     Raises:
@@ -147,12 +147,12 @@ def configure(
 def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
     """Return columns of a correction file by their headings, in the order of channels.
 
-    Each column has the shape (channels,). The mark EEFF above the headings and the hash below the
-    table are ignored, as in the vendor's reader.
+    Each column has the shape (channels,). As in the vendor's reader, the mark EEFF above the
+    headings and the hash below the table are ignored.
 
     Args:
         wanted: the columns, with the values of the model. The values of the unit must have a
-            similar spread.
+            similar spread, which means the difference between the highest and the lowest value.
 
     Raises:
         UsageError: if the file cannot be read, or does not have one value in these columns for

@@ -100,7 +100,8 @@ def make_packet(
         version: the fields major and minor.
         channels: the array of channels in a block.
         tail: the fields between functional safety and sequence.
-        block: the type of the finer azimuth, between azimuth and channels; None if absent.
+        block: the type of the fine azimuth, which is between azimuth and channels; None if blocks
+            have no fine azimuth.
         blocks: the type of the number of blocks.
         imu: whether the packet can have an IMU part.
         safety: whether the packet can have a functional safety part.

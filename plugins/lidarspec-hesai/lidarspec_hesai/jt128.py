@@ -1,9 +1,9 @@
 """Hesai JT128: the packet of a Pandar128E3X with a status of at least 137.
 
-The number of blocks is in the header. Other differences: the motor speed has steps of 0.1 rpm, and
-the time is 1.888 ms after the last shot. The usual number of blocks, the range limits and the
-rotation speed are not public: packets are read by their header, and simulated with 2 blocks at 10
-Hz.
+Unlike in a Pandar128E3X, the header contains the number of blocks, the motor speed has steps of 0.1
+rpm, and the packet's time is 1.888 ms after the last shot. The usual number of blocks, the range
+limits and the rotation speed are not public. Packets are therefore read with the number of blocks
+in their header, and simulated with 2 blocks at 10 Hz.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
 the model).

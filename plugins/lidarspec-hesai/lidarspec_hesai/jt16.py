@@ -1,6 +1,7 @@
 """Hesai JT16: 16 channels over a serial line.
 
-The points of one azimuth are a packet of 80 bytes, and an IMU sample is a packet of 34 bytes:
+A packet of 80 bytes contains the points of one azimuth, and a packet of 34 bytes contains an IMU
+sample:
 
     EE FF 01 08  time_version  00 | date, microseconds
         | azimuth, 16 x (distance, reflectivity), dirt, state, sequence | CRC

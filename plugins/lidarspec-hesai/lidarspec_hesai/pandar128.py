@@ -6,10 +6,11 @@ A packet has 861 bytes, 893 with a signature:
     2 x [azimuth, 128 x (distance, reflectivity [, confidence] [, weight] [, environment])], CRC
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
-The status distinguishes the models. The CRCs are probably those of a QT128. No captured packet was
-available, so they are not verified. The operational state and the azimuth state of the block
-determine which channels fire and when; each of sixteen groups of eight channels has common firing
-times. Below 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in these tables.
+The models differ in the status. The CRCs are probably the same as in packets of a QT128. No
+captured packet was available, so they are not verified. The operational state and the azimuth state
+of the block determine which channels fire and when; each of sixteen groups of eight channels has
+common firing times. Below 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in
+these tables.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
@@ -156,7 +157,7 @@ VERSION = ("major" / Const(1, Int8ul), "minor" / Const(4, Int8ul))
 
 
 def make_tail(speed: float) -> Any:
-    """Return the fields of the tail, with the motor's speed in steps of `speed` rpm."""
+    """Return the fields of the tail; the motor speed has steps of `speed` rpm."""
     return (
         "tail_reserved" / Bytes(9),
         "azimuth_state" / Int16ul * "two bits per block; the first block has the highest bits",
@@ -219,7 +220,7 @@ def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return the other models with these packets; they have another status."""
+    """Return the other models that send these packets, with another status."""
     others = {
         "hesai-pandar128": Relative(
             "a status_version below 128", lambda f: f.status_version < MIN_OT128_STATUS

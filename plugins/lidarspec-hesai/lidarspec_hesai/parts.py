@@ -1,4 +1,4 @@
-"""The parts that all packets of the family share: date, return modes, points of a shot.
+"""Shared by all packets of the family: date, return modes, points of a shot.
 
 Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which
 reproduces its published clouds).
@@ -28,7 +28,7 @@ RETURN_MODES = {
 RETURN_MODE = Enum(Int8ul, **RETURN_MODES)
 FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
-#: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models).
+#: Revolutions per second: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models).
 SPEED_LIMITS_HZ = (
     5.0,
     20.0,
@@ -77,10 +77,10 @@ def clock(f: Fields) -> tuple[Any, Any]:
     return np.where(utc.year == 0, unix, date), f.timestamp
 
 
-#: The date is UTC with GPS. With PTP it is the time of the grandmaster. Data packets do not report
-#: the state of the clock: GPS packets (UDP port 10110) and the sensor's web page do. Until it is
-#: set, the clock counts from a virtual UTC such as 2000-01-01 (user manuals of the Pandar64 and the
-#: PandarXT, appendix B).
+#: With GPS, the date is UTC. With PTP, it is the time of the grandmaster. Data packets do not
+#: report the state of the clock; GPS packets (UDP port 10110) and the sensor's web page report it.
+#: Until the clock is set, it counts from a virtual UTC such as 2000-01-01 (user manuals of the
+#: Pandar64 and the PandarXT, appendix B).
 CLOCK = Clock(clock, epoch="utc")
 
 

@@ -2,8 +2,8 @@
 
     47 74  code  result | length(4) | payload
 
-The angles of a unit are requested when it is opened. Units with only TLS or PTC 2.0 (57 75) do not
-reply.
+The angles of a unit are requested when it is opened. Units that support only TLS or PTC 2.0 (57 75)
+do not reply.
 
 Source: HesaiLidar_SDK_2.0 (ptc_client.h, ptc_1_0_parser.h: frame and codes); tier4/nebula
 (hesai_common.hpp: numbers of the return modes).

@@ -3,9 +3,9 @@
 CRCs cover the blocks, the functional safety part and the tail.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h; angle and firing-time files of a sample unit). The
-CRCs are verified with a capture of tier4/nebula. It also shows that the second block follows the
-first by 111.11 us (nebula has the opposite order). Two loops alternate; each loop fires 92 of the
-channels.
+CRCs are verified with a capture of tier4/nebula. The capture also shows that the second block
+follows the first after 111.11 us (nebula has the opposite order). Two loops alternate from shot to
+shot; each loop fires 92 of the channels.
 """
 
 from __future__ import annotations
