@@ -65,7 +65,7 @@ def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) ->
 
 
 def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
-    """Return points from depth, azimuth and zenith angle (from the z axis).
+    """Return points from depth, azimuth and zenith angle (the angle from the z axis).
 
     The arguments are the same as for `cartesian`.
     """

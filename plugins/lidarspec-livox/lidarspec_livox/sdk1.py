@@ -1,16 +1,17 @@
 """Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: generation 1 of the protocol (Livox-SDK).
 
 A Lidar broadcasts its identity once a second (`broadcast`, to port 55000). The host sends the
-address for the data (`handshake`), and a `heartbeat` each second, without which the Lidar stops
-sending data. Point packets have neither checksum nor counter, so they are identified by their
-length and header. The time from point to point depends on the model, and packets do not contain it.
+address for the data (`handshake`), and then a `heartbeat` each second. Without heartbeats, the
+Lidar stops sending data. Point packets have neither checksum nor counter, so they are identified by
+their length and header. The time from point to point depends on the model, and packets do not
+contain it.
 
 Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h)
-and livox_ros_driver (lds.h: packet sizes, points a second; it prints 9 bytes for a point of type 3,
-which has 10). Ranges and fields of view are assumed. The documents do not state which model sends
-which type of data, so all types are accepted for each model. Packet version 5 is assumed, because
-test vectors have it and drivers ignore it. Hubs and the parameters of commands 0B to 0D are not
-supported.
+and livox_ros_driver (lds.h: packet sizes, points a second). In the latter, the size of a point of
+type 3 is given as 9 bytes, but is 10 bytes. Ranges and fields of view are assumed. The documents do
+not state which model sends which type of data, so all types are accepted for each model. Packet
+version 5 is assumed, because test vectors have this version, and drivers ignore the version. Hubs
+and the parameters of commands 0B to 0D are not supported.
 """
 
 from __future__ import annotations
@@ -308,7 +309,7 @@ REQUEST = 0
 REPLY = 1
 NOTIFICATION = 2
 #: Command set and id of commands without arguments, of commands that set a setting, and of commands
-#: that return one.
+#: that return a setting.
 INFORMATION = (0, 2)
 DISCONNECT = (0, 6)
 ADDRESS = (0, 9)
@@ -499,8 +500,8 @@ def make_frames(rate: int, first: str) -> Mapping[str, Frame]:
 
 
 SIMULATED_ANSWERS = {"get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)}
-#: Shots per second -> simulated field of view for data types that a model does not usually send:
-#: that of a Mid-40, that of an Avia.
+#: Shots per second -> simulated field of view for data types that a model does not usually send.
+#: The first is the field of view of a Mid-40, the second of an Avia.
 DEFAULT_VIEWS: dict[int, View] = {
     100_000: (-19.2, 19.2, -19.2, 19.2),
     240_000: (-35.2, 35.2, -38.6, 38.6),

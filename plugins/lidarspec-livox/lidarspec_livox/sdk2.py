@@ -5,14 +5,14 @@ a Lidar sends points to the host that was set with `set_point_host`. It sends it
 second without a request. Some firmware of the Mid-360 is reported to send point packets with a CRC
 of 0. Such packets are accepted without a check.
 
-Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP
-protocol document 1.4.8 where they differ. Rate, ranges and view of the HAP are from its user
-manual, table 1.2.1; those of the Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by
-the number of points, and the document divides it by this number minus 1, a difference of 1 %. This
-module follows the driver. The HAP is assumed to accept the commands of a Mid-360, because the SDK
-sends the same commands to both. The port for the state of a HAP is unknown, so its state is not
-requested. Commands for logs and firmware are not supported. Parameters with unknown keys are
-returned as bytes.
+Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h); for
+differences of the HAP, HAP protocol document 1.4.8. The point rate, range limits and field of view
+of the HAP are from its user manual, table 1.2.1; those of the Mid-360 are assumed.
+livox_ros_driver2 divides `time_interval` by the number of points, but the document divides it by
+this number minus 1. The difference is 1 %. This module follows the driver. The HAP is assumed to
+accept the commands of a Mid-360, because the SDK sends the same commands to both. The port for the
+state of a HAP is unknown, so its state is not requested. Commands for logs and firmware are not
+supported. Parameters with unknown keys are returned as bytes.
 """
 
 from __future__ import annotations
@@ -158,9 +158,9 @@ def make_points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Fra
 
 
 def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = True) -> Any:
-    """Return the struct of a control frame: a header with CRC-16, data with CRC-32.
+    """Return the struct of a control frame: header with CRC-16, data with CRC-32.
 
-    The CRC-32 of a frame without data is 0.
+    In a frame without data, the CRC-32 is 0.
 
     Args:
         cmd_id: the command; None for frames of several commands.
