@@ -2,8 +2,9 @@
 
 The layout of packets and the directions of beams are read from the metadata of the unit, which are
 in a file (`configure(metadata=path)`), or are requested from the sensor's web server when the
-sensor is opened. Without metadata a layout can be given (`rows`, `turn`, `profile`). The angles are
-then those of an ideal sensor, evenly spread over its field of view, and marked as nominal.
+sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`). The
+angles are then those of an ideal sensor, evenly spread over the field of view, and are marked as
+nominal.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
 (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
@@ -53,8 +54,8 @@ from lidarspec_ouster.packets import (
 )
 from lidarspec_ouster.recognition import recognise
 
-#: Model -> product line, elevation of the lowest and the highest beam in degrees, beam origin and
-#: height of the lidar in mm, range limits in m.
+#: Model -> product line, elevation of the lowest and of the highest beam in degrees, distance of
+#: the beam origin from the axis in mm, height of the lidar in mm, range limits in m.
 MODELS = {
     "OS0": ("OS-0", -45.0, 45.0, 27.67, 36.18, (0.3, 100.0)),
     "OS1": ("OS-1", -22.5, 22.5, 15.806, 36.18, (0.3, 200.0)),
@@ -69,7 +70,7 @@ METADATA_ONLY = "the packets are identical; the metadata name the model"
 def points(f: Fields, unit: Unit) -> Polar:
     """Return the points of the pixels, calculated with the tables of the unit.
 
-    Two returns of a pixel are adjacent.
+    With two returns, both points of a pixel are adjacent.
     """
     columns = f.columns
     bits = PROFILES[unit.profile]

@@ -1,7 +1,7 @@
 """The layout of a unit's packets and the directions of its beams, from its metadata (JSON).
 
-Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat; later files,
-and the sensor's web server, have sections. Both are read.
+Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 have no sections. Later
+files, and metadata from the sensor's web server, have sections. Both formats are read.
 """
 
 from __future__ import annotations
@@ -43,15 +43,16 @@ LIDAR_TO_SENSOR = (
     0.0,
     1.0,
 )
-#: Distance from the axis of rotation to the beam origin, by the beginning of the product line. All
-#: others, including the first generation of the OS1, have the last value (ouster-sdk,
-#: sensor_info.cpp).
+#: Distance from the axis of rotation to the beam origin, by the first letters of the product line.
+#: All other product lines, including the first generation of the OS1, have the value of the next
+#: constant (ouster-sdk, sensor_info.cpp).
 BEAM_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 BEAM_ORIGIN_GENERATION_1_MM = 12.163
 
-#: What the clock counts, by `timestamp_mode` (Software User Manual, setting sensor time source).
-#: PTP's scale is TAI, unless the grandmaster sends UTC. A pulse without NMEA sentences counts from
-#: power-up too. Packets do not report whether the clock is locked: `GET api/v1/time` does.
+#: The epoch from which the clock counts, by `timestamp_mode` (Software User Manual, setting sensor
+#: time source). The time scale of PTP is TAI, unless the grandmaster sends UTC. With a pulse but
+#: without NMEA sentences, the clock also counts from power-up. Packets do not report whether the
+#: clock is locked, but `GET api/v1/time` does.
 TIME_EPOCHS = {
     "TIME_FROM_INTERNAL_OSC": "boot",
     "TIME_FROM_SYNC_PULSE_IN": "utc",
@@ -76,7 +77,7 @@ class Unit:
         beam, lidar, imu: transforms (4, 4) with millimetres: from beam to lidar, from lidar to
             sensor, and from IMU to sensor.
         samples: samples per IMU packet; 0 for LEGACY packets.
-        product, serial: as in the metadata, "" if missing.
+        product, serial: the product line and the serial number in the metadata; "" if missing.
         timestamp_mode: the source of the time, a key of `TIME_EPOCHS`; "" if unknown.
         nominal: whether values of the model replace missing values of the unit.
     """
@@ -104,7 +105,7 @@ class Unit:
         return len(self.elevation)
 
     def compute_beams(self) -> tuple[Table, Table]:
-        """Return the direction of each pixel's beam, and its starting point.
+        """Return the direction and the starting point of each pixel's beam.
 
         Returns:
             The directions, (turn, rows, 3) unit vectors, and the points at range 0, (turn, rows, 3)
@@ -277,7 +278,7 @@ class MetadataKeys:
     def _read_numbers(
         self, key: str, count: int | None, default: tuple[float, ...] | None = None
     ) -> Table:
-        """Return `count` finite numbers, or any number of them if `count` is None.
+        """Return `count` finite numbers; with None, any number of finite numbers.
 
         `default` is used if the key is missing.
         """

@@ -117,7 +117,7 @@ ENCODER_COUNTS_PER_TURN = 90_112
 LIDAR = 1  # packet type
 IMU = 2  # packet type
 GRAVITY = 9.80665  # m/s2, one g of the IMU
-#: The values in place of a CRC that firmware 2.2, and firmware 2.3 to 3.1, send.
+#: The values that firmware 2.2, and firmware 2.3 to 3.1, send in place of a CRC.
 ABSENT_CRCS = (0, 0xDEADBEEF0000C0DE)
 ONES = (1 << 64) - 1
 CRC = Crc(64, 0x42F0E1EBA9EA3693, init=ONES, refin=True, refout=True, xorout=ONES)  # CRC-64/XZ
@@ -225,7 +225,7 @@ def make_lidar_frame(profile: str, rows: int, columns: int, turn: int) -> Frame:
 
 
 def is_plausible(f: Fields, turn: int) -> Any:
-    """Return whether the columns have consecutive numbers below `turn`."""
+    """Return whether the numbers of the columns are consecutive and below `turn`."""
     column_number = f.columns.measurement_id
     return (column_number < turn) & (column_number == f.columns[0].measurement_id + f.columns.index)
 
@@ -233,7 +233,8 @@ def is_plausible(f: Fields, turn: int) -> Any:
 def is_legacy_plausible(f: Fields, turn: int) -> Any:
     """Return whether columns, status, encoder and frame id of a LEGACY packet are valid.
 
-    These packets have no type, so more rules are needed to distinguish them from other data.
+    LEGACY packets contain no packet type, so more rules are needed to distinguish them from other
+    data.
     """
     columns = f.columns
     has_known_status = (columns.status == VALID) | (columns.status == 0)
@@ -254,7 +255,8 @@ LEGACY_IMU = Struct(
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
 )
 #: One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048
-#: and of (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk returns them unchanged.
+#: and of (pi/180)/16.4, which shows that the sensor sends m/s2 and rad/s. ouster-sdk returns them
+#: unchanged.
 SAMPLE = Struct(
     "timestamp" / TIME,
     "measurement_id" / Int16ul,

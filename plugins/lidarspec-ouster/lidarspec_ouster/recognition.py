@@ -1,12 +1,12 @@
 """Recognize the layout of packets from their content, because they do not declare it.
 
-Several layouts have the same packet length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. If a
-layout with too many pixels is tried, every other or every fourth range is really another field, so
-the mean ranges of four adjacent rows differ. Of layouts with equally many pixels, the first one in
-`PROFILES` is used whose unused bits are 0 in most pixels. Some layouts cannot be distinguished. In
-LEGACY, the number of columns per revolution is determined from the encoder. In other profiles, it
-is estimated from the largest column number and the time between columns, assuming ten revolutions a
-second, which is the factory setting.
+Several layouts have the same packet length, for example 32 pixels of 16 bytes, 64 pixels of 8 bytes
+and 128 pixels of 4 bytes. If a layout with too many pixels is tried, every second or fourth range
+is actually another field, so the mean ranges of four adjacent rows differ. Among layouts with the
+same number of pixels, the first layout in `PROFILES` whose unused bits are 0 in most pixels is
+used. Some layouts cannot be distinguished. In LEGACY, the number of columns per revolution is
+determined from the encoder. In other profiles, it is estimated from the largest column number and
+the time between columns, assuming ten revolutions a second, which is the factory setting.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ ROW_COUNTS = (16, 32, 64, 128)
 COLUMNS_PER_TURN = (512, 1024, 2048, 4096)
 MAX_EXAMINED_PACKETS = 256
 FACTORY_TURN_NS = 100_000_000  # ten revolutions a second
-#: The maximum share of pixels with unused bits set; a captured OS2 is below it.
+#: The maximum share of pixels in which unused bits may be set. In a capture of an OS2, the share is
+#: lower.
 MAX_UNUSED_SHARE = 0.1
 Bytes2D = NDArray[np.uint8]
 
@@ -117,8 +118,8 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
     """Return a measure of the similarity of every fourth row, from 0 to 1.
 
-    Rows are grouped by their index modulo four. The result is the smallest mean range of a group,
-    divided by the largest; -1 if unused bits are set in many pixels.
+    Rows are grouped by their index modulo four. The result is the smallest mean range of a group
+    divided by the largest mean range; -1 if unused bits are set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]
