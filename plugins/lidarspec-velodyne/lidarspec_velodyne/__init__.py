@@ -4,14 +4,15 @@ Spinning lidars with 16 to 128 lasers over UDP.
 
 Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and
 ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
-focal distances. The vertical offsets that follow from the focal distance are documented for the
-VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z differs by up to
-11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
+focal distances. Lasers have vertical offsets, which result from the focal distance. They are
+documented for the VLP-16 (11.2 mm at -15 degrees). ros-drivers and nebula ignore them, so their z
+differs from this module by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm
+(VLS-128).
 
-Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot follows
-eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder, two idle
-slots follow eight groups, and it is 7 us before. This module follows velodyne_decoder; directions
-differ by 0.01 degrees.
+Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot
+follows eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder,
+two idle slots follow eight groups, and the first firing is 7 us before the packet's time. This
+module follows velodyne_decoder. The directions of both differ by 0.01 degrees.
 """
 
 from __future__ import annotations
@@ -162,7 +163,8 @@ VLP32C_FIRINGS = Firings(
     product=VLP32C_PRODUCT,
 )
 
-#: Seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on.
+#: Seconds from the firing of eight lasers of a VLS-128 to the firing of the next eight. From
+#: firmware 5.2.3 on, it is 2.89 us.
 GROUP_PERIOD_S = 8 / 3 * 1e-6
 VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 

@@ -1,16 +1,18 @@
-"""Direction and time of each firing of a spinning sensor, from blocks that share an azimuth.
+"""Compute the direction and the time of each firing of a spinning sensor.
 
-The azimuth of a block is that of its first firing; the others lie on the way to the next block, in
-proportion to their time. With dual return two consecutive blocks hold the two returns of the same
-firings and share an azimuth, so the next azimuth is two blocks ahead.
+The azimuth of a block is the azimuth of its first firing. The azimuths of the other firings are
+interpolated to the azimuth of the next block, in proportion to their times. With dual return, two
+consecutive blocks contain the two returns of the same firings and have the same azimuth, so the
+next azimuth is two blocks ahead.
 
-The rule for the last block applies if there is no next block, or if its azimuth is further ahead
-than the sensor can have rotated. Packets have no counter, so such a step is the only sign of a lost
-packet; a sector masked in the sensor's settings looks the same. The rules are:
+If there is no next block, or if its azimuth is further ahead than the sensor can have rotated, the
+rule for the last block is used. Packets have no counter, so such a step is the only sign of a lost
+packet. A sector that is masked in the sensor's settings causes the same step. The user selects one
+of two rules:
 
-* "previous", the default: the last good step is used again, as ros-drivers and nebula do for the
-  last block of every packet; velodyne_decoder uses the mean of the packet. On real packets the
-  two differ by up to 0.04 degrees.
+* "previous", the default: the last valid step is used again. ros-drivers and nebula do this for the
+  last block of every packet; velodyne_decoder uses the mean step of the packet. For real packets,
+  both methods differ by up to 0.04 degrees.
 * "invalid": these firings have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and
@@ -39,17 +41,17 @@ class Firings:
     """The firing pattern of a model.
 
     Attributes:
-        elevation: degrees, (32,), of the laser of each slot of a block; (blocks, 32) if blocks hold
-            different lasers.
-        delay: seconds from the first firing with the same azimuth to each slot's firing, shaped as
-            `elevation`.
+        elevation: degrees, (32,), for the laser of each slot of a block; (blocks, 32) if the blocks
+            contain different lasers.
+        delay: seconds from the first firing with the same azimuth to the firing of each slot, in
+            the shape of `elevation`.
         period: seconds from one azimuth to the next.
-        focal_distance: metres; lasers leave the lens at different heights and cross at this
+        focal_distance: metres. The beams leave the lens at different heights, and cross at this
             distance.
-        product: the product byte that the model should send.
-        offset: degrees to the left of the azimuth for each slot, shaped as `elevation`.
-        sharing: the number of blocks of single return that share an azimuth.
-        returns: returns of each firing; 0 if the packets contain this number.
+        product: the value of the product byte for this model.
+        offset: degrees to the left of the azimuth for each slot, in the shape of `elevation`.
+        sharing: with single return, the number of blocks with the same azimuth.
+        returns: the number of returns of each firing; 0 if the packets contain this number.
         start: seconds from the time of the packet to its first firing.
     """
 
@@ -70,12 +72,12 @@ class Firings:
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """The laser of each slot, counted from the lowest, shaped as `elevation`."""
+        """The laser of each slot, counted from the lowest, in the shape of `elevation`."""
         return np.searchsorted(np.unique(self.elevation), self.elevation)
 
     @property
     def height(self) -> NDArray[np.float64]:
-        """The height in metres at which each slot's beam leaves, shaped as `elevation`."""
+        """The height at which the beam of each slot leaves the lens, metres."""
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
@@ -128,7 +130,7 @@ def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
 def pace(f: Fields, model: Firings) -> Any:
     """Return the seconds from a packet to the next.
 
-    A packet has 12 blocks, or 6 shots with dual return.
+    With dual return, a packet has half as many shots as with single return.
     """
     shots = BLOCKS // model.sharing
     return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period

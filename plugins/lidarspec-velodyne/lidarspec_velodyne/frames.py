@@ -1,10 +1,11 @@
-"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308.
+"""The packets of the family: data in three layouts, and position packets.
 
-Position packets are the same for all models.
+Data packets are sent to UDP port 2368, and position packets to port 8308. Position packets are the
+same for all models.
 
 Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the
-vendor's user manuals; the leading zeros and inertial readings of position packets: VeloView's
-position reader.
+vendor's user manuals; for the leading zeros and the inertial measurements in position packets,
+VeloView's position reader.
 """
 
 from __future__ import annotations
@@ -150,7 +151,7 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 
 
 def is_plausible_single(f: Fields) -> Any:
-    """Return whether the four banks follow each other three times, in single return."""
+    """Return whether a packet has single return, and three times all four banks."""
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))
@@ -159,7 +160,7 @@ def is_plausible_single(f: Fields) -> Any:
 
 
 def is_plausible_dual(f: Fields) -> Any:
-    """Return whether each of the four banks comes twice."""
+    """Return whether each of the four banks has two consecutive blocks."""
     return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 
@@ -171,7 +172,8 @@ def is_plausible_position(f: Fields) -> Any:
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
 
-#: Time, validity and date of a sentence, with position and movement in between.
+#: Matches the time, the validity and the date of a sentence; position and movement are between
+#: them.
 _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 PPS_LOCKED = 2
 SIMULATED_START_S = 1_704_067_200  # 2024-01-01
@@ -192,7 +194,7 @@ CLOCK_STATUS = ClockStatus(
 def nmea_seconds(f: Fields) -> Any:
     """Return the seconds since 1970 of the first valid sentence, nan for all others.
 
-    A sentence counts only if the PPS has locked the clock to it.
+    A sentence is only valid if the clock is locked to the PPS.
     """
     is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
     seconds = np.full(len(is_locked), np.nan)

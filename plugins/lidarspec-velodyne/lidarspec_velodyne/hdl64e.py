@@ -2,17 +2,17 @@
 
 Source: velodyne_decoder (calibration files of an example unit of each series, packet_decoder.cpp:
 firing times) and ros-drivers/velodyne (rawdata.cc: corrections; gen_calibration.py: names and units
-in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1 to 32, those with
-0xFFDD lasers 33 to 64 of the same firing; with dual return, four consecutive blocks share an
-azimuth (velodyne_decoder), first the two of the strongest return.
+in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE contain lasers 1 to 32, and blocks
+with 0xFFDD lasers 33 to 64 of the same firing. With dual return, four consecutive blocks have the
+same azimuth (velodyne_decoder); the first two contain the strongest return.
 
-Each laser of each unit has its own corrections, in the unit's file (db.xml), and a byte at a time
-in `status_value`. The corrections here are those of an example unit; clouds are marked as nominal
-until `configure(calibration=...)` reads the file. Not supported: the second correction of near
-distances (below 25 m), intensity by focal distance, and the calibration in the status bytes. No
-captured packet was available; points of simulated packets lie within 8 cm of those of
-velodyne_decoder, which applies that second correction. The clock has no date, which is only in the
-status bytes.
+Each laser of each unit has its own corrections. They are in the unit's file (db.xml), and are also
+sent in `status_value`, one byte in each packet. The corrections in this module are those of an
+example unit. Clouds are marked as nominal until `configure(calibration=...)` reads the unit's file.
+Not supported: the second correction of near distances (below 25 m), intensity by focal distance,
+and the calibration in the status bytes. No captured packet was available. Points of simulated
+packets differ by less than 8 cm from the points of velodyne_decoder, which applies the second
+correction. The clock has no date; the date is only in the status bytes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from lidarspec_velodyne.frames import BLOCKS, CLOCK_WRAP_S, SLOTS, SPEED_LIMITS_
 UPPER_BANK = 0xFFEE
 LOWER_BANK = 0xFFDD
 MAX_CALIBRATION_BYTES = 1 << 20
-#: Meanings of the status byte, which change from packet to packet.
+#: Meanings of the status byte. The meaning changes from packet to packet.
 STATUS_LETTERS = {
     "hours": "H",
     "minutes": "M",
@@ -77,13 +77,14 @@ class Unit:
 
     Attributes:
         period: seconds from shot to shot.
-        firing: microseconds between groups of four lasers.
-        within: delay of each laser in a group of four, in microseconds.
+        firing: microseconds from the start of one group of four lasers to the start of the next
+            group.
+        within: delay of each of the four lasers within a group, in microseconds.
         vertical: elevation of the 64 lasers in degrees.
-        offset: degrees to the left of the azimuth.
-        height: metres above the origin, perpendicular to the beam.
+        offset: direction of each laser, in degrees to the left of the azimuth.
+        height: offset of each beam upwards, perpendicular to the beam, in metres.
         distance: metres to add to the measured distance.
-        aside: metres to the left of the axis, perpendicular to the beam.
+        aside: offset of each beam to the left, perpendicular to the beam, in metres.
         nominal: whether these are the values of the example unit.
     """
 
@@ -197,7 +198,7 @@ def is_dual(f: Fields) -> Any:
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Return the points of a packet, with an origin of their own for each laser."""
+    """Return the points of a packet; each laser has its own origin."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
     is_dual_return = is_dual(f)
@@ -228,10 +229,11 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
     """Return the sensor with the corrections of one unit.
 
     Args:
-        calibration: the unit's db.xml, with degrees and centimetres.
+        calibration: the unit's file db.xml, in degrees and centimetres.
 
     Raises:
-        UsageError: if the file cannot be read, or does not have all 64 lasers once.
+        UsageError: if the file cannot be read, or does not contain each of the 64 lasers exactly
+            once.
     """
     try:
         with open(calibration, "rb") as file:
