@@ -11,19 +11,19 @@ another kind, and starts as if its descriptor had been received, which is needed
 begin after the descriptor.
 
 For all kinds, a scan ends when the azimuth of the points passes zero. Nodes and HQ capsules also
-mark the first node after zero with a bit, but the start angle of capsules can pass zero a capsule
-earlier or later.
+mark the first node after zero with a bit. Other capsules do not, and their start angle can pass
+zero a capsule earlier or later.
 
-Nodes have no checksum, and are accepted in runs of ten without a gap; the module `nodes` has the
-measured rates of false nodes. Frames do not contain the times of their points, so all points of a
-frame have the time of the frame.
+Nodes have no checksum, and are accepted in runs of ten without a gap. The docstring of `nodes`
+contains the measured rates of false nodes. Frames do not contain the times of their points, so all
+points of a frame have the time of the frame.
 
 Requests, descriptors, and replies with information and configuration were verified with the
 recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that
 were built by the rules of the SDK, and dense, ultra-dense and HQ capsules with the SDK's arithmetic
-by hand. It is not known whether a C1 supports the speed command; by the SDK's rule for model
-numbers it would use PWM. An S2L is assumed to have the model numbers of an S2, and their bytes
-cannot be distinguished. A T1 receives requests and sends its stream over UDP.
+by hand. It is not known whether a C1 supports the speed command. According to the SDK's rule for
+model numbers, it would use PWM. An S2L is assumed to have the model numbers of an S2, so these
+models cannot be distinguished. A T1 receives requests and sends its stream over UDP.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ def configure(
     Args:
         dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK, or
             "signed" as in the protocol.
-        mode: the scan mode that opening starts, instead of a scan of nodes; `answer` must be the
-            kind of its replies.
+        mode: the scan mode that is started when the sensor is opened, instead of a scan of nodes.
+            The option `answer` must be the kind of data frames in this mode.
 
     Raises:
         UsageError: if the mode is not a number from 0 to 255.

@@ -83,7 +83,7 @@ KEYS = {
 }
 KEY = Enum(Int32ul, **KEYS)
 
-#: Streams -> the type of their descriptors.
+#: Kind of data frames -> type of the descriptor that announces them.
 STREAMS = {
     "node": 0x81,
     "express": 0x82,
@@ -131,7 +131,7 @@ def make_stream_descriptor(kind: int, size: int) -> Frame:
 
 
 def is_config_plausible(f: Fields) -> Any:
-    """Return whether the length fits the value, if the key has a known width."""
+    """Return whether the length agrees with the width of the value, if it is known."""
     size = take(_VALUE_BYTES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 

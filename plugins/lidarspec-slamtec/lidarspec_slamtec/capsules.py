@@ -1,14 +1,14 @@
-"""Capsules, which contain many distances and the angle of the first one.
+"""Capsules, which contain many distances and the angle of the first point.
 
 The angles of the other points are computed with the start angle of the next capsule: point k of N
 is at ``start + (next start - start) * k / N``, minus a compensation. If the next capsule is
-missing, or has the S bit (the first after a start), the points of a capsule have no direction. All
-four kinds begin with the sync nibbles A and 5, each next to one nibble of the checksum, which is
-the XOR of the bytes from the third on.
+missing, or has the S bit, which marks the first capsule after a start, the points of a capsule have
+no direction. All four kinds of capsules begin with two bytes. Each contains a sync nibble (A or 5)
+and a nibble of the checksum, which is the XOR of all following bytes.
 
-Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; facts missing there (dense and ultra-dense
-capsules, the ultra capsule's angles, that dtheta is unsigned) from the vendor's SDK
-(sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages adjacent points of an ultra-dense capsule
+Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; facts that it lacks are from the vendor's SDK
+(sl_lidar_cmd.h, handler_capsules.cpp): dense and ultra-dense capsules, the angles of ultra
+capsules, and that dtheta is unsigned. The SDK averages adjacent points of an ultra-dense capsule
 that differ by up to 2 mm. This filter is left out.
 """
 
@@ -37,19 +37,21 @@ ULTRA_CABINS = 32
 DENSE_CABINS = 40
 ULTRA_DENSE_CABINS = 32
 DTHETA_SIGN_BIT = 32  # of six bits
-#: The degrees of a simulated capsule, for 720, 1440, 800 and 800 points a revolution.
+#: The angle that a simulated capsule covers in degrees, for 720, 1440, 800 and 800 points a
+#: revolution.
 EXPRESS_STEP = 16.0
 ULTRA_STEP = 24.0
 DENSE_STEP = 18.0
 ULTRA_DENSE_STEP = 28.8
-#: The simulated capsules per second. 254 and 127 us per point, as measured with a live A1, result
-#: in 5.5 revolutions a second; 125 us, which are assumed, result in 10.
+#: The simulated capsules per second. The times of 254 and 127 us per point, which were measured
+#: with a live A1, result in 5.5 revolutions a second. The assumed time of 125 us results in 10
+#: revolutions a second.
 EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
     1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64))
 )
 
-#: The five levels of the codes of an ultra capsule. A level begins at the code in _STARTS, which
-#: stands for the millimetres in _BASES, and its steps are 1, 2, 4, 8 or 16 mm.
+#: The five levels of the codes of an ultra capsule. A level begins at the code in _STARTS, whose
+#: distance is in _BASES, in millimetres. The steps of the levels are 1, 2, 4, 8 and 16 mm.
 _STARTS = np.array([0, 512, 1280, 1792, 3328])
 _BASES = np.array([0, 512, 2048, 4096, 16384])
 _CODES = np.arange(1 << 12)
@@ -151,7 +153,7 @@ def plausible(f: Fields) -> Any:
 def point_step(f: Fields, count: int) -> Any:
     """Return the degrees from a point to the next, (n, 1), for `count` points.
 
-    The step is nan without a next capsule.
+    The step is nan if the next capsule is missing.
     """
     after = np.where(following(f.start.sync) == 0, following(f.start.angle), np.nan)
     return wrap(after - f.start.angle, 360.0) / count
@@ -189,7 +191,7 @@ def dense_points(f: Fields) -> Polar:
 
 
 def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
-    """Return a predicted distance in mm; 0 for the two codes that mean no return.
+    """Return a predicted distance in mm; 0 for two predictions that mean no return.
 
     Args:
         base: the reference distance in mm.
@@ -204,9 +206,9 @@ def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
 def compensation(mm: Any) -> Any:
     """Return the degrees to subtract from the angle of an ultra capsule's point.
 
-    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, otherwise 8 degrees minus two terms in
-    1/65536 rad. The terms depend on 98361 divided by the distance in quarters of a millimetre,
-    rounded down.
+    Source: handler_capsules.cpp: 7.5 degrees for distances below 50 mm, otherwise 8 degrees minus
+    two terms in 1/65536 rad. The terms depend on 98361 divided by the distance in quarters of a
+    millimetre, rounded down.
     """
     ratio = np.floor(98361 / np.maximum(mm * 4, 200))
     return np.where(mm >= 50, 8 - np.rad2deg((ratio * 64 + ratio**3 / 98304) / 65536), 7.5)
@@ -238,8 +240,8 @@ def ultra_points(f: Fields) -> Polar:
 def ultra_dense_points(f: Fields) -> Polar:
     """Return 64 points per capsule.
 
-    The scale of a point determines its bits: 10 to 13 bits of distance in steps of 2 to 5 mm, and 8
-    to 5 bits of quality above them.
+    The scale of a point determines how its bits are divided: the low 10 to 13 bits are the
+    distance, in steps of 2 to 5 mm, and the 8 to 5 bits above them are the quality.
     """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
@@ -259,8 +261,8 @@ def ultra_dense_points(f: Fields) -> Polar:
 def encode_ultra(polar: Polar) -> Mapping[str, Any]:
     """Return the fields of ultra capsules with these ranges.
 
-    If the difference from a reference is too large for a prediction, the point becomes the code of
-    no return.
+    If the difference from the reference is too large for a prediction, the point is encoded as a
+    point without a return.
     """
     mm = np.asarray(polar.range) * 1000
     code = nearest_codes(mm[..., 0])
@@ -282,7 +284,7 @@ def nearest_codes(mm: Any) -> Any:
 
 
 def encode_prediction(mm: Any, code: Any) -> Any:
-    """Return the steps from the distance of a code to another distance.
+    """Return the difference of a distance from the distance of a code, in steps.
 
     The result is 511 if the distance cannot be encoded, or if it is 0 (no return).
     """
@@ -297,7 +299,8 @@ def encode_prediction(mm: Any, code: Any) -> Any:
 def encode_ultra_dense(polar: Polar) -> Mapping[str, Any]:
     """Return the fields of ultra-dense capsules with these ranges.
 
-    Each range has the finest scale that contains it, and all have the same quality.
+    Each range is encoded with the finest scale that can represent it. All points have the same
+    quality.
     """
     mm = np.asarray(polar.range) * 1000
     scale = np.searchsorted(SCALE_STARTS_MM, mm, side="right") - 1

@@ -1,8 +1,8 @@
-"""The commands of an RPLIDAR, including its motor, which DTR, PWM or a speed controls.
+"""The commands of an RPLIDAR, and the control of its motor by DTR, PWM or speed.
 
-Source: RPLIDAR interface protocol, "requests"; delays after requests and the motor's commands from
-the vendor's SDK (sl_lidar_driver.cpp). While it sends scan data, a sensor does not reply to
-requests for information. A request for a scan starts a new stream.
+Source: RPLIDAR interface protocol, "requests"; the delays after requests, and the commands for the
+motor, are from the vendor's SDK (sl_lidar_driver.cpp). While it sends scan data, a sensor does not
+reply to requests for information. A request for a scan starts a new stream.
 """
 
 from __future__ import annotations

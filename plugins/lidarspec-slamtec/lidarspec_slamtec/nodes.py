@@ -1,10 +1,10 @@
-"""Points with their own angle: the five-byte nodes of a scan, and HQ capsules of 96 nodes.
+"""Points with their own angle: nodes of five bytes, and HQ capsules of 96 nodes.
 
 An HQ capsule has a CRC-32, but a node has no checksum. A node is valid if S and its inverse differ,
 the check bit is 1 and the angle is below 360 degrees, which is true for 17.6 % of all random
 sequences of five bytes. Nodes are therefore accepted only in runs of `CONFIRM` nodes without a gap.
-The table has the number of nodes that were accepted but not sent, for runs of 1, 6, 8, and the
-selected 10:
+The table shows how many nodes were accepted that were not sent, if runs of 1, 6, 8 or 10 nodes are
+required. 10 is the selected value:
 
     random bytes, 8 MiB                          865 530    1 192      32       0
     express capsules, 2 MiB                      227 743    3 767     551     159
@@ -14,12 +14,12 @@ selected 10:
     joining nodes in the middle of one, 300 x        135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
-If distances hardly change, every cabin of a capsule has the same bits, which explains rows two and
-three. Nodes are searched for only after the descriptor 81, so capsules are searched for nodes only
-if a later descriptor was lost. The last row has the number of nodes that continue an accepted run
-at a shifted offset, which no run length prevents. Of 419,430 sent nodes, 411,423 are recovered with
-runs of 1 and 395,728 with runs of 10. The streams have noise of a few millimetres. A test repeats
-this with less data.
+If distances hardly change, every cabin of a capsule has the same bits, which explains the numbers
+in rows two and three. Nodes are searched for only after the descriptor 81. Capsules are therefore
+searched for nodes only if a later descriptor was lost. The nodes in the last row continue an
+accepted run at a shifted offset, which no run length prevents. Of 419,430 nodes that were sent,
+411,423 are found with runs of 1, and 395,728 with runs of 10. The distances in the streams have a
+noise of a few millimetres. A test repeats this with less data.
 
 Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
 handler_hqnode.cpp).

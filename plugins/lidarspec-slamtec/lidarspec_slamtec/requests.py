@@ -24,7 +24,7 @@ from lidarspec.spec import Checksummed, Frame, Scaled, Xor
 from lidarspec_slamtec.answers import KEY
 
 START = Const(b"\xa5")
-#: Codes of requests without a payload, and with one.
+#: The codes of requests without a payload, and of requests with a payload.
 PLAIN_CODES = {
     "scan": 0x20,
     "force_scan": 0x21,

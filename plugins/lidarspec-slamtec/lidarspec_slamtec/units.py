@@ -1,8 +1,8 @@
 """Simulated replies of each model: information, scan modes, and the descriptor of each mode.
 
-Source: the information and the mode Sensitivity of the A1 are replies of a live A1. The rest is
-assumed: the times and ranges of the other modes are those that the vendor's SDK prints for similar
-models, and models differ only in the kinds of their capsules.
+Source: the information and the mode Sensitivity of the A1 are from the replies of a live A1.
+Everything else is assumed. The times and ranges of the other modes are the values that the vendor's
+SDK prints for similar models. Models are assumed to differ only in the kinds of their capsules.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Unit:
     """Values of a simulated unit.
 
     Attributes:
-        model: the model number in its information.
+        model: the model number in the reply with information.
         modes: its scan modes; the typical mode is the last.
     """
 
@@ -64,7 +64,7 @@ class Unit:
     modes: tuple[Mode, ...]
 
     def answers(self) -> dict[str, Any]:
-        """Return the replies by command that are not derived from the request."""
+        """Return the replies that do not depend on the request, by command."""
         information = {
             "model": self.model,
             "firmware_minor": 29,
@@ -85,7 +85,7 @@ class Unit:
         }
 
     def reply_config(self, request: Mapping[str, Any]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """Return the reply with a configuration value, empty for unknown keys and modes."""
+        """Return the reply with a configuration value; empty for an unknown key or mode."""
         key = request["key"]
         number = request.get("mode", 0)
         if number >= len(self.modes):
@@ -102,7 +102,7 @@ class Unit:
         return (answers.make_config(key, values[key]),) if key in values else ()
 
     def reply_descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the descriptor of the requested scan mode, empty for an unknown mode.
+        """Return the descriptor of the requested scan mode; empty for an unknown mode.
 
         Mode 0 of an express request is the plain express scan.
         """
