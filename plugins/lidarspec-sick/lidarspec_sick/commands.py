@@ -209,7 +209,7 @@ def make_commands(scan: str) -> dict[str, Command]:
     }
 
 
-#: Simulated replies that are not derived from the request.
+#: Simulated replies that do not depend on the request.
 SIMULATED_ANSWERS: dict[str, Any] = {
     "get_state": (("state", {"readiness": 1}),),
     "get_firmware": (("firmware", {"text": b"V1.0"}),),

@@ -1,10 +1,10 @@
 """multiScan100 and picoScan100: compact telegrams over UDP with scans or IMU samples.
 
-Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4;
+Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout of versions 3 and 4;
 multiScan136 operating instructions 8027119 for segments and layers. A telegram is a chain of
-modules under one CRC. Each module has its own layers, beams and echoes. Its azimuths are on the
-wire, or evenly spaced between the azimuths of its first and last beam. Elevation counts downwards.
-Bit 0 of a beam's property means a reflector.
+modules under one CRC. Each module has its own layers, beams and echoes. The azimuths are sent for
+each beam, or are evenly spaced between the azimuths of the first and the last beam. Elevation
+counts downwards. Bit 0 of a beam's property means a reflector.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ CRC = Crc(
     32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little"
 )
 MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
-#: Three echoes of the 900 beams of a segment of a multiScan136 need 14,160 bytes.
+#: Maximum size of a telegram. For a multiScan136, the 900 beams of a segment with three echoes each
+#: need 14,160 bytes.
 MAX_TELEGRAM_BYTES = 16_384
 AZIMUTH_STEP_RAD = 1 / 5215
 ZERO_AZIMUTH_STEPS = 16_384  # the azimuth straight ahead on the wire

@@ -4,11 +4,11 @@ A message is one scan. It is sent in several datagrams, each of which has its of
 
 Source: the vendor's driver sick_safetyscanners (ParseDatagramHeader, UDPPacketMerger,
 ParseDataHeader, ParseDerivedValues, ParseMeasurementData, ParseTypeCodeData.cpp, DatagramHeader.h,
-SickSafetyscannersRos.cpp). The blocks of a message may be placed anywhere; here they have the order
-of their entries in the header, and the derived values and the measurements must be sent. The
-content of the blocks for the system state, intrusions and applications is not described. Settings
-over CoLa 2, with which a program chooses its address and the blocks, are not described either. The
-port is assumed.
+SickSafetyscannersRos.cpp). The blocks of a message may be at any offset. This module requires that
+they are in the order of their entries in the header, and that the derived values and the
+measurements are sent. It does not decode the content of the blocks for the system state, intrusions
+and applications. The commands of CoLa 2, with which a program selects its address and the blocks,
+are not supported. The port is assumed.
 """
 
 from __future__ import annotations
@@ -50,16 +50,17 @@ from lidarspec.spec import (
 PORT = 6060
 HEADER_BYTES = 52
 DERIVED_BYTES = 20
-#: Possible offsets of the blocks: the block of the system state (16 bytes) may be before them, and
-#: padding to a multiple of 4 bytes.
+#: Possible offsets of the blocks. The block of the system state (16 bytes) may be before them, as
+#: well as padding to a multiple of 4 bytes.
 DERIVED_OFFSETS = range(HEADER_BYTES, HEADER_BYTES + 65, 4)
 MEASUREMENT_OFFSETS = range(HEADER_BYTES + DERIVED_BYTES, HEADER_BYTES + DERIVED_BYTES + 97, 4)
 MAX_BEAMS = 2751  # ParseMeasurementData.cpp
 MAX_MESSAGE_BYTES = 16_384
-#: Degrees of a raw angle (DerivedValues.h), and of the direction ahead (SickSafetyscannersRos.cpp).
+#: Degrees per raw step of an angle (DerivedValues.h). The next constant is the angle straight ahead
+#: in degrees (SickSafetyscannersRos.cpp).
 ANGLE_STEP_DEG = 1 / 4_194_304
 AHEAD_DEG = 90.0
-#: Days from 1970-01-01 to 1972-01-01, at which the date begins.
+#: Days from 1970-01-01 to 1972-01-01, the day from which dates are counted.
 EPOCH_DAYS = 730
 SECONDS_PER_DAY = 86_400
 MM = 0.001  # m

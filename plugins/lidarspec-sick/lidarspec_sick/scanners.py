@@ -5,9 +5,9 @@ They use CoLa B or CoLa A.
 Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883
 (steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10).
 Assumed, because no data sheet was available: the steps, rates and angles of TiM7xx and LMS1xx, the
-rates of an LMS5xx, and the ranges of all. Telegrams contain the settings, so models are
-distinguished by settings that other models do not support. If that is not enough, the reply to
-`get_identity` contains the model.
+rates of an LMS5xx, and the ranges of all. Telegrams contain the settings of the scanner. Models are
+therefore distinguished by settings that other models do not support. If this is not sufficient, the
+reply to `get_identity` contains the model.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class Kind:
         start: the first angle in degrees.
         beams: the number of beams of a simulated scan.
         echoes: the maximum number of echoes.
-        layers: the elevations of the layers in the order in which they are sent, degrees downwards.
+        layers: the elevations of the layers in the order in which they are sent, in degrees,
+            positive downwards.
     """
 
     rates: tuple[float, ...]
@@ -130,10 +131,10 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
 
 
 def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
-    """Return the frames of scans, with one echo and with all, and of messages.
+    """Return the frames of scans, with one echo and with all echoes, and of messages.
 
-    The frames of scans are in both forms, first in the form `cola`. The frames of messages are in
-    the form `cola` only.
+    There are frames for scans in CoLa A and in CoLa B; those in `cola` come first. The frames of
+    messages are only in `cola`.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
@@ -152,7 +153,7 @@ def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
     """Return the scanner for commands in CoLa A or B, and a number of echoes.
 
-    Scans are read in both forms, with one echo and with `echoes`, by default all.
+    Scans are read in CoLa A and in CoLa B, with one echo or with `echoes` echoes, by default all.
 
     Raises:
         UsageError: if the scanner has fewer echoes.

@@ -2,10 +2,11 @@
 
 Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating
 instructions 8023198 (LMS4000), with the values below 16 that are not distances; 8020494 (MRS1000)
-for the layers; sick_scan_xd for the zero direction. A telegram has one layer. Its 16-bit channels
-are DIST1 to DISTn, followed by RSSI1 to RSSIn if requested, in 16 or in 8 bits. If both are
-present, the intensity is from the 8-bit channels. Telegrams with channels of other kinds (ANGL,
-VANG, QLTY) are not supported. A third of a degree is 0.3333 on the wire, and is not rounded.
+for the layers; sick_scan_xd for the zero direction. A telegram has one layer. It has the channels
+DIST1 to DISTn with 16 bits. If requested, the channels RSSI1 to RSSIn follow, with 16 or 8 bits. If
+there are RSSI channels of both sizes, the intensity is from the 8-bit channels. Telegrams with
+channels of other kinds (ANGL, VANG, QLTY) are not supported. An angle of a third of a degree is
+sent as 0.3333, and is used unchanged.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ DISTANCE = (
     Scaled(Int16ub, 0.001, "m")
     * "before the multiplication by the scale factor; raw values below 16: no distance"
 )
-#: Higher rates are in Hz instead of 100 Hz, because of an error in some firmware (sick_scan_xd).
+#: The unit of the rate is 100 Hz, but some firmware erroneously sends the rate in Hz
+#: (sick_scan_xd). A rate above this limit is therefore divided by 100.
 MAX_BEAM_RATE_HZ = 1e6
 MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
@@ -78,7 +80,7 @@ def make_channel(
     Args:
         content: the name of the content, as sent.
         values: the type of a sample.
-        first: whether it is the first channel, whose number of values all others have.
+        first: whether it is the first channel. All other channels have the same number of values.
         name: the name of the field, by default the content in lower case.
     """
     count = this.count if first else this._.dist1.count
@@ -179,7 +181,7 @@ def plausible(f: Fields, echoes: int) -> Any:
 
 
 def points(f: Fields, echoes: int) -> Polar:
-    """Return points from the start angle on, each with `echoes` returns."""
+    """Return points from the start angle on, with `echoes` returns for each beam."""
     first = f.dist1
     distances = [getattr(f, f"dist{index}") for index in range(1, echoes + 1)]
     strengths = [getattr(f, f"rssi{index}") for index in range(1, echoes + 1)]
