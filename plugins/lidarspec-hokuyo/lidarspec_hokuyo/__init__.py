@@ -1,17 +1,18 @@
 """Hokuyo scanners with SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
 
-The reply to a scan command is one revolution. It contains the requested steps, but neither the
-number of steps of a full revolution nor the model. MD requests continuous scans with distances, ME
-with distances and intensities, MS with distances of two characters, and ND and NE with all echoes.
-GD, GE, GS, HD and HE request one scan; the laser has to be switched on with `laser_on` before.
-Scans with any steps are decoded. ``configure(content=, first=, last=, cluster=)`` selects the steps
-that are requested.
+The reply to a scan command contains the measurements of one revolution and the range of requested
+steps. It contains neither the number of steps of a full revolution nor the model. MD requests
+continuous scans with distances, ME with distances and intensities, MS with distances of two
+characters, and ND and NE with all echoes. GD, GE, GS, HD and HE request one scan; the laser has to
+be switched on with `laser_on` before. Scans with any range of steps are decoded.
+``configure(content=, first=, last=, cluster=)`` selects the steps that are requested.
 
 Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the reply of a URG-04LX to PP);
 UST-10LX/20LX, C-42-04076 (port); replies of a UST-10LX and a UTM-30LX-EW to PP, published by users,
 for their ranges and speed. It is assumed that a UST-20LX and a UTM-30LX reply in the same way as a
-UTM-30LX-EW, except for the shortest range of the UST-20LX, that only a URG-04LX accepts SS, CR and
-HS, and that it accepts neither ME nor GE. Several echoes are documented for the UTM-30LX-EW only.
+UTM-30LX-EW, except for the shortest range of the UST-20LX. It is also assumed that only a URG-04LX
+accepts SS, CR and HS, and that a URG-04LX accepts neither ME nor GE. Several echoes are documented
+for the UTM-30LX-EW only.
 """
 
 from __future__ import annotations

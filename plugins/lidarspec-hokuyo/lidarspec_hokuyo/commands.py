@@ -1,8 +1,8 @@
 """Commands and their replies.
 
-A reply has an echo of the command, a status and optional lines with a name and a value. In the
-lines of VV, PP and II the check character covers the text before the semicolon. Commands end with a
-line feed. They are sent without the optional text that a scanner would repeat.
+A reply consists of an echo of the command, a status and optional lines, each with a name and a
+value. In the lines of VV, PP and II, the check character covers the text before the semicolon.
+Commands end with a line feed. They are sent without the optional text that a scanner would repeat.
 
 Source: SCIP 2.0, C-42-03320B, section 8 (BM, QT, RS, TM, SS, CR, HS, VV, PP, II).
 """
@@ -70,7 +70,7 @@ VALUE_REPLIES = {f"get_{name}": name for name in REPORTED_VALUES}
 
 @dataclass(frozen=True)
 class LineCheck(Checksum):
-    """The lowest six bits of the sum of a line's characters, plus 30 (hexadecimal).
+    """The lowest six bits of the sum of a line's characters, plus 30 in hexadecimal.
 
     The semicolon at the end of the line is not part of the sum.
     """
@@ -147,7 +147,8 @@ def make_command_frame(command: bytes, size: int) -> Frame:
     return Frame(Struct("command" / Const(command), *value, "end" / Const(b"\n")), direction="out")
 
 
-#: Name -> the sent letters, the characters of its argument, and further arguments of `Command`.
+#: Name -> the letters of the command, the number of characters of its argument, and further
+#: arguments of `Command`.
 ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
     "stop": (b"QT", 0, {"stops": True}),
     "laser_on": (b"BM", 0, {}),

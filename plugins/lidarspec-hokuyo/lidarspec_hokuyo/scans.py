@@ -1,10 +1,10 @@
 """Scans with distances of two or three characters, or with distances and intensities.
 
 ME and GE request a distance and an intensity of three characters each. ND, NE, HD and HE request
-the same for each echo of a step, with "&" between echoes. A cluster of steps is sent as one
-distance, the shortest. It is assumed that a last cluster of fewer steps is sent as well, that the
-direction of a cluster is that of its middle, and that a step has at most three echoes, as in
-Hokuyo's urg_library.
+the same for each echo of a step, with "&" between echoes. Several steps can be merged to a cluster,
+for which the scanner sends one distance, the shortest. It is assumed that a last cluster with fewer
+steps is sent as well, that the direction of a cluster is the direction of its middle, and that a
+step has at most three echoes, as in Hokuyo's urg_library.
 
 Source: SCIP 2.0, C-42-03320B, sections 5 (steps), 6 (characters), 8.1 (MD and MS, time, errors) and
 8.2 (GD and GS); UTM-30LX-EW, C-42-03886 (intensities and echoes).
@@ -77,7 +77,7 @@ class RequestedSteps:
 
     @property
     def text(self) -> bytes:
-        """The steps in the form of a command."""
+        """The steps as they are written in a command."""
         return f"{self.first:04}{self.last:04}{self.cluster:02}".encode()
 
 
@@ -131,7 +131,7 @@ def plausible(f: Fields, end: int) -> Any:
 
 
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
-    """Return points from the first step on, counter-clockwise.
+    """Return points that begin at the first step, counter-clockwise.
 
     A value below the shortest distance is an error code or a missing echo; its point is invalid.
     """
