@@ -1,4 +1,4 @@
-"""YDLIDAR's 360 degree lidars over a UART: one packet, with samples in eight forms.
+"""YDLIDAR's 360 degree lidars over a UART: one packet, eight formats of samples.
 
 Most models start to measure after a request. Models with one channel cannot receive, and measure
 without a request.
@@ -6,9 +6,10 @@ without a request.
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
 Known errors and gaps: the angles of the protocol's example, 217.0178 and 235.6326 degrees, are
-217.0191 and 235.6313 by its own formula. Packets do not contain the form of their samples, which
-shows only in their size: choose the model by its name. Not supported: GS1, GS2, GS5 and TIA, which
-have other protocols, and the network models T15 and T30.
+217.0191 and 235.6313 by its own formula. Packets do not contain the format of their samples.
+Formats with samples of different sizes can be recognised, but the others cannot, so select the
+model by its name. Not supported: GS1, GS2, GS5 and TIA, which have other protocols, and the network
+models T15 and T30.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ SAMPLES_PER_PACKET = 40  # number of samples of a full packet (protocol, LSN)
 SIMULATED_SPEED_HZ = 6.0  # within the limits of all models
 #: The scan frequency that packets of a T-mini Pro in good state contain most often.
 GOOD_STATE_HZ = 0.8
-#: Bytes per sample -> CSPC models with the same packet, but other meanings of the sample bits.
+#: Bytes per sample -> CSPC models with the same packets, in which the bits of samples have other
+#: meanings.
 CSPC_MODELS = {
     2: ("cspc-m1c1-mini-v11",),
     3: ("cspc-m1c1-mini", "cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6"),
@@ -76,7 +78,7 @@ def make_angle() -> Construct:
 def plausible(f: Fields) -> Any:
     """Return whether angles are below 360 degrees and the number of samples is valid.
 
-    A packet has at least one sample, and a zero packet exactly one.
+    A packet has at least one sample, and a zero packet has exactly one sample.
     """
     return (
         (f.fsa.angle < 360)
@@ -88,7 +90,7 @@ def plausible(f: Fields) -> Any:
 
 @cache
 def make_data_frame(form: Form) -> Frame:
-    """Return the frame of a packet with samples of this form."""
+    """Return the frame of a packet with samples of this format."""
     frequency = Scaled(BitsInteger(7), 0.1, "Hz", form.slowest)
     struct = Struct(
         "header" / Const(b"\xaa\x55"),
@@ -114,7 +116,7 @@ def make_data_frame(form: Form) -> Frame:
 
 @cache
 def make_points_function(form: Form) -> Callable[[Fields], Points]:
-    """Return the `points` function of packets with samples of this form."""
+    """Return the `points` function of packets with samples of this format."""
     return partial(points, form=form)
 
 
@@ -181,7 +183,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """Return id -> how to recognize it, of each model with samples of the same size.
+    """Return how to recognize other models with samples of the same size, by id.
 
     These include models of CSPC, which send the same packet.
     """

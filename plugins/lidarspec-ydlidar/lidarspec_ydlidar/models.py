@@ -17,10 +17,10 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        form: the form of its samples.
+        form: the format of its samples.
         baud: the baud rate.
         rate: samples per second.
-        range_limits: in metres.
+        range_limits: the shortest and the longest range, metres.
         turn: the lowest and the highest number of scans per second.
         number: the model number in the device information; 0 if it is not documented.
         one_channel: whether the model only sends and cannot receive.

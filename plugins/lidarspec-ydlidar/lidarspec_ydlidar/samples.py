@@ -1,4 +1,4 @@
-"""YDLIDAR samples: two, three or four bytes, in eight forms.
+"""The eight formats of YDLIDAR samples, which have two, three or four bytes.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response) and
 core/common/ydlidar_protocol.h.
@@ -20,16 +20,16 @@ NO_RETURN_NOTE = "0: no return"
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """One form of samples.
+    """One format of samples.
 
     Attributes:
         struct: the struct of a sample.
         size: bytes of a sample.
-        groups: sizes in bytes of the words of a sample that the checksum combines.
+        groups: the sizes in bytes of the words into which the checksum divides a sample.
         correction: a function of the distance in metres that returns the degrees to add to the
             angle.
         slowest: the scan frequency in Hz of the raw value 0.
-        has_intensity: whether it has an intensity.
+        has_intensity: whether a sample has an intensity.
     """
 
     struct: Construct
@@ -55,7 +55,7 @@ def make_plain_distance(step: float) -> Construct:
 
 
 def make_packed_sample(*lower_fields: Construct) -> Construct:
-    """Return the struct of a sample with millimetres in the upper 14 bits."""
+    """Return the struct of a sample with the distance in mm in the upper 14 bits."""
     return ByteSwapped(
         BitStruct("distance" / Scaled(BitsInteger(14), 0.001, "m") * NO_RETURN_NOTE, *lower_fields)
     )
