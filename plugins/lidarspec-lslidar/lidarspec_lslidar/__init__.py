@@ -1,17 +1,17 @@
 """LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars with a UART.
 
-Numbers have the high byte first. The C16 is in `c16`.
+Numbers are big-endian. The C16 is in the module `c16`.
 
 Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
-lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a sum.
-Packets of the M10 family have no checksum, only marks at both ends. The value that the older driver
-calls speed is the time of 15 degrees in microseconds: 4167 at 10 revolutions a second, and 3460 to
-3490 for an M10P at 12.
+lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a checksum,
+which is a sum. Packets of the M10 family have no checksum, only constant bytes at both ends. The
+value that the older driver calls speed is the time for 15 degrees, in microseconds: 4167 at 10
+revolutions a second, and 3460 to 3490 for an M10P at 12 revolutions a second.
 
 Angles are clockwise in the older driver and in this module, but counter-clockwise in the newer
-driver. For an M10, both drivers divide 15 degrees by the number of samples that are not FFFF; this
-module divides it by the number of all samples. The meaning of bytes 103 and 104 of an N10P is not
-documented.
+driver. For an M10, both drivers divide 15 degrees by the number of samples that are not FFFF. This
+module divides 15 degrees by the number of all samples. The meaning of bytes 103 and 104 of an N10P
+is not documented.
 """
 
 from __future__ import annotations
@@ -160,8 +160,8 @@ def n10p_points(f: Fields) -> Polar:
 def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
     """Return points at even steps over 15 degrees from the start angle on.
 
-    Strongly reflecting points have the intensity 255, as in the driver. The function `count`
-    returns the number of samples of a packet.
+    Points with a strong reflection have the intensity 255, as in the driver. `count` is a function
+    that returns the number of samples of a packet.
     """
     samples = count(f)
     clockwise = spread(
@@ -270,7 +270,7 @@ INFO = Frame(
         "end" / END,
     )
 )
-#: Codes of commands, and filters.
+#: The codes of commands. The next constant has the codes of filters.
 CODES = {"run": 1, "stop_motor": 3, "filter": 6, "get_info": 8, "set_speed": 0x0A}
 FILTERS = {"none": 0x0A, "normal": 0x0B, "near": 0x0C}
 COMMAND = Frame(

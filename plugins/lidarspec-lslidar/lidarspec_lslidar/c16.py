@@ -1,18 +1,18 @@
 """LSLIDAR C16 with packets of 1212 bytes: a rotating lidar with 16 lasers over UDP.
 
-Numbers have the low byte first.
+Numbers are little-endian.
 
 Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
 manual of the C32 for the offsets of the device information. The lasers fire at intervals of 3.125
 us, as in the previous edition. This agrees with the steps of 0.36 degrees in a captured packet at
 20 revolutions a second. The last firing of a packet is at the time of the packet, as in the driver.
 
-The clock is read as a date and nanoseconds, which the sensor sends with GPS. With PTP the same
-bytes are seconds, and with NTP the last part has microseconds; only the device information contains
-the time source. A C16 of the previous edition sends packets of 1206 bytes, which are the same as
-those of a Velodyne except for their angles. They are not supported. Configuration, for which the
-whole device information is sent back, and angles that a unit has measured itself are not supported
-either.
+The clock is read as a date and nanoseconds, which the sensor sends if it is synchronized by GPS.
+With PTP, the same bytes are seconds, and with NTP, the last bytes are microseconds. Only the device
+information contains the source of the time. A C16 of the previous edition sends packets of 1206
+bytes, which are the same as those of a Velodyne except for their angles. They are not supported.
+Two more features are not supported: configuration, for which the whole device information has to be
+sent to the sensor, and angles that a unit has measured itself.
 """
 
 from __future__ import annotations
@@ -122,10 +122,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
-    """Return points clockwise from ahead, with azimuths interpolated between blocks.
+    """Return the points; azimuths are interpolated between blocks.
 
-    The optical centre is at a distance from the axis and rotates with the lasers. `unit` is the
-    distance step in centimetres.
+    Azimuths are clockwise from straight ahead. The optical centre is at a distance from the axis,
+    and rotates with the lasers. `unit` is the distance step in centimetres.
     """
     dual = f.return_mode == DUAL
     block = np.arange(BLOCKS)[:, None, None]
