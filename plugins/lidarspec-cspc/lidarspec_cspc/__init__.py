@@ -6,13 +6,14 @@ Source: CSPC M1C1_Mini development manual, sections 1 and 2. Facts missing there
 vendor's SDK (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1
 (2020-01-22), or captures of a COIN-D4 and a COIN-D6.
 
-Known errors and gaps of the manual: the printed sum of the device information, 0x0402, is 0x0403
-(v1.1 has it right); the corrections of the angle example, 10.9442 and 11.8653 degrees, are 10.9445
-and 11.8674 at 1000 and 8000 mm, and 71.1718 is 71.171875; the figure with the order of the checksum
-is missing (the grouping here fits every captured packet); no baud rate, no rule for packets that
-cross 360 degrees or have one sample (the formula divides by LSN - 1), no command for the announced
-switch between 5.5 and 7 Hz. A COIN-D4 sends the fillers FE and FF, and FA FA once, which no manual
-mentions.
+Known errors of the manual: The printed sum of the device information, 0x0402, should be 0x0403, as
+in v1.1. In the angle example, the corrections 10.9442 and 11.8653 degrees should be 10.9445 and
+11.8674 (at 1000 and 8000 mm), and 71.1718 should be 71.171875.
+
+Known gaps of the manual: The figure with the order of the checksum is missing; the grouping in this
+module fits every captured packet. There is no baud rate, no rule for packets that cross 360 degrees
+or have one sample (the formula divides by LSN - 1), and no command for the announced switch between
+5.5 and 7 Hz. A COIN-D4 sends the fillers FE and FF, and FA FA once, which no manual mentions.
 
 Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
 captures: 10 revolutions a second, 400 points each, and an unexplained frame every three seconds.
@@ -182,7 +183,7 @@ def make_data(
     Args:
         first: the fields of the first byte, M&T.
         sample: the struct of one sample.
-        groups: sizes in bytes of the words of a sample that enter the checksum.
+        groups: the sizes in bytes of the words into which the checksum divides a sample.
     """
     return Checksummed(
         Struct(
@@ -237,7 +238,7 @@ def is_ack_plausible(f: Fields) -> Any:
 def plausible(f: Fields) -> Any:
     """Return whether angles are below 360 degrees and the sample count fits.
 
-    A packet has at least one sample, a start packet exactly one (manual 2.2.3, M&T).
+    A packet has at least one sample, and a start packet has exactly one sample (manual 2.2.3, M&T).
     """
     return (
         (f.fsa.angle < 360)
@@ -248,7 +249,7 @@ def plausible(f: Fields) -> Any:
 
 
 def correction(distance: Any) -> Any:
-    """Return the angle correction in degrees, 0 if there is no return.
+    """Return the angle correction in degrees; 0 if there is no return.
 
     `distance` is in metres. Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
     """
@@ -259,10 +260,10 @@ def correction(distance: Any) -> Any:
 def directions(f: Fields, zero: str) -> tuple[Any, Any]:
     """Return the angles of the samples in degrees, uncorrected and corrected.
 
-    Uncorrected angles are evenly spaced from FSA to LSA and count from the zero of the data.
-    Corrected angles (manual 2.2.3) count clockwise from the zero of the data, or from the mark on
-    the housing if `zero` is "housing". If the sensor reports that it does not turn clockwise, the
-    angles of the wire count counter-clockwise; this is assumed, as the manual has only clockwise.
+    Uncorrected angles are evenly spaced from FSA to LSA, relative to the zero of the data.
+    Corrected angles (manual 2.2.3) are clockwise from the zero of the data, or from the mark on the
+    housing if `zero` is "housing". If the sensor reports that it does not turn clockwise, the sent
+    angles are assumed to be counter-clockwise; the manual describes only clockwise rotation.
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     corrected = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
@@ -311,14 +312,14 @@ def configure(
 class Turning:
     """The simulated values of each packet, while the sensor turns at one speed.
 
-    A revolution is a start packet, then packets of 25 samples and a shorter one. The exposure
-    follows the speed after three revolutions (manual 2.2.3).
+    A revolution consists of a start packet, packets of 25 samples, and a shorter packet. Three
+    revolutions after a change of the speed, the exposure changes as well (manual 2.2.3).
 
     Attributes:
         hertz: revolutions per second.
         steps: points per revolution.
         exposure: the exposure at the beginning.
-        before: the values of the packets that complete the revolution before, at another speed.
+        before: the values of the packets that complete the previous revolution, at another speed.
         firmware: the customer firmware.
         follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.
     """
@@ -406,8 +407,8 @@ def make_start_packets(
 ) -> tuple[Any, ...]:
     """Return the simulated replies to the start command.
 
-    A sensor acknowledges, sends fillers until its speed has settled, then noise and its device
-    information (manual 1b, 2.1.3 and 2.2).
+    A sensor acknowledges the command, and sends fillers until its speed has settled. It then sends
+    noise and its device information (manual 1b, 2.1.3 and 2.2).
     """
     return (
         ("ack", {"firmware": firmware}),
@@ -421,7 +422,8 @@ def make_start_packets(
 def has_customer_firmware(f: Fields) -> Any:
     """Return whether the upper bits of M&T are set in a packet without start flag.
 
-    A CSPC sets them at most in the first packet after a start (manual 2.2.3, M&T).
+    A CSPC lidar sets them only in the first packet after a start packet, if at all (manual 2.2.3,
+    M&T).
     """
     return (f.mt.start == 0) & (f.mt.m > 0)
 
@@ -429,8 +431,8 @@ def has_customer_firmware(f: Fields) -> Any:
 def has_bits_beside_firmware(f: Fields) -> Any:
     """Return whether the upper bits of M&T are set, and are not the customer firmware.
 
-    The firmware is in the packet after a start packet, and the same in each revolution. The first
-    packet of a batch does not count, because the packet before it is not known.
+    The firmware is sent in the packet after a start packet, and is the same in each revolution. The
+    first packet of a batch is ignored, because the packet before it is not known.
     """
     begins = np.asarray(f.mt.start == 1)
     values = np.asarray(f.mt.m)
