@@ -5,8 +5,8 @@ Lidars of vacuum cleaners, which send without a request. The host drives the mot
 Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
 packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
 angle of its first sample. Its span is 360 degrees divided by the packets per revolution, which are
-16, or 15 for a 2G. One driver computes the sum modulo FFFF instead of 10000, which is an error. The
-zero offset in the packets is not added to the angles, as in the drivers.
+16, or 15 for a 2G. One driver computes the sum modulo FFFF (hexadecimal) instead of modulo 10000,
+which is an error. The zero offset in the packets is not added to the angles, as in the drivers.
 """
 
 from __future__ import annotations

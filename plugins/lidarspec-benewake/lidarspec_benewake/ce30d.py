@@ -1,12 +1,13 @@
 """Benewake CE30-D: solid-state lidar of 320 by 20 pixels over UDP.
 
 Source: the vendor's SDK ce30_driver 1.3 (packet.h, packet.cpp, udp_socket.h, README.md), and a
-driver in MATLAB (LidarDriver, ce30Sensor.m and ce30_ExtractAngleDist.m), which agree. A scan comes
-in 27 packets of 12 columns, so that the last packet has 4 columns beyond the field of view. The
-content of the 42 bytes of the header is not documented, except one bit for the grey image. The byte
-order of the time is uncertain (the SDK shifts it beyond its size), so that times are those of the
-host. Grey images are not read, and replies to other commands are not known. The y axis is assumed
-to point to the left, as in the point cloud of the SDK. The simulated rate is assumed.
+driver in MATLAB (LidarDriver, ce30Sensor.m and ce30_ExtractAngleDist.m), which agree. A scan is
+sent in 27 packets of 12 columns, so the last packet has 4 columns beyond the field of view. The
+header has 42 bytes. Its content is not documented, except for one bit that marks a grey image. The
+byte order of the time is uncertain, because the SDK shifts the time by more bits than it has. The
+time is therefore not used, and points have the host's time. Grey images are not read, and replies
+to other commands are not known. The y axis is assumed to point to the left, as in the point cloud
+of the SDK. The simulated rate is assumed.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """Cepton Vista: forward-looking lidars, which send Cartesian points over UDP.
 
 Source: the first part of Cepton's Sensor Communication Specifications
-(developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither states
-whether the letters STDV are sent in this order, or as a number with the low byte first, so both are
-accepted. The maximum range and the simulated pattern are assumed. It is also assumed that the time
-of a point counts from the previous point, because 144 points take longer than a byte can represent.
-Information and fault packets are not public and are skipped. No captured packet was available.
+(developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither source
+states whether the letters STDV are sent in this order, or in reverse order as a little-endian
+number, so both orders are accepted. The maximum range and the simulated pattern are assumed. It is
+also assumed that the time of a point counts from the previous point, because 144 points take longer
+than a byte can represent. Information and fault packets are not public and are skipped. No captured
+packet was available.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the points; the axes right, ahead, up are converted to ahead, left, up."""
+    """Return the points, converted from the axes right, ahead, up to ahead, left, up."""
     members = f.points
     return Cartesian(
         members.y,

@@ -3,18 +3,19 @@
 The models measure by time of flight or by triangulation and send data without a request.
 
 Source: STL-27L development manual, section 3. Rates, baud rates and the other frames come from the
-vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P share frame, baud rate and
-point rate, so they are one sensor here. An LD14 triangulates; its angles are converted to angles
-around the axis of rotation as in the SDK (sl_transform.cpp). An older LD14P measures 2300 points a
-second.
+vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P have the same frame, baud rate
+and point rate, so they are a single sensor in this plugin. An LD14 measures by triangulation. Its
+angles are converted to angles around the axis of rotation, as in the SDK (sl_transform.cpp). An
+older LD14P measures 2300 points a second.
 
 The replies of an LD14P to commands are not documented, so commands do not wait for a reply. The
 baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's; no captured frame of the last
 two was available. The STL-50 is left out, because its protocol is not public.
 
-Known errors of the manual: the CRC table lacks entries 175 to 186 (it is generated here); the
-decode table of the example prints point 2 as 200 mm (0x00dc is 220) and point 12 as B0 00 EA (the
-dump, with a valid CRC, has C0 00 E5); no rule for frames that cross 360 degrees.
+Known errors of the manual: The CRC table lacks entries 175 to 186; this module generates the table.
+In the decoded example, point 2 is printed as 200 mm, but 0x00dc is 220, and point 12 is printed as
+B0 00 EA, but the dump, whose CRC is valid, has C0 00 E5. There is no rule for frames that cross 360
+degrees.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ INFO = with_crc(
     "hardware_version" / Int32ul,
     "firmware_version" / Int32ul,
 )
-#: Codes of commands; "get_firmware" is that of the motor's board.
+#: Codes of commands; "get_firmware" returns the firmware of the motor's board.
 CODES = {"start": 0xA0, "stop": 0xA1, "set_speed": 0xA2, "get_firmware": 0xA8}
 COMMAND = with_crc(
     "header" / Const(b"\x54"),
@@ -167,7 +168,7 @@ def make_id(name: str) -> str:
 
 
 def matches_rate(f: Fields, rate: int) -> Any:
-    """Return whether speed and angles of a frame fit `rate` best of all rates.
+    """Return whether `rate` fits the speed and angles of a frame best of all rates.
 
     `rate` is in points per second.
     """
@@ -195,7 +196,7 @@ def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """Return how to recognize each other model: by its point rate."""
+    """Return how to recognize each of the other models by its point rate."""
     others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
     others["oradar-ms200"] = MS200_POINT_RATE_HZ
     return {

@@ -1,10 +1,10 @@
-"""Neato XV-11 and related lidars of vacuum cleaners and the TurtleBot3, with a point per degree.
+"""Neato XV-11, and related lidars of vacuum cleaners and of the TurtleBot3.
 
-Source: the drivers xv_11_laser_driver, kaiaai/LDS (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and
-hls_lfcd_lds_driver of ROBOTIS; there are no public manuals. The XV-11 and Xiaomi's LDS01RR count
-angles counter-clockwise, and the LDS02RR counts them clockwise; the packets do not contain the
-direction. The host drives their motors with PWM, at 5 revolutions a second; they send nothing while
-the motor is off.
+They measure one point per degree. Source: the drivers xv_11_laser_driver, kaiaai/LDS
+(LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and hls_lfcd_lds_driver of ROBOTIS; there are no public
+manuals. The XV-11 and Xiaomi's LDS01RR count angles counter-clockwise, and the LDS02RR counts them
+clockwise; the packets do not contain the direction. The host drives their motors with PWM, at 5
+revolutions a second; they send nothing while the motor is off.
 
 The sources disagree about the HLS-LFCD2. Its speed is in tenths of a revolution per minute
 (ROBOTIS, thijses/HLS_LFCD) or in whole revolutions per minute (kaiaai). Its last two bytes are both

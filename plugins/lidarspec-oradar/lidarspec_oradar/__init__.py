@@ -1,10 +1,10 @@
 """ORADAR MS200: 360 degree time-of-flight lidar, which streams over a UART at 230 400 baud.
 
-The data frame is that of LDROBOT's LD06; commands and start messages are other ones.
+The data frame is the same as that of LDROBOT's LD06. Commands and start messages are different.
 
 Source: the vendor's SDK as published with oradar_lidar (ordlidar_protocol.h, ord_lidar_driver.cpp,
-utils.h) and its ROS node (oradar_scan_node.cpp, ms200_scan.launch.py). It does not state when
-the time in a frame restarts, so points have the time of the host. The replies to commands are not
+utils.h) and its ROS node (oradar_scan_node.cpp, ms200_scan.launch.py). The SDK does not state when
+the time in a frame restarts, so points have the host's time. The replies to commands are not
 documented. The messages with serial number and firmware after power-on (AA 55) are not read. The
 simulated number of points per second is assumed.
 """
@@ -68,7 +68,7 @@ DATA = Checksummed(
 
 
 def make_order(code: int, *content: Any) -> Frame:
-    """Return the frame of a command: header, code, type, size, content, XOR of all that, tail."""
+    """Return the frame of a command: header, code, type, size, content, XOR, tail."""
     struct = Struct(
         "body"
         / Checksummed(

@@ -1,8 +1,8 @@
 """Pepperl+Fuchs R2000: 360 degree scanner with the protocol PFSDP, over HTTP and UDP or TCP.
 
-A program asks the scanner over HTTP for a handle, which names the receiver of the data (UDP) or
-returns the port of the data (TCP), and starts the output with that handle. Without
-``feed_watchdog`` the output ends after a minute.
+A program requests a handle from the scanner over HTTP, and starts the output with this handle. With
+UDP, the request names the receiver of the data. With TCP, the reply contains the port of the data.
+Without ``feed_watchdog``, the output ends after a minute.
 
 Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as far as the drivers
 of the vendor repeat it: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg, pf_r2000_packet_a,
@@ -56,8 +56,9 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-#: The bytes of the header up to the angular increment, and the sizes that drivers name: 60 with two
-#: status words, 76 with the inputs and outputs and their times.
+#: The size of the header up to the angular increment. The next constant has the header sizes in
+#: drivers: 60 bytes with two status words, and 76 bytes with the inputs and outputs and their
+#: times.
 MIN_HEADER_BYTES = 52
 KNOWN_HEADER_BYTES = (60, 76)
 #: The header is padded to a multiple of 4 bytes; later versions may add more fields.
@@ -94,7 +95,7 @@ SAMPLES_BY_TYPE: Mapping[str, Construct] = {
 }
 
 
-#: 32 bits little-endian; bit 0 is the last field.
+#: A status word of 32 bits, little-endian. Bit 0 is the last field.
 STATUS_FLAGS = ByteSwapped(
     BitStruct(
         "reserved_31" / BitsInteger(1),
@@ -124,7 +125,7 @@ STATUS_FLAGS = ByteSwapped(
 
 
 def make_time() -> Construct:
-    """Return the struct of a time in the format of NTP, 64 bits, the fraction first."""
+    """Return the struct of a time in NTP's 64-bit format, with the fraction first."""
     return Struct("fraction" / Scaled(Int32ul, 2.0**-32, "s"), "seconds" / Scaled(Int32ul, 1, "s"))
 
 
@@ -173,9 +174,10 @@ def sample_interval(f: Fields) -> Any:
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds since the previous packet, which may be of the last revolution.
+    """Return the seconds since the previous packet.
 
-    All packets of a scan except the last have the same number of samples.
+    The previous packet may be in the previous revolution. All packets of a scan except the last
+    have the same number of samples.
     """
     interval = sample_interval(f)
     samples_before = f.first_index / np.maximum(f.packet_number - 1, 1)

@@ -1,12 +1,13 @@
-"""Quanergy M8 and MQ8: rotating lidars with eight lasers, which stream over TCP, high byte first.
+"""Quanergy M8 and MQ8: rotating lidars with eight lasers, which stream over TCP.
 
-Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h,
-data_packet_parser_00.cpp, data_packet_parser_04.cpp, data_packet_parser_m_series.h). In the client,
-the time of a packet is the time of its last firing. It is assumed that firings are evenly spaced,
-with 420,000 points a second; range limits and revolutions per second are assumed as well. The
-positions increase or decrease with the direction of rotation. The nanoseconds of packets before
-version 4 are in units of ten nanoseconds, which is not corrected here. Packets of other kinds (1
-and 6) and settings over HTTP are not supported. No captured packet was available.
+Numbers are big-endian. Source: the vendor's quanergy_client (packet_header.h,
+m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
+data_packet_parser_m_series.h). In the client, the time of a packet is the time of its last firing.
+It is assumed that firings are evenly spaced, with 420,000 points a second; range limits and
+revolutions per second are assumed as well. The positions increase or decrease with the direction of
+rotation. The nanoseconds of packets before version 4 are in units of ten nanoseconds, which is not
+corrected here. Packets of other kinds (1 and 6) and settings over HTTP are not supported. No
+captured packet was available.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from lidarspec.spec import (
 FIRINGS = 50
 LASERS = 8
 POSITIONS_PER_TURN = 10_400
-#: The first packet version with distance steps of 10 um; earlier versions have 10 mm.
+#: The first packet version with distance steps of 10 um; earlier versions have steps of 10 mm.
 FINE_STEP_VERSION = 5
 FIRING_PERIOD_S = LASERS / 420_000
 #: The seconds from the time of the packet to each firing.
@@ -55,7 +56,7 @@ DISTANCES: Construct = Array(
     LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5, one step is 10 mm"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
-#: version_mismatch: the versions of software and firmware do not match.
+#: The meaning of status bits. version_mismatch: the versions of software and firmware do not match.
 STATUS = Enum(Int16ub, good=0, version_mismatch=1, watchdog=2)
 
 
@@ -119,8 +120,8 @@ def plausible(f: Fields) -> Any:
 def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
     """Return three returns of each laser.
 
-    If a laser has fewer returns, the packet repeats the first or second distance as the third. The
-    first or second return is then left out, so that it is not counted twice.
+    If a laser has fewer than three returns, the packet repeats the first or second distance as the
+    third. In this case, the first or second return is left out, so that it is not counted twice.
 
     `elevation` is in radians, one per laser.
     """

@@ -7,9 +7,9 @@ A packet contains blocks of four channels, in spherical coordinates:
     [reserved(16), from version 2] count x [angles and their differences, 17 bytes, 4 points of 4
     bytes, or 8 with two returns]
 
-The checksum is not verified, because its CRC is not public. The vendor's SDK moves points by some
-centimetres away from the axis by a table, which is not used here. The number of blocks per packet
-and the simulated pattern are assumed.
+The checksum is not verified, because its CRC is not public. The vendor's SDK uses a table to move
+points by some centimetres away from the axis. This module does not use the table. The number of
+blocks per packet and the simulated pattern are assumed.
 
 Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and
 inno_lidar_packet_utils.h (angles of the channels); its ROS driver (port 8010); data sheet of the

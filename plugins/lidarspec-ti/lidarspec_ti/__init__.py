@@ -1,15 +1,16 @@
 """Texas Instruments IWR6843: a millimetre-wave radar with the out-of-box demo of the mmWave SDK 3.
 
-A frame on its data UART is a header and parts with a type and a length, selected by `guiMonitor`,
-padded with arbitrary bytes to a multiple of 32. Each point has a velocity. Its SNR is in a separate
-part, in the order of the points: ``packets.parts("tlvs.side_info")``.
+A frame on the data UART consists of a header and of parts, each with a type and a length.
+`guiMonitor` selects which parts are sent. The frame is padded with arbitrary bytes to a multiple of
+32 bytes. Each point has a velocity. The SNRs of the points are in a separate part, in the order of
+the points: ``packets.parts("tlvs.side_info")``.
 
-Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), which
-prints a header of 44 bytes that has 40 by its own table; mmWave SDK 3.5 (mmw_output.h) for the
-types of parts, dpif_pointcloud.h for points and SNR. Assumed: the cycles of the 200 MHz R4F, and
-the longest range. Heat maps, and parts of other demos of the toolbox, are kept as bytes. To
-configure and start the radar, send it the lines of a .cfg file over its other UART at 115 200 baud;
-this plugin does not.
+Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), in
+which the size of the header is given as 44 bytes, but is 40 bytes according to its own table;
+mmWave SDK 3.5 (mmw_output.h) for the types of parts, dpif_pointcloud.h for points and SNR. Assumed:
+the cycles of the 200 MHz R4F, and the longest range. Heat maps, and parts of other demos of the
+toolbox, are kept as bytes. To configure and start the radar, send it the lines of a .cfg file over
+its other UART at 115 200 baud; this plugin does not.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def make_part(kind: int, size: int, *members: Any) -> Struct:
 
     Args:
         kind: the type of the part.
-        size: bytes per element; remaining bytes are kept as `rest`.
+        size: bytes per element. Bytes that do not fill an element are kept as `rest`.
         members: the arrays.
     """
     return Struct(

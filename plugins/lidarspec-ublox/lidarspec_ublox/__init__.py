@@ -1,11 +1,12 @@
-"""u-blox GNSS receivers: UBX and NMEA on one line, for the time and position of lidars.
+"""u-blox GNSS receivers, for the time and position of lidars.
 
 Source: ZED-F9P Interface Description, UBX-18010854 R04 (protocol version 27), with page numbers.
 M8 receivers (protocol version 15 and later) send the same messages. CFG-MSG and CFG-RATE are
 deprecated from protocol version 23.01 on, and still accepted (p. 54 and 74).
 
-Known contradictions: the manual's example of RMC with `navStatus` (p. 23) has the checksum of the
-sentence without it. Receivers that write NMEA 2.3 omit `navStatus`, older versions `posMode` too.
+A receiver sends UBX and NMEA over the same line. Known errors: in the manual, the example of RMC
+with `navStatus` (p. 23) has the checksum of the sentence without `navStatus`. Receivers that send
+NMEA 2.3 omit `navStatus`; receivers that send older versions also omit `posMode`.
 """
 
 from __future__ import annotations
@@ -312,7 +313,7 @@ TIMEUTC_CLOCK_STATUS = ClockStatus(  # p. 168: "Valid UTC Time"
 
 
 def date_values(i: int, rate: float) -> dict[str, Any]:
-    """Return the date of simulated frame i, from Sunday, 2026-01-04, on."""
+    """Return the date of simulated frame i; frame 0 is on Sunday, 2026-01-04."""
     second = int(i // rate)
     return {
         "time_of_week": i / rate % WEEK_S,
@@ -328,7 +329,7 @@ def date_values(i: int, rate: float) -> dict[str, Any]:
 
 
 def pvt_sweep(i: int) -> dict[str, Any]:
-    """Return simulated solution i, five a second.
+    """Return the values of simulated solution i, of five a second.
 
     The receiver moves northward at 1 m/s from the manual's position.
     """
