@@ -375,7 +375,7 @@ def _write_frames(
 
 
 def _list_parts(sensor: Sensor, frame: str) -> list[str]:
-    """Return the types of the parts in frames of a type, such as "report.tags.temperature"."""
+    """Return the types of parts in a frame type, for example "report.tags.temperature"."""
     schema = get_codec(sensor.frames[frame]).schema
     return [f"{frame}.{path}" for path in schema.part_kinds]
 
@@ -388,7 +388,7 @@ def _select_frames(
     At its end, or when it is closed, warnings about the clock are printed.
 
     Args:
-        types: the frame types, and types of parts.
+        types: the frame types, and the types of parts.
 
     Raises:
         UsageError: if a required time is unknown, or if there are frames, but none is in the slice.
@@ -580,11 +580,11 @@ def _detect_sensor(source: str, target: str) -> Sensor:
 def _no_data_error(device: Device, target: str, types: Sequence[str] = ()) -> Exception:
     """Return the error that explains why a file contains no data of the sensor.
 
-    The file is empty or damaged, it has only other types of frames, it has data of another sensor,
-    or it has no lidar data.
+    The reason is that the file is empty or damaged, or that it has only other types of frames, data
+    of another sensor, or no lidar data.
 
     Args:
-        types: the frame types, and types of parts, that were searched; empty for data frames.
+        types: the frame types, and the types of parts, that were searched; empty for data frames.
     """
     sensor = device.sensor
     stats = device.stats
