@@ -72,9 +72,8 @@ def open_stored(path: str) -> BinaryIO:
     with _failures(path):
         file: BinaryIO = system.open(path, "rb")
         if isinstance(file, io.BytesIO):
-            return io.BytesIO(
-                file.getbuffer()
-            )  # a copy, because all readers of one BytesIO would share its offset
+            # This is a copy, because all readers of one BytesIO would share its offset.
+            return io.BytesIO(file.getbuffer())
         return file
 
 

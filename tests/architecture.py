@@ -361,9 +361,8 @@ def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list
     complaints, letters = [], re.compile(r"[\W_]+")
     sought = {name: letters.sub("", name).lower() for name in names}
     for module in modules.values():
-        run = letters.sub(
-            "", module.text
-        ).lower()  # where a name is missing whatever joins it, nothing has to be searched
+        # A name that is missing in the joined letters needs no search.
+        run = letters.sub("", module.text).lower()
         for name in (name for name, joined in sought.items() if joined in run):
             if found := name_pattern(name).search(module.text):
                 complaints.append(

@@ -234,9 +234,8 @@ class PcapRecords:
         if len(head) < self._head.size:
             raise TruncatedError
         seconds, fraction, captured, original = self._head.unpack(head)
-        if captured > MAX_PACKET_BYTES or not any(
-            head
-        ):  # missing parts of a file are read as zeros
+        # The missing parts of a sparse or damaged file are read as zeros.
+        if captured > MAX_PACKET_BYTES or not any(head):
             raise DamagedRecordError
         if not self._is_sure(captured, original) and self._is_false(captured, original):
             raise DamagedRecordError

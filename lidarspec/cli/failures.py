@@ -109,9 +109,8 @@ def _find_next_command(error: Exception, command: str, verb: str) -> str:
     sensor = str(getattr(error, "sensor", "") or getattr(error, "place", "")).partition(" ")[0]
     if isinstance(error, errors.SpecError) and error.path.endswith(".py"):
         return f"lidarspec check {shlex.quote(error.path)}"
-    if (
-        isinstance(error, errors.PluginError) and error.file and sensor not in registry()
-    ):  # a plugin of a file that the user named
+    # The user named the file of the plugin.
+    if isinstance(error, errors.PluginError) and error.file and sensor not in registry():
         return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
         if isinstance(error, errors.SpecError):

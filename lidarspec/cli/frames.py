@@ -424,9 +424,8 @@ def _find_sensor(
     """Return the named or a fitting sensor, and the ids of all fitting sensors."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
-    from lidarspec.detect.identification import (
-        find_fitting_sensors,
-    )  # not needed for a named sensor, and slow to import
+    # A named sensor does not need this module, which is slow to import.
+    from lidarspec.detect.identification import find_fitting_sensors
 
     sensors = find_fitting_sensors(sample.chunks, datagrams=sample.datagrams)
     if sensors:

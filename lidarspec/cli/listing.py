@@ -34,9 +34,8 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
     if output is not None or not may_be_coloured:
         emit_parts(map(plain_text, lines), output)
         return
-    from rich.console import (
-        Console,
-    )  # only for colours: importing it takes a third of the time of this verb
+    # Only colours need rich. Importing it takes a third of the time of this verb.
+    from rich.console import Console
 
     console = Console()
     if not console.is_terminal:

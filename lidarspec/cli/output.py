@@ -211,9 +211,8 @@ def emit_parts(
         for part in parts:
             say(part, nl=isinstance(part, str), colour=colour)
         return
-    from lidarspec.formats.common import (
-        replace_file,
-    )  # imports the modules of scans, which only verbs that write a file need
+    # This imports the modules of scans, which only verbs that write a file need.
+    from lidarspec.formats.common import replace_file
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # False for a device or a pipe

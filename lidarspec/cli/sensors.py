@@ -36,9 +36,8 @@ def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
     Most plugins are not loaded for this, because the facts about their sensors are stored in a
     table.
     """
-    is_fresh = (
-        "lidarspec.plugins" not in sys.modules
-    )  # otherwise the program may have registered sensors of its own
+    # If the plugins are loaded, the program may have registered sensors of its own.
+    is_fresh = "lidarspec.plugins" not in sys.modules
     rows = list_described_sensors() if is_fresh else None
     if rows is not None:
         return rows, []

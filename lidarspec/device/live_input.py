@@ -352,11 +352,12 @@ class LiveInput(DeviceInput):
             or not (self._was_opened or self._session.started)
         ):
             return
+        # One command is enough to stop it.
         stopping = [
             name
             for name, command in self.sensor.commands.items()
             if command.stops and not command.args
-        ][:1]  # one command is enough to stop it
+        ][:1]
         with self._session_lock:
             self._session.abandon("the device is being closed")
             names = self.sensor.on_close or stopping

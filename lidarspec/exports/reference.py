@@ -196,9 +196,10 @@ def _iter_frame_section(name: str, frame: Frame) -> Iterator[str]:
         (row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning)
         for row in wire_table(frame)
     ]
+    # Brackets of an index must not become a link.
     escaped_rows = [
         [cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows
-    ]  # an index is not a link
+    ]
     yield "\n".join(
         _iter_table(["offset", "size", "type", "field", "unit", "meaning"], escaped_rows)
     )

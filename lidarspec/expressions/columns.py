@@ -236,9 +236,8 @@ class Column(NDArrayOperatorsMixin):
         """
         schema = self.batch.table.schema
         names = [str(name).strip("?") for name in self.axes if name is not None]
-        if (
-            not names and not self.frame and self.source in schema.fields
-        ):  # of one element in all packets
+        # The column contains one element of an array in all packets.
+        if not names and not self.frame and self.source in schema.fields:
             names = list(schema.fields[self.source].axes)
         if not names:
             raise SpecError("`index` exists only for a field inside an array")
@@ -605,12 +604,10 @@ def _find_axis(
             for first, names in found.items()
             if all(isinstance(table.schema.arrays.get(name, 0), int) for name in names)
         }
-        found = (
-            fixed or found
-        )  # an array of variable length that happens to fit must not change the spec's meaning
-        if len(found) == 1 or (
-            len(shape) > 1 and len(lengths) - len(shape) in found
-        ):  # several axes determine the position
+        # An array of variable length that happens to fit must not change the spec's meaning.
+        found = fixed or found
+        # The number of axes determines the position.
+        if len(found) == 1 or (len(shape) > 1 and len(lengths) - len(shape) in found):
             return max(found)
         if found:
             names = [" x ".join(names) for names in found.values()]

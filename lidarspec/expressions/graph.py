@@ -213,9 +213,8 @@ class TracedColumn(NDArrayOperatorsMixin):
         samples = [
             value.node.sample if isinstance(value, TracedColumn) else value for value in values
         ]
-        arrays, _, _ = align(
-            tuple(samples), self.node.sample.batch
-        )  # other operands are recorded as aligned arrays
+        # Other operands are recorded as aligned arrays.
+        arrays, _, _ = align(tuple(samples), self.node.sample.batch)
         table = _fold_table_rows(function, values, arrays)
         if table is not None:
             return TracedColumn(table[0], self._tape).gather(table[1])

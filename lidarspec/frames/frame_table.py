@@ -329,9 +329,8 @@ class CompiledTable:
             counts[piece.frames] += 1
         ranks = list[NDArray[np.intp]]()
         following = np.cumsum(counts) - counts
-        for (
-            piece
-        ) in part_rows:  # in the order of the rounds; each frame has at most one part in each
+        # The pieces are in the order of the rounds, and a frame has at most one part in each round.
+        for piece in part_rows:
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
         return CompiledTable(

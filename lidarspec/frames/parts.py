@@ -521,9 +521,10 @@ class PartsSize(MeasuredSize):
         cut_off = walked.status == CUT_OFF
         if not np.count_nonzero(cut_off):
             return None, values
+        # These frames already have as many bytes as the longest frame.
         is_all = cut_off & (
             offsets + self.region.limit <= (len(buffer) if stops is None else stops)
-        )  # these already have as many bytes as the longest frame
+        )
         values[is_all] = -LENGTH
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]

@@ -147,9 +147,8 @@ class _DatagramBatch:
         fixed = [
             (kind, self._framing.codecs[kind].size) for kind in self._framing.active_types(mode)
         ]
-        others = [
-            kind for kind, size in fixed if size is not None and not least <= size <= most
-        ]  # no datagram fits them, so they can only give a reason
+        # No datagram fits them, so they can only give a reason.
+        others = [kind for kind, size in fixed if size is not None and not least <= size <= most]
         for kind in (*(kind for kind, _ in fixed if kind not in others), *others):
             if not len(left):
                 break

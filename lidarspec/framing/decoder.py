@@ -100,9 +100,8 @@ class Decoder:
         self.observer: DecoderObserver | None = None
         keep_freed_memory()
         self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
-        answer = sensor.options.get(
-            "answer", ""
-        )  # as if the frame that the answer comes after had been seen
+        # Frames are read as if the frame that the answer comes after had been seen.
+        answer = sensor.options.get("answer", "")
         self._mode = SearchState(
             after=sensor.frames[answer].after if answer in sensor.frames else None
         )

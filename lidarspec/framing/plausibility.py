@@ -363,9 +363,8 @@ class _LookupTable:
         """Return whether the condition is true for each of the values."""
         if self.limits is not None:
             low, high = map(values.dtype.type, self.limits)
-            return np.asarray(
-                values - low <= high - low if low else values <= high
-            )  # values below the limits wrap to large ones
+            # Values below the limits wrap to large values.
+            return np.asarray(values - low <= high - low if low else values <= high)
         if self.bits is not None:
             mask, allowed = self.bits
             left = values & values.dtype.type(mask)
@@ -439,9 +438,8 @@ def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _Look
         size: the number of bytes.
     """
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
-        blocks = np.split(
-            np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16
-        )  # so that memory stays small
+        # The blocks keep the memory small.
+        blocks = np.split(np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16)
         listed = np.concatenate(
             [
                 find_passing(part, leaves, codes.view(np.uint8).reshape(len(codes), -1))

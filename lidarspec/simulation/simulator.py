@@ -312,9 +312,8 @@ class Measurement:
             expected = info.physical(PROBE_VALUE)
             for inner in self._inner(table, answer):
                 part = _part(answer, inner)
-                near = part[
-                    np.isclose(part, expected)
-                ]  # a unit vector whose length is not exactly 1 affects the range
+                # A unit vector whose length is not exactly 1 affects the range.
+                near = part[np.isclose(part, expected)]
                 if np.allclose(near, expected, RANGE_TOLERANCE, 0):
                     step = info.scale
                 else:

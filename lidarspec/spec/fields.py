@@ -287,9 +287,8 @@ class Checksummed(layer.SealedStruct):
         trial = io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
-        unverified = Container(
-            {**context, "_params": Container(_verify=False)}
-        )  # the built bytes have no valid checksum yet
+        # The built bytes have no valid checksum yet.
+        unverified = Container({**context, "_params": Container(_verify=False)})
         parsed = con._parsereport(io.BytesIO(data), unverified, path)
         if None not in given and self._load_stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)

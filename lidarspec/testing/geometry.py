@@ -482,9 +482,8 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
         return
     packets = read(subject, name, frames)
     if subject.sensor.sequence is not None:
-        stats = read(
-            subject, name, frames, by_clock=False
-        ).stats  # the clock would compensate for the counter
+        # The clock would compensate for the counter.
+        stats = read(subject, name, frames, by_clock=False).stats
         message = (
             f"{stats.lost} packets of the sweep count as lost, {stats.late} as late, and"
             f" {stats.duplicates} as duplicates"
@@ -685,9 +684,8 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         subject.picture[f"{name}: rate"] = f"{rate:.0f} points per second, simulated"
     else:
         subject.picture[f"{name}: rate"] = "unknown"
-    count = len(cloud) - 2 * len(cloud) // len(
-        block.frames
-    )  # directions of the last packet may depend on the packet that follows
+    # The directions of the last packet may depend on the packet that follows.
+    count = len(cloud) - 2 * len(cloud) // len(block.frames)
     valid = cloud.valid[:count]
     share = float(valid.mean()) if count else 0.0
     require(

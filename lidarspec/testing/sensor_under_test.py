@@ -326,9 +326,8 @@ class SensorUnderTest:
                     number = frame.confirm + 2
                 else:
                     number = 1
-                first = (
-                    seed * 1000 + turn * number
-                )  # the lowest seeds, because other properties have made these examples already
+                # Other properties have already made the examples of the lowest seeds.
+                first = seed * 1000 + turn * number
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
                 frames += [

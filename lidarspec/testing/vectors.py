@@ -272,9 +272,8 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
         ]
     except ViolationError:  # reported by `vectors_hold`
         frames = []
-    is_told = isinstance(
-        get_codec(subject.sensor.frames[name]), CompiledCodec
-    )  # otherwise the offset of a checksum has no field
+    # The offset of a checksum belongs to a field only in a compiled frame.
+    is_told = isinstance(get_codec(subject.sensor.frames[name]), CompiledCodec)
     for match in _find_common_matches(frames) if is_told and not sealing else []:
         path = _find_checksum_field(subject, name, match, frames[0])
         if path in (named or free) and (named or match.evidence_bits >= PROOF_BITS):

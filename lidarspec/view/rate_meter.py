@@ -92,9 +92,8 @@ class RateTally:
         self.scans = 0
         self.packets = 0
         self._rates = deque[float](maxlen=MAX_KEPT_SCANS)
-        self._sizes = deque[tuple[int, int]](
-            maxlen=MAX_KEPT_SCANS
-        )  # (points, valid points) of each scan
+        # The points and the valid points of each scan.
+        self._sizes = deque[tuple[int, int]](maxlen=MAX_KEPT_SCANS)
         self._gap_count = 0
         self._gap_sum = 0.0
         self._gap_square_sum = 0.0

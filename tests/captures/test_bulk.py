@@ -132,9 +132,8 @@ def test_a_byte_stream_in_batches_equals_single_packets(sizes: list[int]) -> Non
     records = [
         made.record(data, seconds=made.SECONDS + index // 9) for index, data in enumerate(packets)
     ]
-    records[300:305] = [
-        made.record(bytes(47), original=90)
-    ] * 5  # cut where the file says, as long as others
+    # These records are truncated, and the file says so.
+    records[300:305] = [made.record(bytes(47), original=90)] * 5
     capture = made.pcap_head(link=USER_LINKS[0], snap_length=47) + b"".join(records)
     found, stats = in_batches(io.BytesIO(capture), StreamBatches)
     assert (found, stats) == one_by_one(io.BytesIO(capture), StreamReader)

@@ -26,9 +26,8 @@ FRAME = made.frame(b"one")
 HEAD = made.section() + made.interface()
 GOOD = made.packet(FRAME)
 END = len(HEAD + GOOD)
-DAMAGE: dict[
-    str, tuple[bytes, int, dict[str, Any]]
-] = {  # block: datagrams read of GOOD, the block and GOOD; what is counted
+# For each block: the datagrams that are read of GOOD, the block and GOOD, and the counters.
+DAMAGE: dict[str, tuple[bytes, int, dict[str, Any]]] = {
     "unknown kind": (made.block(0x80001234, b"private!"), 2, {}),
     "unknown kind, longer than is ever held": (made.block(0x0BAD, bytes(3 << 20)), 2, {}),
     "name resolution and statistics": (made.block(4, bytes(4)) + made.block(5, bytes(12)), 2, {}),

@@ -75,9 +75,8 @@ def test_a_broken_source_ends_in_one_line_and_its_code(
         result = ran(*(source if word == "SOURCE" else word for word in VERBS[verb]), code=code)
     lines = result.stderr.splitlines()
     said = [line for line in lines if not line.lstrip().startswith("next: ")]
-    kept = (
-        verb == "record" and place is babbling
-    )  # the file that nobody can decode yet is kept, and said
+    # A file that cannot be decoded yet is kept, with a message.
+    kept = verb == "record" and place is babbling
     assert told in said[-1]
     assert len(said) == (2 if kept or (verb, place) == ("detect", silent) else 1), said
     assert lines[-1].lstrip().startswith("next: lidarspec "), lines

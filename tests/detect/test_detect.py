@@ -140,9 +140,8 @@ def test_captures_of_other_devices_fit_no_sensor(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALIKE)
 def test_identical_frames_are_reported_as_ambiguous(name: str) -> None:
-    for found in (
-        one for one in identify_senders(capture(name)) if one.scores
-    ):  # an IMU sends on a port of its own
+    # An IMU sends on a port of its own.
+    for found in (one for one in identify_senders(capture(name)) if one.scores):
         assert found.sensor is None
         assert {score.sensor.id for score in found.candidates} == ALIKE[name]
     with pytest.raises(UsageError, match="send the same frames"):
@@ -497,9 +496,8 @@ def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_c
 def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sends: bool, listened: int | None
 ) -> None:
-    monkeypatch.setattr(
-        "lidarspec.detect.listen.has_no_baud", lambda port: False
-    )  # as of a real port
+    # A real port has a baud rate.
+    monkeypatch.setattr("lidarspec.detect.listen.has_no_baud", lambda port: False)
     told: list[str] = []
     with (
         port(tmp_path) as made,
@@ -546,9 +544,8 @@ class TestStructure:
         monkeypatch.setattr("lidarspec.drafting.crc_search.QUICK_WORK", QUICK_WORK // 64)
         samples = SampleFrames(make_bodies(size, number))
         assert list(crc_matches(samples, quick=True)) == []
-        assert (
-            0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK
-        )  # the steps of Euclid's algorithm pass over the bytes twice
+        # The steps of Euclid's algorithm pass over the bytes twice.
+        assert 0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK
         quick = divided
         assert list(crc_matches(samples)) == []
         assert divided - quick > 2 * quick

@@ -294,9 +294,8 @@ def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
                 other.sendto(stranger, ("127.0.0.1", number))
             own.sendto(frames[index], ("127.0.0.1", number))
         found += packets(device, 30)
-        first = (
-            WHOLE.decode(frames[:1]).points().xyz
-        )  # by the nominal calibration, and not by a stranger's
+        # The nominal calibration is used, not that of another sensor.
+        first = WHOLE.decode(frames[:1]).points().xyz
         assert np.array_equal(
             points(found),
             np.concatenate([first, WHOLE.decode([calibration, *frames[1:]]).points().xyz]),
@@ -374,9 +373,8 @@ def test_two_senders_of_one_address_are_separated_by_port() -> None:
             other.sendto(frames[5], ("127.0.0.1", number))
             own.sendto(frame, ("127.0.0.1", number))
         found = packets(device, 29)
-        read_until(
-            device, lambda: device.stats.foreign >= 28
-        )  # the very first may be that of a restarted sensor
+        # The first foreign packet may count as that of a restarted sensor.
+        read_until(device, lambda: device.stats.foreign >= 28)
         assert sum(map(len, found)) <= 30
         assert f"ignoring data from 127.0.0.2:{other.getsockname()[1]};" in device.warnings[-1]
 
@@ -407,9 +405,8 @@ def test_a_stream_in_datagrams_of_two_ports_is_not_joined() -> None:
 
 
 def test_a_stream_in_datagrams_is_joined_by_sender(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        UdpTransport, "silence", TIMEOUT_S
-    )  # the sender may be held up between two pieces of a frame
+    # The sender may be held up between two pieces of a frame.
+    monkeypatch.setattr(UdpTransport, "silence", TIMEOUT_S)
     sensor = dataclasses.replace(TURNING, links={"data": Udp(7009, stream=True)})
     number, frames = free_port(), turning(sensor, 12)
     stream = b"".join(frames)

@@ -239,9 +239,8 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(
         assert "is a file outside" in ran("stats", "rear", code=2).stderr
     (folder / "lidarspec.toml").write_text(text.format("./inside.csv", place), encoding="utf-8")
     assert "inside.csv" in (said := ran("stats", "front", code=2).stderr)
-    assert (
-        "is not a file in" not in said
-    )  # it is read, and says something else than the sensor asks for
+    # The file is read, but is not the one that the sensor requires.
+    assert "is not a file in" not in said
     assert "lidarspec trust" not in said
 
 

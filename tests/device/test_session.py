@@ -190,9 +190,8 @@ def test_a_late_answer_is_not_the_next_ones() -> None:
     session.request("start", 0)
     session.tick(SECOND)
     again = session.request("start", SECOND + 1)
-    assert (
-        len(session.outgoing()) == 1
-    )  # the second one is held back: the answer to the first would be taken for its own
+    # The second command waits, because the reply to the first could be taken for its reply.
+    assert len(session.outgoing()) == 1
     session.receive([ack(1)], SECOND + 2)
     assert not again.done
     assert session.late == 1

@@ -127,9 +127,8 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
     assert all(
         match.algorithm(frame[: -width // 8]) == crc(frame[: -width // 8]) for frame in frames
     )
-    assert (
-        match.algorithm == crc or match.is_ambiguous
-    )  # several pairs of init and xorout can be the same function
+    # Several pairs of init and xorout can be the same function.
+    assert match.algorithm == crc or match.is_ambiguous
 
 
 @pytest.mark.slow

@@ -121,9 +121,8 @@ def test_pieces_are_yielded_before_the_input_ends() -> None:
 def test_a_frame_type_is_looked_for_in_the_whole_input() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     node = sensor.example("node")
-    found = list(
-        iter_pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node")
-    )  # no descriptor before it
+    # No descriptor before it.
+    found = list(iter_pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node"))
     assert [piece.frame for piece in found] == ["node"] * 600
     (short,) = iter_pieces(STL, [Chunk(b"\x00" + FRAMES[0][1:])], datagrams=False, frame="data")
     assert short.frame == NEAREST

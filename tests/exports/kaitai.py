@@ -91,9 +91,8 @@ def differences(parsed: Any, read: Any, path: str = "") -> list[str]:
             for place in differences(value, _member(read, name), f"{path}.{name}")
         ]
     if isinstance(parsed, list):
-        read = (
-            [] if read is None else getattr(read, "value", read)
-        )  # a chain without any part is not there
+        # A chain without parts is missing.
+        read = [] if read is None else getattr(read, "value", read)
         if len(parsed) != len(read):
             return [f"{path}: {len(parsed)} elements, and {len(read)} in Kaitai"]
         return [

@@ -302,9 +302,8 @@ def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_byt
 ) -> None:
     """Else ten bytes of noise would cost a loop over four thousand million elements."""
     empty = Array(this.n, Struct("x" / If(this._.k > 2, Int8ub)))
-    bits = BitStruct(
-        "low" / Array(24, BitsInteger(1))
-    )  # more elements than bytes, and they are bits
+    # More elements than bytes, and they are bits.
+    bits = BitStruct("low" / Array(24, BitsInteger(1)))
     ours = sensor(Struct("k" / Int8ub, "n" / Int32ub, "bits" / bits, "v" / empty), max_length=20)
     short, huge = b"\0\0\0\0\3\7\7\7", b"\0\xff\xff\xff\xff\7\7\7"
     stats = reader(ours, backend).decode([short, huge]).stats
@@ -325,9 +324,8 @@ def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
         ),
         max_length=60,
     )
-    stats = (
-        reader(ours, backend).decode([b"\0\3", b"\0\xff", b"\0\x3c"]).stats
-    )  # 3 + 9 + 27 elements; too many
+    # 3 + 9 + 27 elements; too many.
+    stats = reader(ours, backend).decode([b"\0\3", b"\0\xff", b"\0\x3c"]).stats
     assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 2, 0)
     assert len(ours.parse(b"\0\3").v[2][2]) == 3
     with pytest.raises(WireError, match=r"v: .*60"):

@@ -164,9 +164,8 @@ def test_two_engines_of_one_frame_type_share_its_layouts() -> None:
     offsets = np.arange(len(headers)) * len(headers[0])
     first = frame_engine.CompiledCodec(frame)
     second = frame_engine.CompiledCodec(frame)
-    some = first.survey(
-        data, offsets[1:]
-    ).status  # not the layout without samples, which has fewer tests
+    # Not the layout without samples, which has fewer tests.
+    some = first.survey(data, offsets[1:]).status
     every = second.survey(data, offsets).status
     assert every[1:].tolist() == some.tolist()
 

@@ -119,8 +119,7 @@ def test_a_counter_of_64_bits_counts_losses_and_starts_again(first: int, backend
         assert (stats.lost, stats.late, stats.duplicates, stats.plugin_errors) == (lost, 0, 0, 0), (
             numbers
         )
-    packets = reader(counted, backend).decode(
-        wide([10**18, 5, 6, 2**63, 2**63 + 1])
-    )  # it was switched off and on
+    # It was switched off and on.
+    packets = reader(counted, backend).decode(wide([10**18, 5, 6, 2**63, 2**63 + 1]))
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert np.diff(packets.index)[[1, 3]].tolist() == [1, 1]

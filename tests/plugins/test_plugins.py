@@ -25,9 +25,8 @@ STRANGER = HERE / "stranger" / "acme_lidars.py"
 def test_sensor_of_a_foreign_distribution_is_found_and_decodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lidarspec.sensor(
-        "ldrobot-stl27l"
-    )  # the registry of this process is made before the stranger is on the path
+    # The registry of this process is made before the stranger is on the path.
+    lidarspec.sensor("ldrobot-stl27l")
     shutil.copy(STRANGER, tmp_path)
     distribution(tmp_path, "acme_lidars", "3.2.1", "[lidarspec]\nacme = acme_lidars\n")
     monkeypatch.syspath_prepend(tmp_path)

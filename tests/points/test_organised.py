@@ -82,9 +82,8 @@ def test_the_shape_is_columns_and_rows_for_two_returns_too(backend: str) -> None
 
 
 def test_rows_are_viewed_or_gathered() -> None:
-    in_order = [
-        frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)
-    ]  # round the end of the table, too
+    # The columns also pass the end of the table.
+    in_order = [frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)]
     beyond, mixed = [frame(TURN - 1)], [frame(0), frame(32)]
     for frames in (in_order, beyond, mixed, in_order * 40 + beyond):
         read = reader(SENSOR, "numpy").decode(frames)

@@ -174,9 +174,8 @@ def test_bit_fields_in_both_orders(backend: str) -> None:
     data = sensor.build("data", **values)
     assert data[2:5] == bytes.fromhex("45 23 01")
     assert data[5:8] == bytes.fromhex("ff ff fe")
-    assert data[8:11] == bytes.fromhex(
-        "ab d1 48"
-    )  # 0x1234 << 10 | 1 << 8 | 0xab = 0x48d1ab, low byte first
+    # 0x1234 << 10 | 1 << 8 | 0xab = 0x48d1ab, low byte first.
+    assert data[8:11] == bytes.fromhex("ab d1 48")
     assert data[26:29] == bytes.fromhex("48 d1 ab")
     assert data[44] == int(f"{1 << 5 | 0b11101:08b}"[::-1], 2)
     packets = reader(sensor, backend).decode(data)
@@ -270,9 +269,8 @@ def test_state_values_align_with_the_axes_of_points(backend: str) -> None:
     np.testing.assert_allclose(np.rad2deg(nominal.elevation), [-3, -1, 1, 3] * 3, atol=1e-5)
     np.testing.assert_allclose(nominal.time, np.repeat([0, 1e-5, 2e-5], 4), atol=1e-12)
     info = sensor.build("info", zero=500, vertical=[-100, 0, 100, 200])
-    known = cloud_of(
-        sensor, data, info, data, backend=backend
-    )  # reading a whole input applies the first info from the start
+    # Reading a whole input applies the first info from the start.
+    known = cloud_of(sensor, data, info, data, backend=backend)
     assert not known.nominal
     assert degrees(known)[:4] == degrees(known)[12:16] == [5, 6, 5, 7]
     np.testing.assert_allclose(np.rad2deg(known.elevation[:4]), [-1, 0, 1, 2], atol=1e-5)

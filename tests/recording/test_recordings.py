@@ -208,9 +208,8 @@ def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage
     source = random.Random(3)
     header = MAGIC + pack_record(HEADER, b"{}")
     claims = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 255, 65535, 0)
-    sealed = (
-        _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
-    )  # an address that is longer than its place
+    # The address is longer than its field.
+    sealed = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
     sealed += zlib.crc32(sealed).to_bytes(4, "little")
     for tail in (
         claims,

@@ -62,9 +62,8 @@ def test_each_beam_is_as_late_as_its_points(name: str) -> None:
         )
         late = (one.stamp_ns - scan.stamp_ns) * 1e-9 + beams_of(one, scan) * one.time_increment
         off = np.abs(late - scan.points.time)
-        turned = np.abs(off - one.scan_time) < 3 * abs(
-            one.time_increment
-        )  # where two scans meet some points are beyond the end
+        # Where two scans meet some points are beyond the end.
+        turned = np.abs(off - one.scan_time) < 3 * abs(one.time_increment)
         assert (off[~turned] <= 3 * abs(one.time_increment) + 2e-3).all()
         assert turned.sum() <= 0.04 * len(scan)
 

@@ -214,9 +214,8 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
 
 
 def test_an_oscillating_sensor_is_cut_equally_for_all_batch_sizes() -> None:
-    sensor = dataclasses.replace(
-        ls.sensor("velodyne-vlp16"), clock=None
-    )  # by which packets that go back in time are late
+    # With a clock, packets that go back in time would be late.
+    sensor = dataclasses.replace(ls.sensor("velodyne-vlp16"), clock=None)
     assert isinstance(sensor.scan, OnWrap)
     frames = simulate(ls.sensor("velodyne-vlp16"), 300)
     packets = sensor.decode([*frames, *frames[::-1], *frames])
@@ -263,9 +262,8 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
     if isinstance(separate.table, CompiledTable) and len(separate):
         link = sensor.links["data"]
         recoded = sensor.frames[sensor.data_frame].wire is not None
-        copied = recoded or (
-            isinstance(link, Udp) and link.assembled is not None
-        )  # what is joined or recoded stands elsewhere
+        # Joined or recoded bytes are copies.
+        copied = recoded or (isinstance(link, Udp) and link.assembled is not None)
         if len(separate.table.groups[0].where) == len(rows) > 1 and not copied:
             assert separate.table.groups[0].rows.strides[0] == size + (size > 1)
         assert_cut_from([Scan(separate.points(), 0.0, True, sensor)], together.points())

@@ -388,9 +388,8 @@ def test_a_laserscan_has_the_requested_beams_and_direction(name: str, falls: boo
                 planar.angle_min + (beams - 1) * planar.angle_increment
             )
             assert (planar.time_increment < 0) == falls
-            assert abs(planar.time_increment) * beams == pytest.approx(
-                planar.scan_time, rel=1e-3
-            )  # its clock counts in ms
+            # Its clock counts in ms.
+            assert abs(planar.time_increment) * beams == pytest.approx(planar.scan_time, rel=1e-3)
         assert len(scan.to_laserscan().ranges) == (sensor.beams or len(scan))
 
 

@@ -150,9 +150,8 @@ def test_an_rplidar_reports_its_identity_and_scans_in_the_requested_mode() -> No
         2: ["ultra", "ultra_descriptor"],
         3: ["ultra", "ultra_descriptor"],
     }
-    assert b"\xa5\x5a\x14" not in send_command(
-        device, "get_info", 5 * SECOND
-    )  # answered only while it does not scan
+    # Answered only while it does not scan.
+    assert b"\xa5\x5a\x14" not in send_command(device, "get_info", 5 * SECOND)
     assert device.commands_received[-1] == "get_info"
     assert send_command(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
     assert a1().parse(send_command(device, "get_info", 5 * SECOND)).hardware == 7

@@ -87,9 +87,8 @@ def _find_hits(
     """
     low, high = sensor.range_limits or (0.0, np.inf)
     azimuth, elevation = cloud.azimuth.astype(float), cloud.elevation.astype(float)
-    if (
-        directions := sensor.simulation_of(frame).directions
-    ) is not None:  # without a return there are no coordinates to have one
+    # A point without a return has no coordinates.
+    if (directions := sensor.simulation_of(frame).directions) is not None:
         pairs = [
             np.stack(np.broadcast_arrays(*directions(number))).reshape(2, -1) for number in numbers
         ]
@@ -138,9 +137,8 @@ def test_every_kind_of_data_frame_of_a_sensor_gives_the_scene_back(name: str) ->
 @pytest.mark.parametrize("name", REPRESENTATIVES)
 def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name: str) -> None:
     sensor, room = ls.sensor(name), Room()
-    out, device = run_device(
-        sensor, 0.12 if sensor.datagrams else 1.3, room
-    )  # a turn is sent by then
+    # A turn is sent in this time.
+    out, device = run_device(sensor, 0.12 if sensor.datagrams else 1.3, room)
     packets = sensor.decode(out if sensor.datagrams else b"".join(out))
     cloud = packets.points()
     assert packets.stats.frames == dict(device.sent)

@@ -134,9 +134,8 @@ def singly(algorithm: Checksum, rows: NDArray[np.uint8]) -> list[int]:
 
 @pytest.mark.parametrize(("crc", "check"), CHECK_VALUES, ids=str)
 def test_catalogue_check_values(crc: Crc, check: int) -> None:
-    assert (
-        crc(b"123456789") == bitwise_crc(crc, b"123456789") == check
-    )  # the oracle is held to them too
+    # The reference implementation is tested as well.
+    assert crc(b"123456789") == bitwise_crc(crc, b"123456789") == check
     rows = np.tile(np.frombuffer(b"123456789", np.uint8), (1000, 1))
     assert compute_checksums(crc, rows).tolist() == [check] * 1000
 
@@ -240,9 +239,8 @@ class TestBatch:
         rows = random_rows(count, length)
         values = compute_checksums(algorithm, rows)
         for row in {*range(0, count, 211), count - 1}:
-            data = rows[
-                row
-            ].tobytes()  # of this length, a single CRC is a batch of one: the oracle has to judge
+            # At this length, a single CRC is computed as a batch: it is no independent reference.
+            data = rows[row].tobytes()
             assert values[row] == (
                 bitwise_crc(algorithm, data)
                 if isinstance(algorithm, Crc) and length > 2000
@@ -295,9 +293,8 @@ def test_temporary_memory_is_bounded(algorithm: Checksum) -> None:
     compute_checksums(algorithm, rows)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert (
-        peak < 4 * 8 * len(rows) + 3_000_000
-    )  # a few columns as long as the answer, and one block
+    # The memory of a few result columns and one block.
+    assert peak < 4 * 8 * len(rows) + 3_000_000
 
 
 def test_sums_and_xors_by_hand() -> None:
@@ -306,9 +303,8 @@ def test_sums_and_xors_by_hand() -> None:
     assert Sum()(data) == 0xCC
     assert Sum(16)(data) == Sum(16, "big")(data) == 0x01CC
     assert Sum(16)(b"\xff" * 258) == 258 * 255 - 65536
-    assert (
-        WordXor(groups=(1, 2))(data) == 0x0012 ^ 0xFF34 ^ 0x0080 ^ 0x0007
-    )  # the last word is cut short
+    # The last word is cut short.
+    assert WordXor(groups=(1, 2))(data) == 0x0012 ^ 0xFF34 ^ 0x0080 ^ 0x0007
     assert WordXor(head=3, groups=(2, 1))(data) == 0x3412 ^ 0x00FF ^ 0x0780  # so is the head's
     assert WordXor()(data) == WordXor(head=8, groups=(1,))(data) == 0x3412 ^ 0x80FF ^ 0x0007
 

@@ -154,9 +154,8 @@ def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
         "lidarspec",
         ".",
     ]  # by its name as an entry point
-    done = run(
-        tmp_path, *words, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1"
-    )  # other libraries' plugins load what they like
+    # Plugins of other libraries could import anything.
+    done = run(tmp_path, *words, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
     assert done.returncode == 0, done.stdout
 
 
@@ -492,9 +491,8 @@ def test_the_checksum_that_is_offered_is_as_wide_as_its_field() -> None:
 
     right = data(Sum(16))
     parsed = [right.parse(right.example("data", seed=seed)) for seed in range(6)]
-    frames = [
-        right.build("data", {**one, "spare": 0}) for one in parsed
-    ]  # the sum is right in four bytes as well
+    # The sum is right in four bytes as well.
+    frames = [right.build("data", {**one, "spare": 0}) for one in parsed]
     vectors = [{"frame": "data", "hex": frame.hex(), "source": "made up"} for frame in frames]
     (said,) = {
         text.partition("; ")[2]

@@ -106,9 +106,8 @@ def test_dumps_are_read_as_their_tools_print_them(command: str, tmp_path: Path) 
         [program, *options, "it.bin"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert parse_hex(done.stdout) == EVERY
-    assert (
-        parse_hex(done.stdout * 2) == EVERY * 2 or command == "xxd -p"
-    )  # a dump begins again where its offset does
+    # A dump begins again where its offset does.
+    assert parse_hex(done.stdout * 2) == EVERY * 2 or command == "xxd -p"
 
 
 def test_frames_are_read_as_analysers_and_terminals_print_them() -> None:

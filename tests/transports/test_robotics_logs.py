@@ -304,9 +304,8 @@ def test_packets_are_the_same_through_every_container(tmp_path: Path) -> None:
         assert [(chunk.data, chunk.at) for chunk in read(target)] == [
             (data, START + STEP * number) for number, data in enumerate(sent)
         ]
-        source = (
-            target if suffix in ("mcap", "lsr") else source
-        )  # packets of a log are taken over from log to log
+        # Packets of a log are taken over from log to log.
+        source = target if suffix in ("mcap", "lsr") else source
     ran("convert", tmp_path / "out.mcap", tmp_path / "mcap.csv", "-s", "velodyne-vlp16")
     ran("convert", tmp_path / "it.pcap", tmp_path / "pcap.csv", "-s", "velodyne-vlp16")
     assert (tmp_path / "mcap.csv").read_bytes() == (tmp_path / "pcap.csv").read_bytes()

@@ -119,9 +119,8 @@ class Terminal:
             except OSError:
                 maps = state = ""
                 end = min(end, time.monotonic() + 3)
-            asleep += "_multiarray_umath" in maps and state.startswith(
-                "S"
-            )  # one that is being loaded runs, or waits for the disk
+            # A process that is still loading runs, or waits for the disk.
+            asleep += "_multiarray_umath" in maps and state.startswith("S")
             self._read(0.02)
 
     def is_as_before(self) -> bool:
@@ -163,9 +162,8 @@ class Terminal:
         data = self._rest + os.read(self._master, 1 << 16)
         whole = len(data)
         begun = data.rfind(b"\x1b")
-        if (
-            begun >= 0 and not data[begun:].rstrip(b"0123456789;?[\x1b")[:1]
-        ):  # a sequence that goes on in the next piece
+        # The escape sequence continues in the next piece.
+        if begun >= 0 and not data[begun:].rstrip(b"0123456789;?[\x1b")[:1]:
             whole = begun
         while whole and data[whole - 1] >= 0x80 and not _decodes(data[:whole]):
             whole -= 1
@@ -182,9 +180,8 @@ class Terminal:
             self._place = int(at_row) - 1, int(at_column) - 1
         elif letter in ("h", "l"):
             (self.modes.add if letter == "h" else self.modes.discard)(numbers)
-            if (
-                numbers == "1049"
-            ):  # the other screen; the text of the main one is not kept here, its cursor is
+            # The alternate screen. Only the cursor of the main screen is kept, not its text.
+            if numbers == "1049":
                 self.grid = [[" "] * len(line) for line in self.grid]
                 self._place, self._kept = self._kept, self._place
         elif letter == "A":

@@ -36,9 +36,8 @@ def test_a_cloud_is_drawn_at_its_coordinates() -> None:
     svg = cloud((4, 0, 0), (0, 2, 0))._repr_svg_()
     assert svg is not None
     middle = 260
-    metre = middle / (
-        2 * 1.08
-    )  # two metres from the middle of the points to their ends, and a margin
+    # Two metres from the middle of the points to their ends, and a margin.
+    metre = middle / (2 * 1.08)
     expected = [(middle - metre, middle + 2 * metre), (middle + metre, middle - 2 * metre)]
     np.testing.assert_allclose(sorted(dots(svg)), expected, atol=0.5)
     assert "2 returns as 2 dots" in svg
@@ -49,9 +48,8 @@ def test_a_cloud_with_heights_is_drawn_from_the_side_as_well() -> None:
     svg = cloud((4, 0, 1), (2, 0, -1))._repr_svg_()
     assert svg is not None
     (first, high), (second, low) = sorted(dots(svg, 1), reverse=True)
-    metres = (
-        2 * 260 / 1.08
-    )  # the two metres between the points, with a margin, are the width of the picture
+    # The two metres between the points, with a margin, are the width of the picture.
+    metres = 2 * 260 / 1.08
     assert first - second == pytest.approx(metres, abs=0.6)
     assert low - high == pytest.approx(metres, abs=0.6)
 

@@ -213,9 +213,8 @@ def test_an_older_model_is_distinguished_from_a_ydlidar() -> None:
         packet((0.0, 0.0), []),
         packet((360.0, 10.0), [1000, 1000]),
         packet((10.0, 360.0), [1000, 1000]),
-        packet(
-            (10.0, 20.0), [1000, 1000], mt={"m": 55, "start": 1}
-        ),  # a start packet has one sample
+        # A start packet has one sample.
+        packet((10.0, 20.0), [1000, 1000], mt={"m": 55, "start": 1}),
         bytes(200),
         b"\xff" * 200,
     ],
@@ -301,9 +300,8 @@ def test_the_device_information_decides_about_the_correction() -> None:
 def test_nominal_until_the_device_information_is_known() -> None:
     assert SENSOR.decode(QUADRANTS).points().nominal
     assert not SENSOR.decode(INFO + QUADRANTS).points().nominal
-    assert (
-        not SENSOR.decode(QUADRANTS + INFO).points().nominal
-    )  # of a whole input the first one applies from the start
+    # If the whole input is decoded at once, the first info frame applies from the start.
+    assert not SENSOR.decode(QUADRANTS + INFO).points().nominal
     assert_same_points(
         decode(SENSOR, INFO + QUADRANTS).points()[:2],
         decode(SENSOR, QUADRANTS + INFO).points()[:2],
@@ -335,17 +333,15 @@ def test_one_sample_has_the_first_angle() -> None:
     packets = decode(SENSOR, vector_bytes(FILE, "cspc_start_packet_synth"))
     expected = vectors(FILE)["cspc_start_packet_synth"]["expected"]
     cloud = packets.points()
-    np.testing.assert_allclose(
-        clockwise(cloud), [expected["first_angle_deg"]], atol=2e-5
-    )  # 0.5 - 9.883 goes below 0
+    # 0.5 - 9.883 is negative.
+    np.testing.assert_allclose(clockwise(cloud), [expected["first_angle_deg"]], atol=2e-5)
     assert packets["frequency"].tolist() == [pytest.approx(expected["scan_freq_hz"])]
     assert (round(float(cloud.range[0]) * 1000), packets.raw["samples"]["intensity"][0, 0]) == (
         500,
         200,
     )
-    apart = decode(
-        SENSOR, packet((40.0, 80.0), [0])
-    ).points()  # LSA of a single sample does not count
+    # LSA of a single sample does not count.
+    apart = decode(SENSOR, packet((40.0, 80.0), [0])).points()
     np.testing.assert_allclose(clockwise(apart), [40])
 
 

@@ -195,9 +195,8 @@ def test_firing_times_and_echoes(name: str) -> None:
     dual: dict[str, Any] = (
         {"return_mode": 0x39} if name == "pandar40p" else {"return_mode": 0x39, "return_count": 2}
     )
-    alone: dict[str, Any] = {
-        name: value for name, value in dual.items() if name == "return_count"
-    }  # the most that there can be
+    # `return_count` is only a maximum, which a packet with one return may also state.
+    alone: dict[str, Any] = {name: value for name, value in dual.items() if name == "return_count"}
     single, double = (
         decode(SENSORS[name], [packet(name, **more)]).points() for more in (alone, dual)
     )
@@ -561,16 +560,14 @@ def test_angles_are_requested_on_opening(tmp_path: Path) -> None:
             ["get_calibration", "speed"],
         )
         assert np.rad2deg(cloud.elevation[:2]) == pytest.approx([15.5, 14.5])
-        with ls.open(
-            port.path, unit.configure(calibration=file)
-        ) as device:  # whose angles are known already
+        # The file has the angles, so they are not requested.
+        with ls.open(port.path, unit.configure(calibration=file)) as device:
             assert np.rad2deg(device.latest(SLACK).points.elevation[:2]) == pytest.approx(
                 [-4.5, -4.0]
             )
         assert port.device.commands_received == ["get_calibration", "speed"]
-        with ls.open(
-            f"{data}?control=127.0.0.1:{free_port()}", unit
-        ) as device:  # where nobody answers
+        # Nothing answers at this address.
+        with ls.open(f"{data}?control=127.0.0.1:{free_port()}", unit) as device:
             assert device.latest(SLACK).points.nominal
             assert any(
                 "refuses connections" in said and "the sensor is read without the values" in said
@@ -639,9 +636,8 @@ def test_points_and_times_by_hand_of_models_named_in_the_status(name: str) -> No
     ).points()
     assert dual.return_index is not None
     assert dual.return_index[::128].tolist() == [0, 1]
-    assert (
-        dual.time[0] == dual.time[128] or name == "pandar128"
-    )  # whose blocks have states of their own
+    # Each block of a Pandar128 has its own operating state.
+    assert dual.time[0] == dual.time[128] or name == "pandar128"
 
 
 @pytest.mark.slow

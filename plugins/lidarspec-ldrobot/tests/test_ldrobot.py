@@ -238,9 +238,8 @@ def test_three_consecutive_frames() -> None:
     assert (packets.stats.frames, packets.stats.bytes_skipped) == ({"data": 3}, 0)
     assert np.diff(packets.time_ns).tolist() == [2_000_000, 3_000_000]
     angles = clockwise(packets.points())
-    np.testing.assert_allclose(
-        np.diff(angles), 0.79, atol=0.03
-    )  # the step goes on over the borders of frames
+    # The step is the same from one frame to the next.
+    np.testing.assert_allclose(np.diff(angles), 0.79, atol=0.03)
 
 
 def test_six_real_frames() -> None:

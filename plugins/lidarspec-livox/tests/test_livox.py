@@ -224,9 +224,8 @@ def test_broadcasts_name_the_model(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, MID40.id])
 def test_a_simulated_one_is_opened_started_and_read(name: str) -> None:
-    with ls.open(
-        f"sim:{name}?rate=0.2"
-    ) as device:  # simulating all of its points takes a whole processor
+    # Simulating all of its points takes a whole processor.
+    with ls.open(f"sim:{name}?rate=0.2") as device:
         scan = device.latest(timeout=30)
         assert len(scan.points)
         told = {

@@ -81,9 +81,8 @@ def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
     ]
     columns = packets.raw["columns"]
     legacy = "encoder" in columns.dtype.names
-    absent = np.zeros(
-        columns.shape
-    )  # what the vendor's reader says of columns that have no number of their turn, and no encoder
+    # The vendor's reader returns 0 if the columns have no frame number or encoder value.
+    absent = np.zeros(columns.shape)
     status = columns["status"]
     if not legacy:
         status = 2 * status["reserved"] + status["valid"]
@@ -94,9 +93,8 @@ def test_every_field_has_the_digest_of_the_vendor(name: str) -> None:
         "FRAME_ID": digest((columns["frame_id"] if legacy else absent).astype("u2")),
         "ENCODER_COUNT": digest((columns["encoder"] if legacy else absent).astype("u4")),
     }
-    names = [
-        key for key in digests if key not in found and not key.startswith("RAW")
-    ]  # RAW32 are the words that the fields are cut out of
+    # RAW32 are the words that contain the fields.
+    names = [key for key in digests if key not in found and not key.startswith("RAW")]
     found |= {key: digest(pixels(packets, key.lower())) for key in names}
     assert found == {key: digests[key] for key in found}
     assert len(names) == (5 if legacy else 9)

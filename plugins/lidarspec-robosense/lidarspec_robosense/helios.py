@@ -220,7 +220,7 @@ HELIOS_16P = Sensor(
             make_packet(make_blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible
         ),
         "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
-    },
+    },  # 600 and 1200 rpm (manual B.1)
     points=points_16p,
     sequence=PacketCounter("bottom_packet_count"),
     state=HELIOS_16P_ROTOR.make_default_state(return_mode=STRONGEST),
@@ -248,7 +248,7 @@ HELIOS_16P = Sensor(
         "clock": dataclasses.replace(COMMON["clock"], status=make_clock_status()),
         "turn": (FACTORY_SPEED_HZ, 20.0),
         "status": "capture",
-    },  # 600 and 1200 rpm (manual B.1)
+    },
 )
 
 HELIOS_32 = dataclasses.replace(

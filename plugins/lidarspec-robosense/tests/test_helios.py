@@ -125,9 +125,8 @@ def test_calibration_angles(name: str) -> None:
     info = patch(difop(), ANGLES[name], vector_bytes(FILE, name))
     cloud = decode(SENSOR, [info, msop(steady(0, 40))]).points()
     plain = decode(SENSOR, [difop(), msop(steady(0, 40))]).points()
-    turned = np.rad2deg(
-        plain.azimuth - cloud.azimuth + cloud.elevation
-    )  # one of the two is 0; clockwise counts positive
+    # One of the two is 0; clockwise counts positive.
+    turned = np.rad2deg(plain.azimuth - cloud.azimuth + cloud.elevation)
     expected = np.array(vectors(FILE)[name]["expected"]["values"]) / 100
     np.testing.assert_allclose(turned[:4], expected, atol=1e-4)
     np.testing.assert_allclose(turned[16:20], expected, atol=1e-4)
@@ -153,15 +152,12 @@ def test_points_by_hand() -> None:
     info = difop(angles)
     data = [
         msop(steady(0x88DB, 40), {(0, 0): (0x0140, 1)}, count=0),  # R 350.35, H 346.29
-        msop(
-            steady(10_000, 40), {(0, 19): (4000, 2)}, count=50
-        ),  # laser 4 of the second firing: R 100.2340, H 103.8140
-        msop(
-            steady(20_010, 38), {(0, 31): (12_345, 3)}, count=100
-        ),  # laser 16 of the second firing: R 200.4402, H 204.0102
-        msop(
-            steady(2000, 40), {(0, 12): (65_535, 255)}, count=150
-        ),  # laser 13: R 20.1312, H 16.1712
+        # Laser 4 of the second firing: R 100.2340, H 103.8140.
+        msop(steady(10_000, 40), {(0, 19): (4000, 2)}, count=50),
+        # Laser 16 of the second firing: R 200.4402, H 204.0102.
+        msop(steady(20_010, 38), {(0, 31): (12_345, 3)}, count=100),
+        # Laser 13: R 20.1312, H 16.1712.
+        msop(steady(2000, 40), {(0, 12): (65_535, 255)}, count=150),
     ]
     cloud = decode(SENSOR, [info, *data]).points()
     places = [at(12 * packet, slot) for packet, slot in enumerate((0, 19, 31, 12))]
@@ -214,13 +210,11 @@ def test_two_firings_share_the_step_to_the_following_block_also_over_a_packets_b
     ).points()
     turned = clockwise(cloud)
     assert turned[at(10, 16)] == pytest.approx(0.2, abs=1e-4)  # 0.00 to 0.40
-    assert turned[at(11, 16)] == pytest.approx(
-        0.6, abs=1e-4
-    )  # 0.40 to 0.80, which is in the next packet
+    # From 0.40 to 0.80 degrees; the second angle is in the next packet.
+    assert turned[at(11, 16)] == pytest.approx(0.6, abs=1e-4)
     assert turned[at(12, 16)] == pytest.approx(0.98, abs=1e-4)  # 0.80 to 1.16
-    assert turned[at(23, 16)] == pytest.approx(
-        0.8 + 11 * 0.36 + 0.18, abs=1e-4
-    )  # nothing follows: the step before
+    # No packet follows, so the step is that of the previous block.
+    assert turned[at(23, 16)] == pytest.approx(0.8 + 11 * 0.36 + 0.18, abs=1e-4)
 
 
 def test_a_lost_packet_and_a_gap_in_the_field_of_view_keep_the_step_before() -> None:
@@ -230,9 +224,8 @@ def test_a_lost_packet_and_a_gap_in_the_field_of_view_keep_the_step_before() -> 
     ).points()
     turned = clockwise(cloud)
     assert turned[at(5, 16)] == pytest.approx(81.5 + 0.15, abs=1e-4)
-    assert turned[at(11, 16)] == pytest.approx(
-        241.5 + 0.15, abs=1e-4
-    )  # packet 2 is missing: 242.20 is not the next block
+    # Packet 2 is missing: 242.20 is not the next block.
+    assert turned[at(11, 16)] == pytest.approx(241.5 + 0.15, abs=1e-4)
     assert turned[at(12, 16)] == pytest.approx(242.2 + 0.05, abs=1e-4)
 
 

@@ -26,9 +26,8 @@ EXCERPTS = {
     "rsm1_radius_example",
 }
 SPLITS = {"rsm1_split_unit_a", "rsm1_split_unit_b", "rsm1_split_loop"}
-OTHER_LAYOUTS = {
-    "rs_time_utc_us"
-}  # a time with milliseconds and microseconds apart, of the mechanical models
+# A time with milliseconds and microseconds apart, of the mechanical models.
+OTHER_LAYOUTS = {"rs_time_utc_us"}
 
 
 def beginning(data: bytes) -> bytes:
@@ -197,9 +196,8 @@ def test_dual_return() -> None:
     assert cloud.return_index is not None
     assert len(cloud) == 250
     assert cloud.return_index.tolist() == [0] * 125 + [1] * 125
-    np.testing.assert_array_equal(
-        cloud.xyz[:125], cloud.xyz[125:]
-    )  # two echoes at one distance are both kept
+    # Two echoes at one distance are both kept.
+    np.testing.assert_array_equal(cloud.xyz[:125], cloud.xyz[125:])
     single = decode(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_header_manual"))]).points()
     assert single.return_index is not None
     assert single.return_index.tolist() == [0] * 125
@@ -225,9 +223,8 @@ def test_the_device_information() -> None:
 
 @pytest.mark.parametrize("layout", ["difop", "difop_fov", "difop_guide", "difop_other"])
 def test_the_first_28_bytes_are_equal_in_all_layouts(layout: str) -> None:
-    head = bytes.fromhex(
-        "a5ff005a11115555 00 0a c0a801c8 c0a80166 001ccd0a0b0c 1a2b 1e6c"
-    )  # 10 Hz, 192.168.1.200, 192.168.1.102, MAC, 6699, 7788
+    # 10 Hz, 192.168.1.200, 192.168.1.102, MAC, 6699, 7788.
+    head = bytes.fromhex("a5ff005a11115555 00 0a c0a801c8 c0a80166 001ccd0a0b0c 1a2b 1e6c")
     data = head + SENSOR.example(layout)[28:]
     parsed = SENSOR.parse(data, layout)
     assert parsed.frame_rate == 10
@@ -320,9 +317,8 @@ def test_the_sweep_stays_in_the_field_of_view() -> None:
         pytest.approx(-12.5, abs=0.3),
         pytest.approx(12.5, abs=0.3),
     )
-    np.testing.assert_allclose(
-        np.ptp(azimuth, axis=(0, 1)), 24, atol=0.3
-    )  # each channel a fifth of 120 degrees
+    # Each channel covers a fifth of 120 degrees.
+    np.testing.assert_allclose(np.ptp(azimuth, axis=(0, 1)), 24, atol=0.3)
     assert SENSOR.simulation.sweep(630)["pkt_psn"] == 1
     assert SENSOR.simulation.sweep(6300 + 63)["seconds"] + SENSOR.simulation.sweep(6300 + 63)[
         "microseconds"

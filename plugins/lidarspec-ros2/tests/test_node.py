@@ -185,9 +185,8 @@ def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: 
     assert "5.0 to 3.0" in client.set("range_min", 5.0)
     assert client.set("beams", -1)
     assert (client.value("scan_z_min"), client.value("range_min")) == (0.0, 0.0)
-    assert (
-        client.set("angle_min", 2.0) == ""
-    )  # on through the back, to where the last beam looks a turn on
+    # The range passes the back, up to the last beam in the next turn.
+    assert client.set("angle_min", 2.0) == ""
     client.until(lambda: newest().angle_min == 2.0)
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
@@ -478,9 +477,8 @@ def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int)
     code, complaints = end_node(process, by)
     assert (code, complaints) == (0, "")
     assert not any(Path(f"/proc/{thread}").exists() for thread in threads)
-    ports = {
-        name for name in list_shared_memory(os.getpid()) if "_port" in name
-    }  # where the client listens
+    # The client receives at these ports.
+    ports = {name for name in list_shared_memory(os.getpid()) if "_port" in name}
     assert not [name for name in own - ports if Path(name).exists()]
     assert set(holders(port)) <= {str(simulator)}
 

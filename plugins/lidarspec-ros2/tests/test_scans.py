@@ -147,9 +147,8 @@ def test_imu_messages_equal_those_of_the_library(
         ]
         for one in read
     ]
-    shared = [
-        row for row in found if row in wanted
-    ]  # on a busy computer some of either may be lost
+    # On a busy computer, either side may have lost some.
+    shared = [row for row in found if row in wanted]
     assert shared == [row for row in wanted if row in found]
     assert (len(shared) > 100, {one.header.frame_id for one in read}) == (True, {"head"})
 

@@ -61,9 +61,8 @@ def test_the_files_of_parameters_name_parameters_and_installed_sensors() -> None
 def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(
     client: Client, name: str, topic: str, kind: Any
 ) -> None:
-    program = Path(
-        get_package_prefix("lidarspec_ros2"), "lib", "lidarspec_ros2", "lidarspec_node"
-    )  # where launch looks for it
+    # The launch command searches here.
+    program = Path(get_package_prefix("lidarspec_ros2"), "lib", "lidarspec_ros2", "lidarspec_node")
     config = share("config", "two_lidars.yaml")
     words = [
         "--ros-args",
@@ -74,9 +73,8 @@ def test_a_node_of_the_launch_file_has_its_parameters_from_the_file(
         "--params-file",
         str(config),
     ]
-    received = client.listen(
-        f"/{name}/{topic}", kind, reliable=name == "back"
-    )  # the node's own choice for that one
+    # The node sends this topic with reliable delivery.
+    received = client.listen(f"/{name}/{topic}", kind, reliable=name == "back")
     with subprocess.Popen([program, *words]) as node:
         client.until(lambda: received)
         node.terminate()

@@ -120,9 +120,8 @@ def test_a_clock_change_is_reported(
     assert stamps[-1] < BEGAN + 10 * SECOND
 
 
-@pytest.mark.parametrize(
-    "sensor", ["livox-avia", "ouster-os0"]
-)  # whose samples have no clock, and that of the points
+# The IMU samples of the Avia have no clock, those of the OS0 have the clock of the points.
+@pytest.mark.parametrize("sensor", ["livox-avia", "ouster-os0"])
 def test_imu_samples_and_points_have_consistent_stamps(
     run: Callable[..., Any], client: Client, sensor: str
 ) -> None:

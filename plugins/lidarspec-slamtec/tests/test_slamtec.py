@@ -239,9 +239,8 @@ def test_the_compensation_of_express_capsules_signed_or_not() -> None:
         "first": {"distance": 1000, "dtheta_high": 2},
         "second": {"distance": 1000, "dtheta_high": 0},
     }
-    cabins = [
-        {**empty, "dtheta_low": {"first": 8, "second": 8}}
-    ] * 16  # 101000: 40, or -24; 001000: 8
+    # 101000: 40, or -24; 001000: 8.
+    cabins = [{**empty, "dtheta_low": {"first": 8, "second": 8}}] * 16
     data = b"".join(
         A1.build("express", start={"angle": angle * 64, "sync": 0}, cabins=cabins)
         for angle in (100, 132)

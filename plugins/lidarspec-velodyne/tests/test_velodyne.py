@@ -110,9 +110,8 @@ def test_vlp16_points_by_hand() -> None:
     assert cloud.ring[spots].tolist() == [1, 15, 0]
     np.testing.assert_allclose(cloud.time[spots], [4.608e-6, 421.632e-6, 1271.808e-6], atol=1e-12)
     vendor = VLP16.configure(frame="vendor").decode([first, packet(steps(30), {})]).points()
-    np.testing.assert_allclose(
-        vendor.xyz[spots[0]], (6.89184, 6.88783, -2.23983), atol=2e-5
-    )  # x right, y forward
+    # x points to the right, y forward.
+    np.testing.assert_allclose(vendor.xyz[spots[0]], (6.89184, 6.88783, -2.23983), atol=2e-5)
 
 
 def test_vlp16_dual_return_by_hand() -> None:
@@ -334,9 +333,8 @@ def test_a_single_block_after_a_masked_sector_uses_the_rotor_speed(jump_deg: int
     cells = {(block, slot): (500, 1) for block in range(12) for slot in range(32)}
     cloud = VLP16.decode([packet(starts, cells)]).points()
     first, last = clockwise(cloud)[[spot(11, 0), spot(11, 31)]]
-    within = (
-        0.4 * (55.296 + 15 * 2.304) / 110.592
-    )  # degrees from laser 0 to laser 31, at 0.4 degrees from block to block
+    # Degrees from laser 0 to laser 31, at 0.4 degrees from block to block.
+    within = 0.4 * (55.296 + 15 * 2.304) / 110.592
     assert (last - first) % 360 == pytest.approx(within, abs=1e-4)
 
 

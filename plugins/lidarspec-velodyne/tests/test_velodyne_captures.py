@@ -23,9 +23,8 @@ OLD = "velodyne/vlp16_old_firmware/vlp-16-test-90deg-1-50-frames.pcap"
 HDL = "velodyne/hdl32e/sample_velodyne_hdl32.pcap"
 RAW = "velodyne/vlp16_raw/recording.bin"
 
-PCD = np.dtype(
-    "f4, f4, f4, u1, u1, u2, f4, f4, f4, u4"
-)  # x y z intensity return_type channel azimuth elevation distance time
+# The fields x y z intensity return_type channel azimuth elevation distance time.
+PCD = np.dtype("f4, f4, f4, u1, u1, u2, f4, f4, f4, u4")
 
 
 @functools.cache
@@ -72,9 +71,8 @@ def test_old_firmware_published_points() -> None:
         (13859, 15, 29, (-0.0094354, 4.91462, 1.31687)),
     ]:
         np.testing.assert_allclose(cloud.xyz[index, :2], xyz[:2], atol=1e-5)
-        offset = (
-            0.04191 * np.tan(np.deg2rad(15)) * (1 if ring == 0 else -1)
-        )  # published without the vertical offset of the laser
+        # The published values omit the vertical offset of the laser.
+        offset = 0.04191 * np.tan(np.deg2rad(15)) * (1 if ring == 0 else -1)
         assert cloud.xyz[index, 2] - offset == pytest.approx(xyz[2], abs=1e-5)
         assert (cloud.ring[index], cloud.intensity[index]) == (ring, intensity)
 
@@ -103,9 +101,8 @@ def test_dual_return_pieces() -> None:
     scans = list(VLP16.scans(payloads(DUAL)))
     assert [scan.complete for scan in scans] == [False, True, True, True, False]
     assert [scan.rate_hz for scan in scans[1:4]] == [pytest.approx(10, abs=0.02)] * 3
-    assert all(
-        len(scan) % 64 == 0 for scan in scans
-    )  # never cut between the two blocks of a firing
+    # No scan is cut between the two blocks of a firing.
+    assert all(len(scan) % 64 == 0 for scan in scans)
 
 
 def test_recording_without_any_header_is_a_stream() -> None:

@@ -213,9 +213,8 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
                 piece["size"],
             )
             rows = frame["explanation"]["rows"]
-            assert (
-                "".join(row["hex"].replace(" ", "") for row in rows) == frame["hex"]
-            )  # every byte once, in order
+            # The rows contain every byte once, in order.
+            assert "".join(row["hex"].replace(" ", "") for row in rows) == frame["hex"]
             assert [row["offset"] for row in rows] == np.cumsum(
                 [0, *(len(bytes.fromhex(row["hex"])) for row in rows[:-1])]
             ).tolist()

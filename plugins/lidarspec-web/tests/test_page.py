@@ -481,9 +481,8 @@ def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callab
                     "params": {"expression": expression, "returnByValue": True},
                 }
                 socket.send(json.dumps(asked))
-                return (
-                    json.loads(socket.recv()).get("result", {}).get("result", {}).get("value")
-                )  # none while a page is loading
+                # The value is None while a page is loading.
+                return json.loads(socket.recv()).get("result", {}).get("result", {}).get("value")
 
             def turned(front: bool) -> None:
                 ask(f"activate/{(tab if front else other)['id']}")
