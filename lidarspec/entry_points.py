@@ -72,13 +72,15 @@ def entry_points(group: str) -> list[EntryPoint]:
     If several distributions have the same name, the first on `sys.path` is used.
     """
     try:
-        entries = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
+        entries = [
+            entry for folder in _iter_distributions() for entry in _iter_declared(folder, group)
+        ]
     except _NonFolderPathError:
         entries = _read_by_metadata(group)
     return sorted(entries, key=lambda entry: (entry.name, entry.value))
 
 
-def _distributions() -> Iterator[str]:
+def _iter_distributions() -> Iterator[str]:
     """Yield the metadata folder of each installed distribution, one for each name."""
     if any(
         hasattr(finder, "find_distributions") and finder is not PathFinder
@@ -118,7 +120,7 @@ def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     If the distribution's file is not UTF-8 and the group is `GROUP`, the first entry has no module,
     and its `load` raises the error.
     """
-    text = _text(folder, "entry_points.txt")
+    text = _read_text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP
     if not is_damaged and f"[{group}]" not in text:
         return
@@ -135,12 +137,12 @@ def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
 
 
 def _name_and_version(folder: str) -> tuple[str, str]:
-    header = (_text(folder, "METADATA") or _text(folder, "PKG-INFO")).partition("\n\n")[0]
+    header = (_read_text(folder, "METADATA") or _read_text(folder, "PKG-INFO")).partition("\n\n")[0]
     fields = dict(re.findall(r"^(Name|Version):[ \t]*(.*?)[ \t\r]*$", header, re.MULTILINE))
     return fields.get("Name", "?"), fields.get("Version", "?")
 
 
-def _text(folder: str, name: str) -> str:
+def _read_text(folder: str, name: str) -> str:
     try:
         with open(os.path.join(folder, name), encoding="utf-8", errors="replace") as file:
             return file.read()

@@ -45,7 +45,7 @@ class SpecError(LidarSpecError):
 
 
 #: Packages that a plugin calls. They never contain the line at fault.
-_NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
+_CALLED_PACKAGES = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
@@ -166,7 +166,7 @@ def raised_at(error: BaseException) -> tuple[str, int]:
         if (
             os.path.isfile(file)
             and not file.startswith(ours)
-            and not set(file.split(os.sep)) & set(_NOT_ITS_OWN)
+            and not set(file.split(os.sep)) & set(_CALLED_PACKAGES)
         ):
             return file, entry.lineno or 0
     return "", 0
@@ -266,7 +266,7 @@ class LibraryError(UsageError):
 
 
 #: Maximum number of suggested names that contain the typed name.
-SUGGESTED = 6
+MAX_SUGGESTED_NAMES = 6
 
 
 def did_you_mean(
@@ -275,7 +275,7 @@ def did_you_mean(
     *,
     alike: float = 0.5,
     aliases: Mapping[str, str] = MappingProxyType({}),
-    max_parts: int = SUGGESTED,
+    max_parts: int = MAX_SUGGESTED_NAMES,
 ) -> str:
     """Return a clause such as ``; did you mean 'speed'?``; "" if no name is similar.
 
@@ -349,7 +349,7 @@ class UnknownName(UsageError):
 
     what = "name"
     alike = 0.5
-    max_parts = SUGGESTED
+    max_parts = MAX_SUGGESTED_NAMES
     max_listed: float = 12
 
     def __init__(

@@ -274,19 +274,19 @@ class Registry:
         """All installed plugins; those that failed or lost a name have an error."""
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
-        return [self._judge(plugin) for plugin in (*self._modules, *offered)]
+        return [self._drop_lost_names(plugin) for plugin in (*self._modules, *offered)]
 
-    def _judge(self, plugin: Plugin) -> Plugin:
+    def _drop_lost_names(self, plugin: Plugin) -> Plugin:
         """Return a plugin with only the ids that it owns, and an error if it lost a name."""
         home = plugin.home
-        own = sorted(name for name in self._sensors.get(home, {}) if self._holder(name) == home)
+        own = sorted(name for name in self._sensors.get(home, {}) if self._find_owner(name) == home)
         lost = [
             name
             for name, homes in self._claims.items()
-            if home in homes and self._holder(name) != home
+            if home in homes and self._find_owner(name) != home
         ]
         if lost and not plugin.error:
-            holder = self._holder(lost[0])
+            holder = self._find_owner(lost[0])
             if holder:
                 others = [holder]
             else:
@@ -376,7 +376,7 @@ class Registry:
             for name in (sensor.id, *sensor.aliases):
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
-    def _holder(self, name: str) -> Home | None:
+    def _find_owner(self, name: str) -> Home | None:
         """Return the plugin that owns a name; None if no plugin claims or owns it."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
@@ -415,7 +415,7 @@ class Registry:
         Raises:
             UsageError: if several distributions claim the name, and none owns it.
         """
-        home = self._holder(name)
+        home = self._find_owner(name)
         if home is None:
             if name not in self._claims:
                 return None
@@ -440,7 +440,7 @@ class Registry:
             name: sensor
             for home, own in self._sensors.items()
             for name, sensor in own.items()
-            if self._holder(name) == home
+            if self._find_owner(name) == home
         }
 
     def names(self) -> list[str]:
@@ -459,7 +459,7 @@ class Registry:
 
         Only the plugin whose entry point has this name is loaded.
         """
-        if self._holder(name) is None or self._find(name) is None:
+        if self._find_owner(name) is None or self._find(name) is None:
             return None
         return self.sensor(name)
 
@@ -479,7 +479,11 @@ class Registry:
             for entries in self._offered.values()
             if any(entry in self._tried for entry in entries)
         ]
-        return [plugin for plugin in map(self._judge, (*self._modules, *offered)) if plugin.error]
+        return [
+            plugin
+            for plugin in map(self._drop_lost_names, (*self._modules, *offered))
+            if plugin.error
+        ]
 
     def list_sensors(self) -> list[KnownSensor]:
         """Return a row for each installed sensor, sorted by id.
@@ -494,13 +498,13 @@ class Registry:
                     self._load(entry)
         rows = {row.id: row for row in described if self._has_name(row.distribution, row.id)}
         for name, sensor in self._loaded_sensors().items():
-            home = self._holder(name)
+            home = self._find_owner(name)
             if name not in rows and home is not None:
                 rows[name] = make_row(sensor, home[0], self._version(home[0]))
         return [rows[name] for name in sorted(rows)]
 
     def _has_name(self, distribution: str, name: str) -> bool:
-        home = self._holder(name)
+        home = self._find_owner(name)
         return home is not None and home[0] == distribution
 
     def _version(self, distribution: str) -> str:
@@ -570,7 +574,9 @@ class Registry:
 
     def apply_hooks(self, sensor: Sensor) -> Sensor:
         """Return a sensor with the checksum and points hooks of all plugins applied."""
-        frames = {name: self._seal(sensor, frame) for name, frame in sensor.frames.items()}
+        frames = {
+            name: self._apply_checksum_hooks(sensor, frame) for name, frame in sensor.frames.items()
+        }
         points = self._manager.hook.lidarspec_points
         if not points.get_hookimpls():
             return replace(sensor, frames=frames, hooked=self.apply_hooks)
@@ -589,7 +595,7 @@ class Registry:
         """Call another hook and return its result."""
         return getattr(self._manager.hook, hook)(**arguments)
 
-    def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
+    def _apply_checksum_hooks(self, sensor: Sensor, frame: Frame) -> Frame:
         """Return a frame with the checksum of the first hook that provides a checksum.
 
         If a hook raises an exception, the error is recorded and the next hook is called.
@@ -599,7 +605,7 @@ class Registry:
             try:
                 algorithm = hook.function(**{name: arguments[name] for name in hook.argnames})
                 if algorithm is not None:
-                    return _reseal(frame, algorithm)
+                    return _replace_checksum(frame, algorithm)
             except Exception as error:
                 self._record_checksum_failure(
                     hook.plugin_name,
@@ -777,7 +783,7 @@ def _letters(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
 
 
-def _reseal(frame: Frame, algorithm: Any) -> Frame:
+def _replace_checksum(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"must return a Checksum or None, got {type(algorithm).__name__}")
     struct = prepare(frame.struct)
@@ -830,7 +836,7 @@ def try_plugins() -> list[Plugin]:
         return registry().plugins
     groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
-    trials = _trials(list(entries))
+    trials = _try_loading_all(list(entries))
     lost = [
         Plugin(
             entry.distribution,
@@ -859,8 +865,8 @@ def _modules() -> list[EntryPoint]:
     return list(entries.values())
 
 
-def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
-    """Return the result of `_trial` for each plugin.
+def _try_loading_all(homes: list[Home]) -> dict[Home, tuple[str, str]]:
+    """Return the result of `_try_loading` for each plugin.
 
     First, one process loads all plugins. If this fails, each plugin is loaded in a process of its
     own.
@@ -868,13 +874,13 @@ def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
     from concurrent.futures import ThreadPoolExecutor
 
     nothing_wrong = ("", "")
-    if _trial(*homes) == nothing_wrong:
+    if _try_loading(*homes) == nothing_wrong:
         return dict.fromkeys(homes, nothing_wrong)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return dict(zip(homes, pool.map(_trial, homes), strict=True))
+        return dict(zip(homes, pool.map(_try_loading, homes), strict=True))
 
 
-def _trial(*homes: Home) -> tuple[str, str]:
+def _try_loading(*homes: Home) -> tuple[str, str]:
     """Load plugins in another process; return (error, side effects), each "" if none."""
     import subprocess
 
@@ -915,7 +921,8 @@ def _trial(*homes: Home) -> tuple[str, str]:
 def load_alone() -> None:
     """Load the plugins in `sys.argv`, print the threads that keep running, and exit.
 
-    `_trial` runs this in a process. In the output, a marker precedes the names of the threads.
+    `_try_loading` runs this function in a process. In the output, a marker precedes the names of
+    the threads.
     """
     import faulthandler
 
@@ -1012,7 +1019,7 @@ def _from_file(text: str) -> Sensor:
     file, wanted = split_file_and_id(text)
     module = import_file(file)
     local = Registry()
-    with _faults_of(file):
+    with _convert_errors(file):
         ids = local.add(module, name=str(file))
     if not ids:
         raise SpecError(
@@ -1051,7 +1058,7 @@ def import_file(file: Path) -> ModuleType:
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module.__name__] = module
     try:
-        with _faults_of(file):
+        with _convert_errors(file):
             module_spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[module.__name__]
@@ -1060,7 +1067,7 @@ def import_file(file: Path) -> ModuleType:
 
 
 @contextlib.contextmanager
-def _faults_of(file: Path) -> Iterator[None]:
+def _convert_errors(file: Path) -> Iterator[None]:
     """Convert exceptions of the code in a file to `SpecError` with the file's name."""
     try:
         yield

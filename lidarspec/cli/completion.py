@@ -34,7 +34,7 @@ from lidarspec.transports.ports import list_serial_ports
 #: The environment variable with the request of the shell.
 VARIABLE = "_LIDARSPEC_COMPLETE"
 #: The characters at which bash splits words.
-BREAKS = ":="
+WORD_BREAKS = ":="
 
 
 @add_completion_class
@@ -53,17 +53,17 @@ class BashCompletion(BashComplete):
     def get_completion_args(self) -> tuple[list[str], str]:
         """Return the words before the cursor, and the word at the cursor.
 
-        Bash splits words at the characters in `BREAKS`; the parts are joined again.
+        Bash splits words at the characters in `WORD_BREAKS`; the parts are joined again.
         """
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in (*args, incomplete):
-            if words and word and (word[0] in BREAKS or words[-1][-1:] in BREAKS):
+            if words and word and (word[0] in WORD_BREAKS or words[-1][-1:] in WORD_BREAKS):
                 words[-1] += word
-            elif word or not words or words[-1][-1:] not in BREAKS:
+            elif word or not words or words[-1][-1:] not in WORD_BREAKS:
                 words.append(word)
         *args, incomplete = words
-        self._bash_prefix = incomplete[: max(incomplete.rfind(mark) for mark in BREAKS) + 1]
+        self._bash_prefix = incomplete[: max(incomplete.rfind(mark) for mark in WORD_BREAKS) + 1]
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:

@@ -219,7 +219,7 @@ def refuse_overwriting(
         if os.path.exists(file)
     ]
     files = [file for file in existing if os.path.isfile(file)]
-    for path in [path for source in inputs for path in _read_for(source)] if files else ():
+    for path in [path for source in inputs for path in _iter_read_files(source)] if files else ():
         if os.path.exists(path):
             same = next((file for file in files if os.path.samefile(path, file)), None)
         else:
@@ -237,7 +237,7 @@ def refuse_overwriting(
         raise suggest(error, "repeat with --force, or with another file")
 
 
-def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
+def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
     """Yield the files that may be read for an argument."""
     if isinstance(argument, Sensor):
         yield from (

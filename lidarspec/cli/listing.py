@@ -42,10 +42,10 @@ def emit_lines(lines: Iterable[Line], output: str | None) -> None:
         emit_parts(map(plain_text, lines), output)
         return
     width = console.width if sys.stdout.isatty() else None
-    emit_parts((_colour(line, width) for line in lines), output, colour=True)
+    emit_parts((_format_line(line, width) for line in lines), output, colour=True)
 
 
-def _colour(line: Line, width: int | None) -> str:
+def _format_line(line: Line, width: int | None) -> str:
     from rich.text import Text
 
     drawing = Text()

@@ -196,7 +196,7 @@ def _iter_packets(
             place = {"offset": int(packets.offset[index]), "time_ns": int(packets.time_ns[index])}
             yield (
                 units,
-                {**place, **{path: _scalar(column[index]) for path, column in columns.items()}},
+                {**place, **{path: _to_scalar(column[index]) for path, column in columns.items()}},
             )
         if time.monotonic() >= until or wanted.ended:
             break
@@ -206,7 +206,7 @@ def _iter_packets(
         raise wanted.missed_error(device.source)
 
 
-def _scalar(value: Any) -> Any:
+def _to_scalar(value: Any) -> Any:
     if np.ndim(value) or isinstance(value, str):
         return value
     return float(value)

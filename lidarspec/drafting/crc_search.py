@@ -33,7 +33,15 @@ from lidarspec.drafting.samples import (
     iter_spans,
     weigh_evidence,
 )
-from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
+from lidarspec.spec.checksums import (
+    CRCS,
+    KNOWN_POLYNOMIALS,
+    MIRROR,
+    ByteOrder,
+    Crc,
+    name_of,
+    reflect,
+)
 
 #: The maximum degree of the cofactors that are tried to find a divisor.
 MAX_COFACTOR_DEGREE = 11
@@ -339,7 +347,7 @@ def _iter_matches(
         candidates = _iter_candidates(_make_codewords(few, place, span, reading), reading)
     for crc, fitted, notes in candidates:
         right = samples.count_valid(crc, place, span, reading.order)
-        is_known = crc.poly in KNOWN[crc.width]
+        is_known = crc.poly in KNOWN_POLYNOMIALS[crc.width]
         # An unknown polynomial is an additional fitted parameter. A known polynomial is one of many
         # that were tried.
         evidence_bits = weigh_evidence(
@@ -413,7 +421,9 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
         for poly in divisors(common_divisor(multiples, floor=width), width)
         if poly != xor_polynomial
     ]
-    catalogued = [poly for poly in polynomials if poly & ((1 << width) - 1) in KNOWN[width]]
+    catalogued = [
+        poly for poly in polynomials if poly & ((1 << width) - 1) in KNOWN_POLYNOMIALS[width]
+    ]
     return (catalogued + [poly for poly in polynomials if poly not in catalogued])[:MAX_POLYNOMIALS]
 
 

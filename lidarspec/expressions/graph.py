@@ -542,11 +542,11 @@ def evaluate_expressions(
 
 
 #: The maximum number of cached values of a term.
-REMEMBERED = 64
+MAX_CACHED_VALUES = 64
 
 #: A function that converts the values of a term to integers, (n,) or (1,), given the values and the
 #: number of packets n.
-Made = Callable[[Any, int], NDArray[np.int64]]
+IntegerConverter = Callable[[Any, int], NDArray[np.int64]]
 
 
 class HeaderFunction:
@@ -557,12 +557,12 @@ class HeaderFunction:
 
     Args:
         function: a function of `Fields` that returns a column, or several columns (the terms).
-        made: a function that converts the values of a term to integers; see `Made`.
+        to_integers: a function that converts the values of a term to integers.
     """
 
-    def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
+    def __init__(self, function: Callable[[Any], Any], to_integers: IntegerConverter) -> None:
         self._function = function
-        self._made = made
+        self._to_integers = to_integers
         self._terms: list[_ResultPart] | None = None
         self._is_tried = False
 
@@ -573,7 +573,8 @@ class HeaderFunction:
             self._is_tried, self._terms = True, self._split_terms(batch, table)
         if self._terms is None:
             return [
-                self._made(term, len(batch)) for term in _to_terms(self._function(Fields(batch)))
+                self._to_integers(term, len(batch))
+                for term in _to_terms(self._function(Fields(batch)))
             ]
         return [term(table) for term in self._terms]
 
@@ -581,7 +582,7 @@ class HeaderFunction:
         try:
             traced, _ = trace(self._function, make_sample(batch, table.groups[0]))
             return [
-                _ResultPart(Expression.of(term.node, table.schema), self._made)
+                _ResultPart(Expression.of(term.node, table.schema), self._to_integers)
                 for term in _to_terms(traced)
             ]
         except Exception:  # calling the function itself reports the error
@@ -601,11 +602,11 @@ class _ResultPart:
         UntraceableError: if a field is optional or in an array.
     """
 
-    def __init__(self, expression: Expression, made: Made) -> None:
+    def __init__(self, expression: Expression, to_integers: IntegerConverter) -> None:
         if any(info.axes or info.optional for info in expression.fields):
             raise UntraceableError("a field that is used is optional or inside an array")
         self._expression = expression
-        self._made = made
+        self._to_integers = to_integers
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}
 
     def __call__(self, table: Table) -> NDArray[np.int64]:
@@ -634,7 +635,7 @@ class _ResultPart:
         cached = self._known.get(key)
         if cached is None:
             cached = self._compute(columns)
-            if len(self._known) >= REMEMBERED:
+            if len(self._known) >= MAX_CACHED_VALUES:
                 self._known.clear()
             self._known[key] = cached
         return cached
@@ -643,13 +644,15 @@ class _ResultPart:
         raw = {
             info.path: column for info, column in zip(self._expression.fields, columns, strict=True)
         }
-        return self._made(self._expression.values(raw), len(columns[0]))
+        return self._to_integers(self._expression.values(raw), len(columns[0]))
 
 
 @lru_cache(maxsize=256)
-def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) -> HeaderFunction:
+def header_function(
+    function: Callable[[Any], Any], schema: Schema, to_integers: IntegerConverter
+) -> HeaderFunction:
     """Return the `HeaderFunction` for a function and a schema; repeated calls share it."""
-    return HeaderFunction(function, made)
+    return HeaderFunction(function, to_integers)
 
 
 def split_condition(node: Node) -> Iterator[Node]:

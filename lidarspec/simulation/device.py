@@ -163,7 +163,7 @@ class ReplyMaker:
         if now - self._received.get(link, now) > REQUEST_TIMEOUT_NS:
             decoder.idle()
         self._received[link] = now
-        requests = (self._request(item.frame, item.data, link) for item in decoder.feed(data))
+        requests = (self._find_request(item.frame, item.data, link) for item in decoder.feed(data))
         return [request for request in requests if request is not None]
 
     def make_replies(self, request: ReceivedCommand) -> list[ReplyPart]:
@@ -204,7 +204,7 @@ class ReplyMaker:
             path: _to_physical(fields[path], value) for path, value in raw.items() if path in fields
         }
 
-    def _request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
+    def _find_request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
         """Return the command that a received frame contains; None if there is none.
 
         If several commands match, returns the one with the most fixed values.
@@ -426,7 +426,7 @@ class SimulatedDevice:
         self.commands_received = list[str]()
         self.destination: tuple[str, int] | None = None
         self.sent = Counter[str]()
-        self.lines = {name: self._line(name, seed) for name in sensor.links}
+        self.lines = {name: self._make_link(name, seed) for name in sensor.links}
         self._scene = scene or make_room(seed)
         self._source = random.Random(f"device {seed}")
         self._replies = ReplyMaker(sensor, self.faults.shake)
@@ -446,10 +446,10 @@ class SimulatedDevice:
         if isinstance(link, Udp) and link.assembled is not None:
             self._fragmenter = Fragmenter(sensor.id, link.assembled)
         if sensor.has_points:
-            self._simulation(sensor.data_frame)
+            self._get_simulation(sensor.data_frame)
         check_clock_faults(sensor, self.faults.clock)
 
-    def _line(self, name: str, seed: int) -> FaultyLink:
+    def _make_link(self, name: str, seed: int) -> FaultyLink:
         """Return the link of this name with its faults.
 
         TCP and HTTP lose no bytes, so these links have no faults. A byte stream other than the data
@@ -481,7 +481,7 @@ class SimulatedDevice:
         if is_started or self.sensor.has_points:
             self._begin_periodic(0.0)
         if is_started and self.sensor.has_points:
-            self._begin(0.0, self.sensor.data_frame)
+            self._begin_data(0.0, self.sensor.data_frame)
 
     def _waits_for_a_command(self) -> bool:
         """Return whether the device sends no data until a start command is received.
@@ -513,7 +513,7 @@ class SimulatedDevice:
         """
         if self._stream is None:
             raise UsageError(f"{self.sensor.id} sends no data, so its clock cannot jump")
-        self._simulation(self._stream.frame).clock.check(self.faults.clock)
+        self._get_simulation(self._stream.frame).clock.check(self.faults.clock)
         self._timeline.jump_ns += round(seconds * SECOND)
         self._replies.use_timeline(self._timeline)
 
@@ -626,7 +626,7 @@ class SimulatedDevice:
         repetition = due.repetition + 1
         data = self._replies.make_periodic_frame(due.frame, repetition)
         period_ns = SECOND / self._periodic_rates[due.frame]
-        self._put(due.at + period_ns, due.link, due.frame, data, repetition)
+        self._plan_data(due.at + period_ns, due.link, due.frame, data, repetition)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
         """Plan the reply to a command, unless the command is ignored while data is sent.
@@ -649,9 +649,9 @@ class SimulatedDevice:
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
         for answer in self._replies.make_replies(request):
             if answer.pause:
-                time_ns = self._settle(time_ns, answer.pause, command.link)
+                time_ns = self._plan_pause(time_ns, answer.pause, command.link)
             else:
-                self._put(time_ns, command.link, answer.frame, answer.data)
+                self._plan_data(time_ns, command.link, answer.frame, answer.data)
                 mode = answer.frame if answer.frame in announcing else mode
         if request.name in self.sensor.simulation.effects:
             self._apply_effect(request.name)
@@ -669,7 +669,7 @@ class SimulatedDevice:
                 else next(iter(kinds), None)
             )
             if chosen is not None:
-                self._begin(time_ns, chosen)
+                self._begin_data(time_ns, chosen)
 
     def _apply_effect(self, command: str) -> None:
         """Change the sweep after a command; frames that exist already are still sent."""
@@ -681,26 +681,28 @@ class SimulatedDevice:
             number = self._stream.next_number
         self._sweep = self.sensor.simulation.effects[command](sweep, number)
         if self._stream is not None:
-            self._stream.change(self._simulation(self._stream.frame))
+            self._stream.change(self._get_simulation(self._stream.frame))
 
     def _begin_periodic(self, at: float) -> None:
         """Plan the first frame of each type without points that is sent periodically."""
         for name in self._periodic_rates:
-            self._put(at, "data", name, self._replies.make_periodic_frame(name, 0))
+            self._plan_data(at, "data", name, self._replies.make_periodic_frame(name, 0))
 
-    def _settle(self, at: float, seconds: float, link: str) -> float:
+    def _plan_pause(self, at: float, seconds: float, link: str) -> float:
         """Plan the fillers that are sent during a pause, and return the end of the pause."""
         for step in range(PAUSE_FILLERS if self.sensor.fillers else 0):
             data = bytes([self._source.choice(self.sensor.fillers)])
-            self._put(at + seconds * SECOND * (step + 1) / (PAUSE_FILLERS + 1), link, "", data)
+            self._plan_data(
+                at + seconds * SECOND * (step + 1) / (PAUSE_FILLERS + 1), link, "", data
+            )
         return at + seconds * SECOND
 
-    def _begin(self, at: float, frame: str) -> None:
+    def _begin_data(self, at: float, frame: str) -> None:
         self._stream = _FrameStream(
-            self._simulation(frame), frame, self._scene, at, self.faults.shake, self._timeline
+            self._get_simulation(frame), frame, self._scene, at, self.faults.shake, self._timeline
         )
 
-    def _simulation(self, frame: str) -> FrameSimulation:
+    def _get_simulation(self, frame: str) -> FrameSimulation:
         sensor = self.sensor
         if self._sweep is not None:
             sensor = replace(sensor, simulation=replace(sensor.simulation, sweep=self._sweep))
@@ -713,7 +715,9 @@ class SimulatedDevice:
             )
         return stream_simulation
 
-    def _put(self, at: float, link: str, frame: str, data: bytes, repetition: int = 0) -> None:
+    def _plan_data(
+        self, at: float, link: str, frame: str, data: bytes, repetition: int = 0
+    ) -> None:
         self._planned += 1
         planned = _PlannedData(at, self._planned, link, frame, data, repetition)
         heapq.heappush(self._plan, planned)

@@ -55,7 +55,7 @@ class FrameMaker:
         }
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
-        self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
+        self._set_up(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
 
     @classmethod
     def of_struct(cls, sensor: str, frame: Frame) -> FrameMaker:
@@ -78,10 +78,10 @@ class FrameMaker:
         """
         maker = cls.__new__(cls)
         maker._coder = None  # only whole frames have a wire form
-        maker._makes(sensor, root, limit, given, set())
+        maker._set_up(sensor, root, limit, given, set())
         return maker
 
-    def _makes(
+    def _set_up(
         self, sensor: str, root: Node, limit: int, given: Mapping[str, int], elsewhere: set[str]
     ) -> None:
         self._sensor = sensor
@@ -209,7 +209,7 @@ class FrameMaker:
             parts = [dict(part) for part in result.pop(axis, ())]
             kinds = [find_kind(node, part) for part in parts]
             around = {ref.path: self._raw(result, ref.path) for ref in node.outer}
-            makers = [self._maker(kind, around) for kind in kinds]
+            makers = [self._get_maker(kind, around) for kind in kinds]
             sizes = [
                 maker._layout(maker._with_parts(maker._with_texts(part))[0]).size
                 for maker, part in zip(makers, parts, strict=True)
@@ -230,7 +230,7 @@ class FrameMaker:
             result[node.total.path] = len(parts_by_axis[axis])
         return result, parts_by_axis
 
-    def _maker(self, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
+    def _get_maker(self, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
         key = (kind, *around.items())
         if key not in self._makers:
             self._makers[key] = FrameMaker._of_parts(self._sensor, kind.root, self._limit, around)

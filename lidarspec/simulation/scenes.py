@@ -248,24 +248,24 @@ def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
     Raises:
         UsageError: for an invalid scene.
     """
-    _known(table, ("room", "box", "mover"), place)
+    _check_keys(table, ("room", "box", "mover"), place)
     walls = None
     if "room" in table:
         if not isinstance(table["room"], Mapping):
             raise UsageError(f"{place}: room: expected one table, [room]")
-        walls = _box(table["room"], f"{place}: room")
+        walls = _read_box(table["room"], f"{place}: room")
         if not all(low < 0 < high for low, high in zip(walls.low, walls.high, strict=True)):
             raise UsageError(
                 f"{place}: room: the room must contain the sensor, which is at [0, 0, 0]"
             )
-    boxes = [_box(entry, where) for entry, where in _entries(table, "box", place)]
-    movers = [_mover(entry, where) for entry, where in _entries(table, "mover", place)]
+    boxes = [_read_box(entry, where) for entry, where in _read_entries(table, "box", place)]
+    movers = [_read_mover(entry, where) for entry, where in _read_entries(table, "mover", place)]
     return Room(walls, tuple(boxes), tuple(movers))
 
 
-def _box(table: Mapping[str, Any], place: str) -> Box:
-    _known(table, ("low", "high"), place)
-    low, high = (_numbers(table, name, 3, place) for name in ("low", "high"))
+def _read_box(table: Mapping[str, Any], place: str) -> Box:
+    _check_keys(table, ("low", "high"), place)
+    low, high = (_read_numbers(table, name, 3, place) for name in ("low", "high"))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise UsageError(
             f"{place}: each coordinate of high must be above that of low, got low {low} and high"
@@ -274,9 +274,9 @@ def _box(table: Mapping[str, Any], place: str) -> Box:
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
-def _mover(table: Mapping[str, Any], place: str) -> Mover:
-    _known(table, ("size", "path", "speed", "floor"), place)
-    size = _numbers(table, "size", 3, place)
+def _read_mover(table: Mapping[str, Any], place: str) -> Mover:
+    _check_keys(table, ("size", "path", "speed", "floor"), place)
+    size = _read_numbers(table, "size", 3, place)
     if min(size) <= 0:
         raise UsageError(f"{place}.size: expected numbers above 0, got {size}")
     path = table.get("path")
@@ -285,20 +285,20 @@ def _mover(table: Mapping[str, Any], place: str) -> Mover:
             f"{place}.path: expected at least two positions, such as [[1, -1], [1, 1]]"
         )
     points = [
-        _numbers({f"path[{index}]": point}, f"path[{index}]", 2, place)
+        _read_numbers({f"path[{index}]": point}, f"path[{index}]", 2, place)
         for index, point in enumerate(path)
     ]
     if len(set(map(tuple, points))) < 2:
         raise UsageError(f"{place}.path: all positions are equal")
     others = {
-        name: _number(table[name], f"{place}.{name}")
+        name: _read_number(table[name], f"{place}.{name}")
         for name in ("speed", "floor")
         if name in table
     }
     return Mover((size[0], size[1], size[2]), tuple((x, y) for x, y in points), **others)
 
 
-def _entries(
+def _read_entries(
     table: Mapping[str, Any], name: str, place: str
 ) -> list[tuple[Mapping[str, Any], str]]:
     entries = table.get(name, [])
@@ -307,23 +307,23 @@ def _entries(
     return [(entry, f"{place}: {name}[{index}]") for index, entry in enumerate(entries)]
 
 
-def _known(table: Mapping[str, Any], names: tuple[str, ...], place: str) -> None:
+def _check_keys(table: Mapping[str, Any], names: tuple[str, ...], place: str) -> None:
     for name in table:
         if name not in names:
             hint = did_you_mean(name, names) or f"; expected one of {', '.join(names)}"
             raise UsageError(f"{place}: unknown key {name!r}{hint}")
 
 
-def _numbers(table: Mapping[str, Any], name: str, count: int, place: str) -> list[float]:
+def _read_numbers(table: Mapping[str, Any], name: str, count: int, place: str) -> list[float]:
     values = table.get(name)
     if not isinstance(values, list) or len(values) != count:
         raise UsageError(
             f"{place}.{name}: expected {count} numbers in brackets, got {shown(values)}"
         )
-    return [_number(value, f"{place}.{name}") for value in values]
+    return [_read_number(value, f"{place}.{name}") for value in values]
 
 
-def _number(value: Any, place: str) -> float:
+def _read_number(value: Any, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
         raise UsageError(f"{place}: expected a number, got {shown(value)}")
     return float(value)

@@ -62,7 +62,7 @@ BITS_PER_BYTE = 10
 CLOCK_TOLERANCE_NS = 1_000_000
 #: Number of packets that are simulated after the last requested packet. They are needed because
 #: directions may depend on the next packet.
-AHEAD = 1
+EXTRA_PACKETS = 1
 #: Maximum number of packets that are made to find the fields with ranges, and the packet rate.
 MAX_PROBED_PACKETS = 256
 #: Number of packets from which the fields of the clock are found.
@@ -155,7 +155,7 @@ class Measurement:
     ) -> None:
         self._sensor = sensor
         self._frame = frame
-        self._points = sensor.points_of(_name(frame, table))
+        self._points = sensor.points_of(_get_table_name(frame, table))
         self._encode: Callable[[Polar], Mapping[str, Any]] | None = sensor.simulation_of(
             frame
         ).encode
@@ -170,7 +170,7 @@ class Measurement:
         cls, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str]
     ) -> Measurement:
         """Return a `PointPlacement` for Cartesian points, else a `Measurement`."""
-        result, _ = _result(sensor, frame, table)
+        result, _ = _evaluate_points(sensor, frame, table)
         if isinstance(result, Cartesian):
             return PointPlacement(sensor, frame, table, given)
         return Measurement(sensor, frame, table, given)
@@ -187,7 +187,7 @@ class Measurement:
             scene: the scene.
             times: time of each packet, (n,) seconds since the scene began.
         """
-        steps = [self._step(table, target) for target in self._targets]
+        steps = [self._measure_step(table, target) for target in self._targets]
         before = np.zeros(1)
         blind = np.zeros(1, np.bool_)
         written: dict[str, NDArray[Any]] = {}
@@ -215,7 +215,7 @@ class Measurement:
 
     def beams(self, table: CompiledTable) -> Beams:
         """Return the beams of a table."""
-        result, batch = _result(self._sensor, self._frame, table)
+        result, batch = _evaluate_points(self._sensor, self._frame, table)
         with (
             np.errstate(all="ignore"),
             plugin_errors(f"points of {self._frame}", self._sensor.id, self._points),
@@ -224,7 +224,7 @@ class Measurement:
             arrays, axes, _, shape = align_points(parts, batch)
         depth = len(shape)
         full = {
-            name: _as_deep(np.asarray(array, np.float64), depth)
+            name: _with_depth(np.asarray(array, np.float64), depth)
             for name, array in zip(parts, arrays, strict=True)
         }
         places = None
@@ -281,7 +281,7 @@ class Measurement:
         raw_values: dict[str, NDArray[Any]] = {}
         for target, (step, zero) in zip(self._targets, steps, strict=True):
             info = table.schema.fields[target.path]
-            part = _part(ranges, target.inner)
+            part = _select_inner(ranges, target.inner)
             with np.errstate(all="ignore"):
                 raw = round_raw(info, (part - zero) / step)
             raw_values[target.path] = np.where(
@@ -310,8 +310,8 @@ class Measurement:
                 continue
             answer = self._probe(table, [path], PROBE_VALUE)[0].range
             expected = info.physical(PROBE_VALUE)
-            for inner in self._inner(table, answer):
-                part = _part(answer, inner)
+            for inner in self._list_inner_indices(table, answer):
+                part = _select_inner(answer, inner)
                 # A unit vector whose length is not exactly 1 affects the range.
                 near = part[np.isclose(part, expected)]
                 if np.allclose(near, expected, RANGE_TOLERANCE, 0):
@@ -345,8 +345,8 @@ class Measurement:
                     table, [path], PROBE_VALUE, 2 * PROBE_VALUE, 3 * PROBE_VALUE
                 )
             ]
-            for inner in self._inner(table, answers[0]):
-                once, twice, thrice = (_part(answer, inner) for answer in answers)
+            for inner in self._list_inner_indices(table, answers[0]):
+                once, twice, thrice = (_select_inner(answer, inner) for answer in answers)
                 even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
                 if (even & (metres | np.isclose(twice, 2 * once))).any():
                     targets.append(RangeField(path, inner, None))
@@ -367,7 +367,7 @@ class Measurement:
             write_raw(table, path, raw)
         return beams
 
-    def _step(self, table: CompiledTable, target: RangeField) -> tuple[Any, Any]:
+    def _measure_step(self, table: CompiledTable, target: RangeField) -> tuple[Any, Any]:
         """Return metres per raw step, and the range of the raw value 0 in metres.
 
         Both are numbers, or arrays with a value for each point.
@@ -375,12 +375,12 @@ class Measurement:
         if target.step is not None:
             return target.step, target.zero
         once, twice = (
-            _part(beams.range, target.inner)
+            _select_inner(beams.range, target.inner)
             for beams in self._probe(table, [target.path], PROBE_VALUE, 2 * PROBE_VALUE)
         )
         return (twice - once) / PROBE_VALUE, 2 * once - twice
 
-    def _inner(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
+    def _list_inner_indices(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
         """Return all indices in the axes that the points have but the fields do not have."""
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
@@ -416,7 +416,7 @@ class PointPlacement(Measurement):
         for path, raw in self._values(table, beams, ranges, []).items():
             write_raw(table, path, raw)
         if self._intensity and not self._encode:
-            self._fill_intensity(table, _part(ranges, self._targets[0].inner) * 1000)
+            self._fill_intensity(table, _select_inner(ranges, self._targets[0].inner) * 1000)
 
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Return the declared azimuths and elevations of packets, (n, *shape) each.
@@ -457,15 +457,17 @@ class PointPlacement(Measurement):
         for inner in dict.fromkeys(target.inner for target in self._targets):
             paths = [target.path for target in self._targets if target.inner == inner]
             infos = [table.schema.fields[path] for path in paths]
-            zero, *ones = (_part(places, inner) for places in self._move(table, paths))
+            zero, *ones = (
+                _select_inner(places, inner) for places in self._probe_coordinates(table, paths)
+            )
             slopes = np.stack([(probed - zero) / PROBE_VALUE for probed in ones])
             raw = [
                 round_raw(info, column)
                 for info, column in zip(
-                    infos, _solve(slopes, _part(aims, inner) - zero), strict=True
+                    infos, _solve(slopes, _select_inner(aims, inner) - zero), strict=True
                 )
             ]
-            kept = _part(ranges, inner) > 0
+            kept = _select_inner(ranges, inner) > 0
             for info, column in zip(infos, raw, strict=True):
                 kept = kept & (
                     (column >= info.limits[0]) & (column <= info.limits[1])
@@ -477,7 +479,7 @@ class PointPlacement(Measurement):
             }
         return raw_values
 
-    def _move(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
+    def _probe_coordinates(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
         """Return the coordinates with all fields 0, then with one field at a time probed.
 
         Each array has the shape (3, n, ...). The table is restored afterwards.
@@ -512,8 +514,8 @@ class PointPlacement(Measurement):
                 )
                 if beams.places is not None
             ]
-            for inner in self._inner(table, places[0][0]):
-                once, twice, thrice = (_part(place, inner) for place in places)
+            for inner in self._list_inner_indices(table, places[0][0]):
+                once, twice, thrice = (_select_inner(place, inner) for place in places)
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
                     targets.append(RangeField(path, inner, None))
         if not targets:
@@ -542,17 +544,17 @@ def _solve(slopes: Floats, aims: Floats) -> Floats:
     return np.moveaxis((inverse @ wanted[..., None])[..., 0], -1, 0)
 
 
-def _name(frame: str, table: CompiledTable) -> str:
+def _get_table_name(frame: str, table: CompiledTable) -> str:
     """Return the name of the frame type or parts in a table."""
     if isinstance(table, PartRows):
         return ".".join(filter(None, (frame, *table.place)))
     return frame
 
 
-def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
+def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
     """Return the result of `points` for a table of the first frames of a stream."""
-    batch = _batch(sensor, table)
-    points = sensor.points_of(_name(frame, table))
+    batch = _make_point_batch(sensor, table)
+    points = sensor.points_of(_get_table_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
         result = points(Fields(batch))
     measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
@@ -565,7 +567,7 @@ def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, B
     return result, batch
 
 
-def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
+def _make_point_batch(sensor: Sensor, table: CompiledTable) -> Batch:
     """Return a batch of frames or parts, without earlier frames of other types."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
@@ -574,12 +576,12 @@ def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
     return Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
 
 
-def _part(array: Floats, inner: tuple[int, ...]) -> Floats:
+def _select_inner(array: Floats, inner: tuple[int, ...]) -> Floats:
     corner: Any = (..., *inner)
     return np.asarray(array[corner])
 
 
-def _as_deep(array: Floats, depth: int) -> Floats:
+def _with_depth(array: Floats, depth: int) -> Floats:
     return array.reshape(*(1,) * (depth - array.ndim), *array.shape)
 
 
@@ -682,8 +684,8 @@ class RestingImu:
 
     def _read_motion(self, table: CompiledTable) -> Floats:
         """Return angular velocities, then accelerations, (6, n, ...)."""
-        batch = _batch(self._sensor, table)
-        function = self._sensor.imu_of(_name(self._frame, table))
+        batch = _make_point_batch(self._sensor, table)
+        function = self._sensor.imu_of(_get_table_name(self._frame, table))
         with (
             np.errstate(all="ignore"),
             plugin_errors(f"imu of {self._frame}", self._sensor.id, function),
@@ -695,7 +697,7 @@ class RestingImu:
             )
         return np.stack(
             [
-                np.broadcast_to(_as_deep(np.asarray(array, np.float64), len(shape)), shape)
+                np.broadcast_to(_with_depth(np.asarray(array, np.float64), len(shape)), shape)
                 for array in arrays
             ]
         )
@@ -870,7 +872,7 @@ class FrameSimulation:
             shake: standard deviation of the noise on IMU measurements, m/s2 and rad/s.
             timeline: the faults of the sensor's clock; None for no faults.
         """
-        numbers = range(start, start + count + AHEAD)
+        numbers = range(start, start + count + EXTRA_PACKETS)
         table = self._maker.table(self._sweep_values(numbers))
         times = self._pace.times(table, functools.partial(self._beams, table))
         seconds = since + times / 1e9

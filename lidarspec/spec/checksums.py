@@ -395,7 +395,9 @@ CRCS: dict[str, Crc] = {
 }
 _NAMES = {crc: name for name, crc in CRCS.items()}
 #: The polynomials of the CRCs in `CRCS`, by width.
-KNOWN = {width: {crc.poly for crc in CRCS.values() if crc.width == width} for width in (8, 16, 32)}
+KNOWN_POLYNOMIALS = {
+    width: {crc.poly for crc in CRCS.values() if crc.width == width} for width in (8, 16, 32)
+}
 
 
 def name_of(crc: Crc) -> str:

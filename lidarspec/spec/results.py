@@ -21,9 +21,9 @@ from lidarspec.errors import SpecError
 #: A column, or a NumPy array or number that broadcasts with columns.
 Array = Any
 
-#: The valid names of additional columns, except for the names in `TAKEN`.
+#: The valid names of additional columns, except for the names in `STANDARD_NAMES`.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-TAKEN = frozenset(
+STANDARD_NAMES = frozenset(
     (
         "x",
         "y",
@@ -41,7 +41,7 @@ TAKEN = frozenset(
         "ring",
     )
 )
-TAKEN |= {
+STANDARD_NAMES |= {
     "return_index",
     "column",
     "invalid",
@@ -55,7 +55,7 @@ TAKEN |= {
     "stamp_ns",
     "rate_hz",
 }
-TAKEN |= {"complete"}
+STANDARD_NAMES |= {"complete"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +91,8 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
         SpecError: for an invalid name, or the name of a standard column.
     """
     for name in extra:
-        if not _NAME.fullmatch(name) or name in TAKEN:
-            if name in TAKEN:
+        if not _NAME.fullmatch(name) or name in STANDARD_NAMES:
+            if name in STANDARD_NAMES:
                 reason = "is a reserved name"
             else:
                 reason = "is not a valid name: use lower-case letters, digits and _"

@@ -157,7 +157,7 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
             unit.
     """
     turn = end - start
-    _refuse_folded(turn, full)
+    _refuse_whole_turns(turn, full)
     if isinstance(count, int | np.integer):
         return start + wrap(turn, full) * (steps(count) / max(int(count) - 1, 1))
     return start + wrap(turn, full) / np.maximum(count - 1, 1) * steps(count)
@@ -345,7 +345,7 @@ class TableLookup:
         return np.where(inside, entries, np.nan)
 
 
-def _refuse_folded(turn: Array, full: float) -> None:
+def _refuse_whole_turns(turn: Array, full: float) -> None:
     angles = np.asarray(turn.seen if hasattr(turn, "seen") else turn, np.float64)
     moved = angles[angles != 0]
     if moved.size and not np.mod(moved, full).any():

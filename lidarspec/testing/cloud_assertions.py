@@ -50,7 +50,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
     """
     assert cloud.columns.keys() == other.columns.keys()
     assert same(cloud.valid, other.valid)
-    reach = _reach(cloud)
+    reach = _find_extents(cloud)
     range_tolerance = ulps * np.spacing(np.minimum(reach, np.abs(cloud.range)))
     tolerances: dict[str, tuple[Any, float]] = {
         **dict.fromkeys("xyz", (ulps * np.spacing(reach), 0.0)),
@@ -73,7 +73,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
     assert cloud.shape == other.shape
 
 
-def _reach(cloud: PointCloud) -> NDArray[np.float32]:
+def _find_extents(cloud: PointCloud) -> NDArray[np.float32]:
     """Return each point's range or largest absolute coordinate, (n,), at least 1 m."""
     lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
     with np.errstate(invalid="ignore"):

@@ -61,12 +61,12 @@ def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
     """
     for share in (0.0, 0.37, 1.0):
         try:
-            _parses_back(subject.sensor, name, arguments(subject, name, share))
+            _check_parses_back(subject.sensor, name, arguments(subject, name, share))
         except LidarSpecError as error:
             raise ViolationError("LS601", str(error), f"commands.{name}") from error
 
 
-def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -> None:
+def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -> None:
     """Fail unless the command's frame parses back to its fixed values and arguments."""
     command = sensor.commands[name]
     data = sensor.command(name, **arguments_given)
@@ -184,7 +184,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
     refused = ""
     for share in (0.0, 0.37, 1.0) if command.args else (0.0,):
         try:
-            reply = _ask(subject, name, arguments(subject, name, share))
+            reply = _get_reply(subject, name, arguments(subject, name, share))
         except CommandError as error:
             refused = refused or str(error)
             continue
@@ -195,14 +195,14 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
             what = f"the reply can only be simulated with answers= of the Simulation: {cause}"
             raise ViolationError("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
-        _learn(subject, name, reply)
+        _check_learned_options(subject, name, reply)
         return
     decides = callable(subject.sensor.simulation.answers.get(name))
     if not (command.args and decides):
         raise ViolationError("LS604", refused, f"commands.{name}")
 
 
-def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
+def _check_learned_options(subject: SensorUnderTest, name: str, reply: Reply) -> None:
     """Check that the options that are read from a reply are valid for `configure`."""
     sensor = subject.sensor
     try:
@@ -220,7 +220,7 @@ def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
         raise ViolationError("LS604", what, f"commands.{name}") from error
 
 
-def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
+def _get_reply(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     """Return the reply of a simulated sensor to a command.
 
     Raises:
@@ -245,13 +245,13 @@ def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     if command.needed:
         for earlier in sensor.on_open:
             if earlier != name and sensor.commands[earlier].provides is not None:
-                now = _exchange(device, session, session.request(earlier, now), earlier, now)
+                now = _run_exchange(device, session, session.request(earlier, now), earlier, now)
     pending = session.request(name, now, **given)
-    _exchange(device, session, pending, name, now)
+    _run_exchange(device, session, pending, name, now)
     return pending.result()
 
 
-def _exchange(
+def _run_exchange(
     device: SimulatedDevice, session: Session, pending: PendingReply, name: str, now: int
 ) -> int:
     """Simulate a device until it has replied to a command; return that time in ns."""

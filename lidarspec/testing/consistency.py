@@ -20,7 +20,7 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
 from lidarspec.spec.tree import to_exact
 from lidarspec.testing.findings import require
-from lidarspec.testing.geometry import MAX_BACK_STEP_RAD, SMALL_CHANGE, make_sweep, read
+from lidarspec.testing.geometry import ANGLE_CHANGE_STEPS, MAX_BACK_STEP_RAD, make_sweep, read
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Indices of the packets of the `sweep` for the check of the clock. The last ones are so large that
@@ -100,7 +100,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
     full = FULL_TURNS[info.unit]
     radians = 2 * np.pi / full
     still = _read_azimuths(subject, name, values)
-    little = SMALL_CHANGE * info.scale
+    little = ANGLE_CHANGE_STEPS * info.scale
     moved = _angles_between(
         _read_azimuths(subject, name, _turn_angles(values, angles, little, full)), still
     )
@@ -118,7 +118,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         )
         if moved is None:
             continue
-        wrong = np.abs(_fold(moved - sense * shift * radians))
+        wrong = np.abs(_wrap_to_pi(moved - sense * shift * radians))
         worst = float(wrong.max(initial=0))
         turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
         require(
@@ -165,9 +165,9 @@ def _angles_between(
     if first is None or second is None or first.shape != second.shape:
         return None
     finite = np.isfinite(first) & np.isfinite(second)
-    return _fold(first[finite] - second[finite])
+    return _wrap_to_pi(first[finite] - second[finite])
 
 
-def _fold(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrap_to_pi(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the equivalent angles from -pi to pi, in radians."""
     return (angles + np.pi) % (2 * np.pi) - np.pi

@@ -347,7 +347,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
     Fields that are declared as pure numbers, by `Scaled(..., "")`, give no finding.
     """
-    pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
+    pure = _find_pure_numbers(frame) | (_find_range_fields(subject, name) if frame.data else set())
     for path, info in get_codec(frame).schema.all_fields.items():
         if (
             info.name in MEASURE_NAMES
@@ -364,7 +364,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
             )
 
 
-def _find_multiplied(subject: SensorUnderTest, name: str) -> set[str]:
+def _find_range_fields(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields that `range` is calculated from, if one of them is in metres."""
     try:
         infos = [

@@ -77,7 +77,7 @@ MAX_BACK_STEP_RAD = np.deg2rad(1.5)
 #: The same limit as a multiple of the median step. The larger of both limits applies.
 MAX_BACK_STEP_MEDIANS = 4
 #: Number of raw units by which an angle is changed to test whether the points turn with it.
-SMALL_CHANGE = 4
+ANGLE_CHANGE_STEPS = 4
 #: Default number of examples that are tried until one has points.
 TRIED_EXAMPLES = 8
 #: A sensor is treated as rotating if the median step of its azimuth, in radians, is larger than
@@ -330,7 +330,7 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
         try:
             # The full circle is set first, because few frames can represent it.
             clouds = _decode_with_values(
-                subject, name, path, (full[1], full[0], full[0] + SMALL_CHANGE)
+                subject, name, path, (full[1], full[0], full[0] + ANGLE_CHANGE_STEPS)
             )
         except SpecError as error:
             raise ViolationError(
@@ -364,7 +364,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
         if zero is None:
             clouds = []
         else:
-            clouds = _decode_with_values(subject, name, path, (zero, zero + SMALL_CHANGE))
+            clouds = _decode_with_values(subject, name, path, (zero, zero + ANGLE_CHANGE_STEPS))
         sense = _find_turn_sense(info, *clouds) if clouds else 0
         if not sense:
             continue
@@ -375,7 +375,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
             f"at azimuth {np.rad2deg(first) + 0:.1f} deg where {path} is 0 (0 is ahead, 90 is left)"
         )
         axes = subject.sensor.vendor_axes
-        expected = _sense_of(axes, first) if axes else 0
+        expected = _find_axis_sense(axes, first) if axes else 0
         message = (
             f"points turn {words[sense]} if {path} grows, but angles in vendor_axes"
             f" {', '.join(axes or ())} turn {words.get(expected)}"
@@ -385,7 +385,7 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
         return
 
 
-def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
+def _find_axis_sense(axes: tuple[str, str, str], zero: float) -> int:
     """Return the direction in which the vendor's angles increase.
 
     1 is counter-clockwise, -1 clockwise, 0 unknown.
@@ -516,7 +516,7 @@ def _find_zero(info: FieldInfo) -> int | None:
     ):
         return None
     raw = round(-info.offset / info.scale)
-    if info.limits[0] <= raw <= info.limits[1] - SMALL_CHANGE:
+    if info.limits[0] <= raw <= info.limits[1] - ANGLE_CHANGE_STEPS:
         return raw
     return None
 
@@ -603,7 +603,7 @@ def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) ->
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
-        SMALL_CHANGE * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
+        ANGLE_CHANGE_STEPS * info.scale * 2 * np.pi / FULL_TURNS[info.unit]
     )
     if 0.5 < abs(most) < 1.5:
         return int(np.sign(most))

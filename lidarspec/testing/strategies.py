@@ -283,7 +283,7 @@ def _packets_per_scan(sensor: Sensor) -> int:
     count = FIRST_PACKETS
     while count <= MAX_PACKETS:
         packets = simulate(sensor, count)
-        if any(scan.complete for scan in sensor.scans(_delivery(sensor, packets))):
+        if any(scan.complete for scan in sensor.scans(_join_frames(sensor, packets))):
             return count
         count *= 2
     raise SpecError(
@@ -303,7 +303,7 @@ def _scans(draw: DrawFn, sensor: Sensor, packets: int, lost: int) -> Scan:
     sent = simulate(sensor, packets, start=start, scene=room)
     for index in sorted(draw(st.sets(st.integers(0, packets - 1), max_size=lost)), reverse=True):
         del sent[index]
-    all_scans = list(sensor.scans(_delivery(sensor, sent)))
+    all_scans = list(sensor.scans(_join_frames(sensor, sent)))
     complete = [scan for scan in all_scans if scan.complete]
     if not all_scans:
         reject()
@@ -323,7 +323,7 @@ def _boxes(draw: DrawFn) -> Box:
     return Box((min(x), min(y), -1.0), (max(x), max(y), draw(st.integers(-9, 10)) / 10))
 
 
-def _delivery(sensor: Sensor, packets: list[bytes]) -> Any:
+def _join_frames(sensor: Sensor, packets: list[bytes]) -> Any:
     """Return data frames as the data link transmits them.
 
     If data frames are only valid after another frame, that frame is the first.
@@ -358,7 +358,7 @@ def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -
         ranges = ranges_of(sensor, frame, draw(st.sampled_from(known_headers(sensor, frame))))
         assert ranges is not None
     drawn = {
-        leaf.info.path: _draw_leaf(draw, leaf, _element(leaf.info, ranges, fields))
+        leaf.info.path: _draw_leaf(draw, leaf, _element_values(leaf.info, ranges, fields))
         for leaf in ranges.free
     }
     struct = ranges.make_struct(drawn, fixed=fields)
@@ -410,7 +410,7 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
     return numbers
 
 
-def _element(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
+def _element_values(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
     """Return a strategy for raw values of a field, or of its elements or bytes."""
     if info.path in fields:
         return fields[info.path]

@@ -32,7 +32,7 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     data = material.make_input(subject.sensor, sent)
     received = [(item.frame, item.data) for item in subject.sensor.split(data)]
     if received != sent:
-        raise _loss(sent, received)
+        raise _make_loss_violation(sent, received)
     stats = subject.sensor.decode(data, subject.sensor.main_frames[0]).stats
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     require(
@@ -42,7 +42,9 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     )
 
 
-def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> ViolationError:
+def _make_loss_violation(
+    sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]
+) -> ViolationError:
     """Return the violation for the first frame that is lost or changed."""
     equal = 0
     for sent_frame, received_frame in zip(sent, received, strict=False):
@@ -88,7 +90,7 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
     for size in BATCH_SIZES:
         parts = _scans_in_batches(subject.sensor, frames, size)
         require(
-            [_cut(scan) for scan in parts] == [_cut(scan) for scan in whole],
+            [_summarize_scan(scan) for scan in parts] == [_summarize_scan(scan) for scan in whole],
             "LS404",
             f"batches of {size} packets give different scans than a single batch",
         )
@@ -108,6 +110,6 @@ def _scans_in_batches(sensor: Sensor, frames: list[Found], size: int) -> list[Sc
     return scans
 
 
-def _cut(scan: Scan) -> tuple[int, bool, bool]:
+def _summarize_scan(scan: Scan) -> tuple[int, bool, bool]:
     """Return the number of points of a scan, and whether it is whole and complete."""
     return len(scan), scan.whole, scan.complete

@@ -119,12 +119,14 @@ class LayoutRanges:
             if self._check_rows(self._make_rows([{**kept, path: values[path]}]))[0]:
                 kept[path] = values[path]
             elif leaf.shape:
-                mixed = self._mix(kept, leaf, values[path])
+                mixed = self._replace_invalid_elements(kept, leaf, values[path])
                 if self._check_rows(self._make_rows([{**kept, path: mixed}]))[0]:
                     kept[path] = mixed
         return kept
 
-    def _mix(self, kept: Mapping[str, Values], leaf: Leaf, values: Values) -> Values:
+    def _replace_invalid_elements(
+        self, kept: Mapping[str, Values], leaf: Leaf, values: Values
+    ) -> Values:
         """Replace each invalid element of an array by the same element of the base."""
         base = leaf.load(self._base)
         mixed = base.copy()
@@ -173,8 +175,8 @@ class LayoutRanges:
         highest = {
             leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[1]) for leaf in leaves
         }
-        low = find_ends(lowest, self._accept)
-        high = find_ends(highest, self._accept)
+        low = find_ends(lowest, self._check_values)
+        high = find_ends(highest, self._check_values)
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
@@ -183,8 +185,8 @@ class LayoutRanges:
         for leaf in leaves:
             path = leaf.info.path
             start = int(leaf.load(self._base).flat[0])
-            end = find_ends({path: (start, 0)}, self._accept)[path]
-            (is_valid,) = self._accept([(path, end)])
+            end = find_ends({path: (start, 0)}, self._check_values)[path]
+            (is_valid,) = self._check_values([(path, end)])
             if is_valid:
                 values = np.broadcast_to(np.array(end, leaf.info.dtype), (1, *leaf.shape))
                 self._base = self._make_rows([{path: values}])
@@ -198,7 +200,7 @@ class LayoutRanges:
             declared.plausible is not None or declared.wire is not None or self.layout.conditions
         )
 
-    def _accept(self, values: Sequence[tuple[str, int]]) -> list[bool]:
+    def _check_values(self, values: Sequence[tuple[str, int]]) -> list[bool]:
         """Return for each (path, value) whether the base with this value is valid."""
         tried = []
         for path, value in values:

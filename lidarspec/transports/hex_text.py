@@ -304,14 +304,15 @@ def _parse_dump_bytes(text: str) -> bytes:
             ) from None
         if comment or (
             # The first characters may be blanks, which are then part of the gap.
-            gap and any(_represent(" " * count + rest, data) for count in range(len(gap[0]) + 1))
+            gap
+            and any(_can_represent(" " * count + rest, data) for count in range(len(gap[0]) + 1))
         ):
             break
         text = rest
     return data
 
 
-def _represent(characters: str, data: bytes) -> bool:
+def _can_represent(characters: str, data: bytes) -> bool:
     """Return whether characters represent the first bytes of `data`.
 
     "." and characters outside ASCII can represent any byte.

@@ -300,7 +300,7 @@ class RateSeries:
         self.scans = list[tuple[float, float]]()
         while not live.ended and time.monotonic() < until:
             live.read(0.0)
-            self._take()
+            self._count_batch()
             self.scans += [
                 (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
                 for scan in live.scans
@@ -311,7 +311,7 @@ class RateSeries:
         """Return a time in seconds since the first packet."""
         return (at - self._first) * 1e-9
 
-    def _take(self) -> None:
+    def _count_batch(self) -> None:
         """Add the newest batch of packets to the counts."""
         packets = self._live.packets
         if packets is None or not len(packets):

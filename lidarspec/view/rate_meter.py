@@ -63,7 +63,7 @@ class MeterReading:
         return asdict(self)
 
 
-NOTHING = MeterReading(
+EMPTY_READING = MeterReading(
     seconds=None,
     speed_hz=None,
     scans=0,

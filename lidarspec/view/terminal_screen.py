@@ -242,7 +242,11 @@ class Screen:
         if sys.platform == "win32":
             os.system("")  # enables escape sequences in the console
         self._write(ENTER)
-        for name, function in (("SIGTERM", _end), ("SIGHUP", _end), ("SIGTSTP", self._suspend)):
+        for name, function in (
+            ("SIGTERM", _raise_terminated),
+            ("SIGHUP", _raise_terminated),
+            ("SIGTSTP", self._suspend),
+        ):
             number = getattr(signal, name, None)
             if number is not None:
                 self._handlers[number] = signal.signal(number, function)
@@ -324,7 +328,7 @@ def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> st
     return "".join(parts)
 
 
-def _end(number: int, frame: FrameType | None) -> None:
+def _raise_terminated(number: int, frame: FrameType | None) -> None:
     raise TerminatedError(number)
 
 

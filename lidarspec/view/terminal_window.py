@@ -18,7 +18,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, CellGrid
 from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.polar import draw_cloud
-from lidarspec.view.rate_meter import NOTHING, MeterReading, format_figure
+from lidarspec.view.rate_meter import EMPTY_READING, MeterReading, format_figure
 from lidarspec.view.terminal_screen import Screen
 from lidarspec.view.terminal_window_parts import (
     WindowFigure,
@@ -159,7 +159,7 @@ class Window:
         while not self.settings.done and time.monotonic() < self._end:
             keys = self._wait(screen)
             for key in keys:
-                self._press(key)
+                self._handle_key(key)
             now = time.monotonic()
             has_scan = self._live.number != drawn_number and not self.settings.paused
             is_old = now - drawn_at >= FIGURES_PERIOD_S / 2
@@ -211,7 +211,7 @@ class Window:
             _paste_in_middle(drawn, draw_message(width, warning))
         return drawn
 
-    def _press(self, key: str) -> None:
+    def _handle_key(self, key: str) -> None:
         ramps = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
         self.settings = self.settings.after_key(key, self._current_look().reach, ramps)
         if key in ("r", "R") and self._record is not None:
@@ -237,9 +237,9 @@ class Window:
         self._scan = newest
         new = choose_appearance(newest.points, ramp=self.settings.ramp)
         old = self._look
-        if old is not None and _fits(new.reach, old.reach):
+        if old is not None and _can_keep_scale(new.reach, old.reach):
             new = replace(new, reach=old.reach)
-        if old is not None and old.ramp == new.ramp and _fits(new.full, old.full):
+        if old is not None and old.ramp == new.ramp and _can_keep_scale(new.full, old.full):
             new = replace(new, full=old.full, low=min(old.low, new.low))
         self._look = new
 
@@ -275,7 +275,7 @@ class Window:
 
     def _list_figures(self) -> list[WindowFigure]:
         """Return the statistics of the last second and of the shown scan."""
-        reading = self._reading or NOTHING
+        reading = self._reading or EMPTY_READING
         figures = [
             WindowFigure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
             WindowFigure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
@@ -352,7 +352,7 @@ def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:
     target.paste(max(row, 0), max(column, 0), box)
 
 
-def _fits(needed: float, kept: float) -> bool:
+def _can_keep_scale(needed: float, kept: float) -> bool:
     """Return whether the scale of the previous scan can be kept.
 
     Args:

@@ -233,7 +233,7 @@ class _Builder:
         if isinstance(inner, construct.GreedyRange | construct.RepeatUntil) and not place.in_bits:
             return self._fill_with_elements(inner, place)
         if isinstance(inner, RawPart):
-            return self._raw(inner, place)
+            return self._make_raw_copy(inner, place)
         if isinstance(inner, construct.Check):
             return self._check(inner, place)
         if inner is construct.Error:
@@ -278,7 +278,7 @@ class _Builder:
         is_computable = (
             not isinstance(formula, tree.Untraced)
             and all(_is_single_value(ref, place.info) for ref in asked)
-            and all(map(_is_whole, tree.parts(formula)))
+            and all(map(_is_always_defined, tree.parts(formula)))
             and (is_fractional or tree.width(formula) <= tree.MAX_FORMULA_BITS)
         )
         if not is_computable:
@@ -290,7 +290,7 @@ class _Builder:
             info if is_float else _describe_integer(place.info), "computed", formula
         )
 
-    def _raw(self, con: RawPart, place: _Context) -> tree.Struct:
+    def _make_raw_copy(self, con: RawPart, place: _Context) -> tree.Struct:
         """Return a RawCopy as a struct with the value, its bytes and its offsets."""
         info = place.info
         scope = tree.RawCopyScope(place.scope, info.path, self._asked)
@@ -660,7 +660,7 @@ class _Builder:
             return None
         try:
             root, rule = self._make_part_frame(
-                con, None if until is None else functools.partial(_ask_predicate, until), place
+                con, None if until is None else functools.partial(_trace_predicate, until), place
             )
         except SpecError:  # a length of a part outside of the element
             return None
@@ -730,7 +730,7 @@ class _Builder:
             if (
                 not asked
                 and tree.width(condition) <= tree.MAX_FORMULA_BITS
-                and all(map(_is_whole, tree.parts(condition)))
+                and all(map(_is_always_defined, tree.parts(condition)))
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)
             if asked:
@@ -901,7 +901,7 @@ def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
     return tree.Value(value.formula if isinstance(value, tree.Symbol) else unknown)
 
 
-def _is_whole(formula: tree.Formula) -> bool:
+def _is_always_defined(formula: tree.Formula) -> bool:
     """Return whether an operation is defined for all values of its fields.
 
     Division, modulo and shifts are defined for all values only if the right operand is a positive
@@ -936,7 +936,7 @@ def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tr
     yield from (formula for formula in others if formula is not None)
 
 
-def _ask_predicate(predicate: Any, scope: tree.Scope) -> Any:
+def _trace_predicate(predicate: Any, scope: tree.Scope) -> Any:
     """Return the value of a RepeatUntil's predicate for an element.
 
     The list of the earlier elements is not available.
