@@ -392,18 +392,18 @@ class _PartWalk:
         offsets = self._ends[which]
         self._ends[which] = offsets + layout.size
         if kind.node.until is not None:
-            is_last = self._evaluate_all(kind, layout, kind.node.until, offsets)
+            is_last = self._evaluate_all(layout, kind.node.until, offsets)
             self._announced[which] = np.where(is_last == 0, ANY_SIZE, 0)
             self._status[which[is_last < 0]] = FAILED
             return
         if formula is None:
             return
-        announced = self._evaluate_all(kind, layout, formula, offsets)
+        announced = self._evaluate_all(layout, formula, offsets)
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
 
     def _evaluate_all(
-        self, kind: PartKind, layout: Layout, formula: tree.Formula, offsets: Offsets
+        self, layout: Layout, formula: tree.Formula, offsets: Offsets
     ) -> NDArray[np.int64]:
         """Return the value of a formula in each part; -1 if the formula raises an error."""
         asked = tree.refs(formula)
@@ -420,11 +420,11 @@ class _PartWalk:
             values = tree.arrays(formula, columns, np.int64)
             return np.broadcast_to(values, len(offsets)).astype(np.int64)
         return np.array(
-            [self._evaluate(kind, layout, formula, offset) for offset in offsets.tolist()],
+            [self._evaluate(layout, formula, offset) for offset in offsets.tolist()],
             np.int64,
         )
 
-    def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, offset: int) -> int:
+    def _evaluate(self, layout: Layout, formula: tree.Formula, offset: int) -> int:
         """Return the value of a formula in one part; -1 if the formula raises an error."""
         part = self._buffer[offset : offset + layout.size].tobytes()
 

@@ -44,24 +44,6 @@ def pick_offsets(length: int, source: random.Random, count: int = CUT_OFFSETS) -
     return sorted({*ends, *source.sample(range(length), min(count, length))})
 
 
-#: Sizes in bytes of the chunks that a stream is cut into, and their mean.
-CHUNK_SIZES = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
-MEAN_CHUNK_SIZE = sum(CHUNK_SIZES) / len(CHUNK_SIZES)
-
-
-def cut_randomly(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
-    """Yield the bytes in chunks of random sizes, including empty chunks.
-
-    Args:
-        scale: factor by which the sizes are multiplied.
-    """
-    start = 0
-    while start < len(data):
-        size = source.choice(CHUNK_SIZES) * scale
-        yield data[start : start + size]
-        start += size
-
-
 def mutate(
     data: bytes, source: random.Random, words: Sequence[bytes] = (), offsets: Sequence[int] = ()
 ) -> bytes:

@@ -117,7 +117,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
         data = parse_hex(vector["hex"])
         name = vector["frame"]
         parsed = _parse_vector(subject, name, data, key)
-        _compare_values(subject, name, data, parsed, vector, key)
+        _compare_values(subject, name, parsed, vector, key)
         require(
             subject.sensor.build(name, parsed) == data,
             "LS302",
@@ -518,7 +518,6 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: s
 def _compare_values(
     subject: SensorUnderTest,
     name: str,
-    data: bytes,
     parsed: Any,
     vector: Mapping[str, Any],
     entry_key: str,

@@ -18,6 +18,7 @@ from tests.engine.streams import (
     MANY_HEADERS,
     Books,
     clean,
+    cut_randomly,
     damage,
     decode_chunks,
     longest_example,
@@ -51,7 +52,7 @@ def any_split_gives_the_same(subject: SensorUnderTest, length: int = LENGTH) -> 
     if length < LENGTH:
         offsets = source.sample(range(len(data)), min(QUICK_SPLITS, len(data)))
     splits = [[data[:offset], data[offset:]] for offset in offsets]
-    splits += [list(material.cut_randomly(data, source)) for _ in range(len(offsets) // 4)]
+    splits += [list(cut_randomly(data, source)) for _ in range(len(offsets) // 4)]
     splits.append([data[offset : offset + 1] for offset in range(len(data))])
     _assert_same_in_pieces(sensor, data, splits)
 
@@ -170,9 +171,7 @@ def announcements_may_change_with_every_frame(
             (frame, frame, frame[: source.randint(1, 5)], material.mutate(frame, source))
         )
     assert_like_oracle(subject, data, "announcements in any order")
-    _assert_same_in_pieces(
-        sensor, data, [list(material.cut_randomly(data, source)) for _ in range(10)]
-    )
+    _assert_same_in_pieces(sensor, data, [list(cut_randomly(data, source)) for _ in range(10)])
 
 
 def the_longest_frame_is_a_frame(subject: SensorUnderTest, length: int = LENGTH) -> None:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from lidarspec import Counters, Sensor, SpecError
 from lidarspec.framing.example_frames import make_random_header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
-from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import cuts
 from tests.by_construct import reader
@@ -24,6 +23,17 @@ from tests.engine.oracle import Cut
 LENGTH = 800
 MEGABYTE = 1 << 20
 MANY_HEADERS = 200
+#: Sizes in bytes of the chunks that a stream is cut into.
+CHUNK_SIZES = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
+
+
+def cut_randomly(data: bytes, source: random.Random) -> Iterator[bytes]:
+    """Yield the bytes in chunks of random sizes, including empty chunks."""
+    start = 0
+    while start < len(data):
+        size = source.choice(CHUNK_SIZES)
+        yield data[start : start + size]
+        start += size
 
 
 def damage(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
@@ -184,7 +194,7 @@ class Books:
 def decode_chunks(sensor: Sensor, data: bytes) -> list[Cut]:
     """Decode a stream in chunks of random sizes; return its frames."""
     books = Books(sensor)
-    for chunk in material.cut_randomly(data, random.Random(len(data))):
+    for chunk in cut_randomly(data, random.Random(len(data))):
         books.feed(chunk)
     return books.finish()
 

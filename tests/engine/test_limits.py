@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.engine.engines import is_compiled
-from tests.engine.streams import MEGABYTE, peak, worst
+from tests.engine.streams import MEGABYTE, cut_randomly, peak, worst
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.representatives import STREAM_REPRESENTATIVES, load_sensor
 from tests.shapes import SHAPES
@@ -64,7 +63,7 @@ def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
         SensorUnderTest(sensor).stream(rounds=1)[:6_000],
     ):
         decoder = sensor.decoder()
-        for chunk in material.cut_randomly(data, random.Random(1)):
+        for chunk in cut_randomly(data, random.Random(1)):
             decoder.feed(chunk)
             assert decoder.stats.pending < pending_bound(sensor)
 

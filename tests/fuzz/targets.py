@@ -51,6 +51,7 @@ from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_port, live_address
 from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
+from tests.engine.streams import cut_randomly
 from tests.every_sensor import distinct_frames, distinct_sensors
 from tests.fuzz.words import HOSTILE, run_command, spoken
 from tests.shapes import SHAPES
@@ -250,7 +251,7 @@ def _stream(sensor: Sensor) -> Target:
 
     def run(data: bytes) -> None:
         source = random.Random(zlib.crc32(data))
-        chunks = _datagrams(data) if sensor.datagrams else list(material.cut_randomly(data, source))
+        chunks = _datagrams(data) if sensor.datagrams else list(cut_randomly(data, source))
         decoder = sensor.decoder()
         for chunk in chunks:
             decoder.feed(chunk)

@@ -29,11 +29,18 @@ from lidarspec import Scan, Sensor
 from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header, pack_record
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Serial
-from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
 from tests.engine.oracle import Oracle
-from tests.engine.streams import Books, clean, damage, decode_chunks, hostile_streams, worst
+from tests.engine.streams import (
+    Books,
+    clean,
+    cut_randomly,
+    damage,
+    decode_chunks,
+    hostile_streams,
+    worst,
+)
 from tests.engine.test_limits import feed, garbage, peak
 from tests.engine.test_linear_time import seconds
 from tests.every_sensor import distinct_frames, every_sensor, stream_sensors
@@ -72,7 +79,7 @@ def splits(share: float) -> Figure:
         books = Books(sensor).feed(data)
         whole, stats = books.finish(), books.decoder.stats
         cuts = [[data[:spot], data[spot:]] for spot in range(0, len(data), 1 if share == 1 else 7)]
-        for parts in [*cuts, *(list(material.cut_randomly(data, source)) for _ in range(50))]:
+        for parts in [*cuts, *(list(cut_randomly(data, source)) for _ in range(50))]:
             books = Books(sensor)
             for part in parts:
                 books.feed(part)

@@ -1111,9 +1111,6 @@ _OPAQUE_REASONS = {
     ),
 }
 
-#: Constructs that read all available bytes unchanged.
-_GREEDY_BYTES = (type(construct.GreedyBytes),)
-
 #: The kinds of numbers, by the kind of their dtype.
 _NUMBER_KINDS: dict[str, Literal["uint", "int", "float"]] = {"u": "uint", "i": "int", "f": "float"}
 
