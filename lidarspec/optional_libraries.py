@@ -119,7 +119,7 @@ def check_version(requirement: Requirement, extra: str) -> None:
 
 
 def installed_version(distribution: str) -> str:
-    """Return the installed version of a distribution, "" if it is not installed."""
+    """Return the installed version of a distribution; "" if it is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

@@ -271,7 +271,7 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All installed plugins; those that failed or lost a name have an error."""
+        """All installed plugins. A plugin that failed or lost a name has an error."""
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._drop_lost_names(plugin) for plugin in (*self._modules, *offered)]
@@ -398,7 +398,7 @@ class Registry:
         return None
 
     def _find_same_names(self, home: Home, name: str) -> set[str]:
-        """Return the id and the aliases of the sensor that a plugin has under a name.
+        """Return the id and aliases of the sensor that a plugin registers under a name.
 
         If the sensor is not loaded, these are the names of its entry points.
         """
@@ -828,7 +828,7 @@ def registry() -> Registry:
 
 
 def try_plugins() -> list[Plugin]:
-    """Load each plugin in another process, and then in this one; return all plugins.
+    """Load all plugins in another process, and then in this process; return them.
 
     Plugins that hang or end the other process are not loaded in this process.
     """

@@ -67,7 +67,7 @@ def find_distrust(path: Path) -> str:
 
 
 def describe_sharing(status: os.stat_result, others: int) -> str:
-    """Return a text such as "belongs to user 0"; "" for a file of the user's own.
+    """Return a text such as "belongs to user 0"; "" if a file is the user's own.
 
     On Windows it is always "".
 
@@ -123,7 +123,7 @@ def trust(folder: str | Path) -> Path:
 
 
 def resolve_beside(folder: Path, value: object) -> Path:
-    """Return the path of a file in a folder or below, which another file there names.
+    """Return the path of a file that another file in the folder names.
 
     Raises:
         UsageError: for any other path, or if it is not a regular file.

@@ -25,8 +25,8 @@ class Verbosity:
     """How many remarks are printed on standard error.
 
     Attributes:
-        loudness: -1 for no remarks, 0 for the default, 1 for more remarks. It is set to 0 at the
-            start of each command.
+        loudness: -1 to print no remarks, 0 to print the usual remarks, and 1 to print more remarks.
+            It is set to 0 at the start of each command.
     """
 
     loudness = 0

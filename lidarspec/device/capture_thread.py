@@ -272,8 +272,8 @@ class CaptureThread:
         """Record and queue chunks.
 
         Args:
-            gap: whether data is missing before the first chunk, which is then marked.
-            quiet: whether silence preceded the first chunk, which is then marked.
+            gap: whether data is missing before the first chunk. If so, the chunk is marked.
+            quiet: whether silence preceded the first chunk. If so, the chunk is marked.
         """
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)

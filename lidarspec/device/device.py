@@ -705,7 +705,7 @@ def _make_recorder(
     own_recorders: list[TrafficLog],
     sensor: Sensor,
 ) -> TrafficLog | None:
-    """Return the requested recorder, None if nothing is recorded.
+    """Return the requested recorder; None if nothing is recorded.
 
     If the device has to close the recorder, it is added to `own_recorders`.
     """

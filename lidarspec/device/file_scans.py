@@ -225,7 +225,7 @@ class _StatePickler(pickle.Pickler):
         self._frames = {id(get_codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return the name of a constant, None for an object that has to be pickled.
+        """Return the name of a constant; None for an object that has to be pickled.
 
         A copy of the sensor with another clock is identified by the name of that clock.
         """

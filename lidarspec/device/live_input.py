@@ -459,7 +459,7 @@ class LiveInput(DeviceInput):
             self._deliver(link, decode_chunks(decoder, chunks))
 
     def _decode_senders(self, chunks: list[Chunk]) -> None:
-        """Decode chunks of the data link, but only those that the sensor sent."""
+        """Decode the chunks of the data link that the sensor sent, not another sender."""
         chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return
@@ -487,7 +487,7 @@ class LiveInput(DeviceInput):
     def _select_first_sender(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks of the first sender that replied to a broadcast.
 
-        This sender is then selected as the sensor on every link.
+        When this sender is found, it is selected as the sensor on every link.
         """
         mine = self._broadcast_senders[link].select(chunks)
         if (address := self._broadcast_senders[link].address) is not None:

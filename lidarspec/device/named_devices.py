@@ -7,12 +7,12 @@
     options = {calibration = "./angles.csv"}
 
 A name can be used wherever a SOURCE is expected. A file called front is written as ``./front``. Two
-files are read: the file in the user's configuration directory, and the project's file. The latter
-is the nearest file, in the working directory or above it, that the user owns. It cannot override
-names of the user's file. A project may be untrusted. Unless the user has allowed its folder, the
-project's file cannot run Python or refer to paths outside the folder. A mistake in a file disables
-only the devices of that file. The table [owners] in the user's own file decides which plugin
-provides a sensor; `plugins` reads it.
+files are read: the file in the user's configuration directory, and the project's file. The
+project's file is the nearest file that the user owns, in the working directory or above it. It
+cannot override names of the user's file. A project may be untrusted. Unless the user has allowed
+its folder, the project's file cannot run Python or refer to paths outside the folder. A mistake in
+a file disables only the devices of that file. The table [owners] in the user's own file decides
+which plugin provides a sensor; `plugins` reads it.
 """
 
 from __future__ import annotations

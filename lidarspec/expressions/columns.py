@@ -197,7 +197,7 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """Return the same values on other axes, named after arrays of the frame.
+        """Return the same values on other axes, which are named after arrays of the frame.
 
         The column's own axes become the last of the named axes. Elements beyond the end of the
         column are nan, for example in frames that lack the field.
@@ -266,12 +266,12 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return the rows of a table that the values select, with one more axis.
+        """Return the rows of a table that the values select.
 
-        The new axis is that array of the frame which has k elements.
+        The result has one more axis, whose array in the frame has k elements.
 
         Args:
-            table: (m + 1, k); the last row is nan, for indices out of range.
+            table: (m + 1, k); the last row contains nan, and is used for indices out of range.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -296,9 +296,10 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def shift(self, step: int) -> Column:
-        """Return the values `step` places later in stream order, on the same axes.
+        """Return for each element the value `step` elements later in stream order.
 
-        A negative step returns earlier values. Values across a loss and beyond the end are nan.
+        A negative step returns earlier values. The result has the same axes. It is nan if packets
+        were lost between both elements, and beyond the end of the stream.
         """
         row = FlatColumn(self)
         size = abs(step)
@@ -334,9 +335,9 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def latest(self, where: Any = None) -> Column:
-        """Return for each element the last value, up to this element, for which `where` is true.
+        """Return for each element the latest value so far for which `where` is true.
 
-        The result is nan before the first such value.
+        The value of the element itself is included. The result is nan before the first such value.
 
         Args:
             where: a condition that aligns with the column; by default, whether the value is finite.

@@ -699,8 +699,8 @@ def is_full(value: Any, width: int) -> bool:
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
     """Return the condition and the two options of a ``np.where``.
 
-    Returns None unless the condition is low, and each option is a number or a full expression of
-    one field.
+    Returns None if the condition is not low, or if an option is neither a number nor a full
+    expression of one field.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None

@@ -207,7 +207,7 @@ class ReplyMaker:
     def _find_request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
         """Return the command that a received frame contains; None if there is none.
 
-        If several commands match, returns the one with the most fixed values.
+        If several commands match, the command with the most fixed values is returned.
         """
         values = dict(_iter_flat(parse(self._sensor, data, frame=frame)))
         fields = get_codec(self._sensor.frames[frame]).schema.fields
@@ -486,7 +486,8 @@ class SimulatedDevice:
     def _waits_for_a_command(self) -> bool:
         """Return whether the device sends no data until a start command is received.
 
-        The start command must be in `on_open`, because no program would send another one.
+        Only start commands in `on_open` are considered, because programs send no other start
+        command.
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)

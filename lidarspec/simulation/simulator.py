@@ -480,9 +480,10 @@ class PointPlacement(Measurement):
         return raw_values
 
     def _probe_coordinates(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
-        """Return the coordinates with all fields 0, then with one field at a time probed.
+        """Return the coordinates if all fields are 0, and if one field has a probe value.
 
-        Each array has the shape (3, n, ...). The table is restored afterwards.
+        The list has one array for all fields 0, and one array for each probed field. Each array has
+        the shape (3, n, ...). The table is restored afterwards.
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
@@ -683,7 +684,7 @@ class RestingImu:
         return readings
 
     def _read_motion(self, table: CompiledTable) -> Floats:
-        """Return angular velocities, then accelerations, (6, n, ...)."""
+        """Return three angular velocities and three accelerations, (6, n, ...)."""
         batch = _make_point_batch(self._sensor, table)
         function = self._sensor.imu_of(_get_table_name(self._frame, table))
         with (

@@ -370,7 +370,7 @@ class Relative:
     """A related model, installed or not, whose packets have the same layout.
 
     Args:
-        difference: a text that describes the difference to this sensor.
+        difference: a text that describes how the related model differs from this sensor.
         sends: a function of the data frame's `Fields` that returns True for packets that only the
             related model sends.
     """

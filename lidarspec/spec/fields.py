@@ -209,7 +209,7 @@ class SizeOf(layer.SizeField):
 
 
 class Checksummed(layer.SealedStruct):
-    """A struct with a checksum in one of its own fields, which may be anywhere in it.
+    """A struct that contains its checksum, in any of its fields.
 
     It can be nested. A `Checksummed` around another `Checksummed` is a struct with two checksums.
 
@@ -410,7 +410,7 @@ class Parts(layer.Partition):
             constants match is used, so if the last Struct has no constants, it matches all other
             parts.
         count: the number of parts.
-        size: the size of the first part in bytes, 0 if there are no parts; requires `following`.
+        size: the size of the first part in bytes; 0 if there are no parts. Requires `following`.
         following: an expression of the fields of a part that gives the size of the next part in
             bytes; 0 in the last part.
         within: the total size of all parts in bytes.
@@ -485,9 +485,9 @@ class Parts(layer.Partition):
         raise SizeofError("the size of the parts depends on their content", path=path)
 
     def _make_size_rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
-        """Return a function from the parts so far to the size of the next part in bytes.
+        """Return a function from the previous parts to the size of the next part.
 
-        The function returns 0 if there is no further part, and -1 if the struct of the part
+        The size is in bytes; 0 if there is no further part, and -1 if the struct of the part
         determines its size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))

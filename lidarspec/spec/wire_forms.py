@@ -334,12 +334,12 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
 
 
 def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
-    """Return for each offset the first place that is not below it, (n,).
+    """Return for each offset the first place at this offset or after it, (n,).
 
     Args:
-        places: the places, ascending.
+        places: the offsets of some bytes, ascending.
         offsets: the offsets, (n,).
-        none: the result for an offset above all places.
+        none: the result for an offset after all places.
     """
     return np.append(places, none)[places.searchsorted(offsets)]
 

@@ -1,4 +1,4 @@
-"""Conformance of a sensor as a test for pytest: everything that `lidarspec check` checks.
+"""A pytest test that a sensor conforms, with all checks of `lidarspec check`.
 
 Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in your
 own test. In both cases there is one test, and its failure lists all findings.

@@ -54,8 +54,8 @@ def mutate(
     Args:
         words: byte strings that are inserted or that overwrite other bytes, such as values at the
             edge of a range, or parts of other inputs.
-        offsets: offsets, such as those of fields, for half of the changes; by default all offsets
-            are random.
+        offsets: offsets for half of the changes, for example the offsets of fields. By default, all
+            offsets are random.
     """
     mutated = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
@@ -173,7 +173,7 @@ class SensorUnderTest:
         examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`.
-        vectors: the file of golden vectors, None if there is none.
+        vectors: the file of golden vectors; None if there is no such file.
         family: the ids of the sensors that share that file; empty if the file belongs to this
             sensor alone.
         tested: related models that are tested as well. Frame types that this sensor shares with

@@ -244,7 +244,7 @@ def _joined_runs(
 
 @st.composite
 def _run(draw: DrawFn, sensor: Sensor, frame: str) -> list[bytes]:
-    """Draw frames of a type that are valid in this order."""
+    """Draw consecutive frames of a type, after the frame that must precede them."""
     declared = sensor.frames[frame]
     before = [] if declared.after is None else [draw(frames(sensor, declared.after))]
     count = draw(_integers(declared.confirm, declared.confirm + 2))
@@ -351,7 +351,7 @@ def _to_plain(parsed: Any) -> Any:
 
 @st.composite
 def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw the header, then values of the other fields of the layout."""
+    """Draw the header fields, and then the other fields of the layout."""
     ranges = ranges_of(sensor, frame, draw(_headers(sensor, frame, fields)))
     if ranges is None:
         # No plausible frame has this header.

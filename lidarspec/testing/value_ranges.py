@@ -49,8 +49,8 @@ class LayoutRanges:
 
     Attributes:
         layout: the layout.
-        free: the fields to draw. These are all fields except those of the header, constants,
-            lengths and checksums.
+        free: the fields to draw. These are all fields except header fields, constants, lengths and
+            checksums.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values and all other values that are valid with them.
+        """Return the fixed values, and all other values that are valid together with them.
 
         Fields that are missing in the result have their value from the base. For a field in an
         array, the valid elements are kept, and the other elements have their value from the base.
@@ -180,7 +180,7 @@ class LayoutRanges:
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Set each field of the base as near to 0 as is valid; return whether any changed."""
+        """Set each field of the base to the valid value nearest to 0."""
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
@@ -240,7 +240,7 @@ def find_ends(
     wanted: Mapping[str, tuple[int, int]],
     are_valid: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
-    """Return the last valid value of each field on the way to a wanted value.
+    """Return for each field the last valid value between a valid and a wanted value.
 
     Args:
         wanted: path -> (valid value, wanted value).
@@ -343,7 +343,7 @@ def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
 def _are_valid(
     sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]
 ) -> NDArray[np.bool_]:
-    """Return for each struct whether it is valid and has a wire form, (n,)."""
+    """Return for each struct whether it is valid and can be encoded, (n,)."""
     mask = valid_mask(sensor, frame, layout, rows)
     declared = sensor.frames[frame]
     if declared.wire is not None:

@@ -353,7 +353,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
 def _find_common_matches(frames: list[bytes]) -> list[ChecksumMatch]:
     """Return the checksums that match all frames.
 
-    Long frames are searched one by one, and only at the usual offsets.
+    Long frames are searched one by one, and only at offsets where checksums usually are.
     """
     if max(map(len, frames), default=0) <= MAX_SHORT_BYTES:
         return search(frames)

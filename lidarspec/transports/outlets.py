@@ -322,7 +322,7 @@ class UdpLine(OutletLine):
             opened.close()
 
     def _listen_for_commands(self) -> None:
-        """Receive commands, on a free port; a local listener gets the port by the SOURCE."""
+        """Receive commands; for a local listener, add the port to the SOURCE."""
         self.takes_commands = True
         if self._host == LOCALHOST:
             self._sockets[0].bind((LOCALHOST, 0))

@@ -135,7 +135,7 @@ def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
 
 
 def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
-    """Yield other programs that have opened a file for whose path `wanted` is true."""
+    """Yield other programs that have opened a file whose path `wanted` accepts."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue

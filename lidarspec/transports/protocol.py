@@ -95,11 +95,13 @@ class Format:
         suffix: the suffix including the dot, ".csv".
         description: a short description for lists.
         write: writes scans to a path. With `every_point`, it also writes points without a return.
-        holds: the names of optional features that the format supports: "organized": points in rows
-            and columns. `write` then accepts `organized=True` with one scan. "scans": each scan is
-            stored separately, and organized if its points are. "beams": planar scans are also
-            written as LaserScan messages. "frame-id": messages contain a frame_id. "packets": raw
-            packets, which `write` accepts as `packets=`.
+        holds: the names of optional features that the format supports:
+            "organized": points in rows and columns. `write` then accepts `organized=True` with one
+            scan.
+            "scans": each scan is stored separately, and organized if its points are.
+            "beams": planar scans are also written as LaserScan messages.
+            "frame-id": messages contain a frame_id.
+            "packets": raw packets, which `write` accepts as `packets=`.
     """
 
     suffix: str

@@ -50,19 +50,19 @@ class VirtualClock:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the clock has not reached the time that it was advanced to."""
+        """Whether the clock has not reached the time set by `advance` or `advance_to`."""
         return self._now_ns < self._end_ns
 
     def advance(self, seconds: float) -> None:
-        """Let later steps advance the clock by some seconds."""
+        """Let later calls of `step` advance the clock by some seconds."""
         self.advance_to(self._end_ns + int(seconds * SECOND))
 
     def advance_to(self, end_ns: int) -> None:
-        """Let later steps advance the clock to a time."""
+        """Let later calls of `step` advance the clock to a time."""
         self._end_ns = max(self._end_ns, end_ns)
 
     def step(self) -> None:
-        """Move the clock by one step, but not beyond the time that it was advanced to."""
+        """Move the clock by one step, but not beyond the time set by `advance_to`."""
         self._now_ns = min(self._now_ns + _VIRTUAL_STEP_NS, self._end_ns)
 
 

@@ -1,7 +1,7 @@
 """Write the bytes of a simulated sensor to a file, without waiting.
 
-The arrival times in the file are those of the simulated device. The file equals a recording that
-begins when the device is switched on and opened.
+The arrival times in the file are the times of the simulated device. The file equals a recording
+that begins when the device is switched on and opened.
 """
 
 from __future__ import annotations

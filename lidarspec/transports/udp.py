@@ -239,7 +239,7 @@ class UdpTransport(LiveTransport):
         label: the SOURCE, for messages.
         ports: the ports to listen on; 0 for any free port.
         host: address of the interface; "" for all interfaces.
-        group: multicast group to join; None for none.
+        group: multicast group to join; None to join no group.
         sender: accept only datagrams from this "HOST" or "HOST:PORT"; others are counted in
             `foreign`. None to accept all.
         datagrams: whether each datagram is a whole frame, not a portion of a byte stream.

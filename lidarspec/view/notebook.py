@@ -133,7 +133,7 @@ def explanation(value: Explanation) -> str:
 def sensor(value: Sensor) -> str:
     """Return the packet diagrams of a sensor as HTML.
 
-    Each diagram can be opened and closed; at first, only those of data frames are open.
+    Each diagram can be opened and closed. At first, only the diagrams of data frames are open.
     """
     head = (
         f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"

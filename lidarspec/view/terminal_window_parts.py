@@ -93,7 +93,7 @@ def write_side(
 
 
 def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
-    """Write the known statistics into the last line; omit those that do not fit."""
+    """Write the known statistics into the last line, as far as they fit."""
     columns, lines = window.size
     row = lines - 1
     column = 1

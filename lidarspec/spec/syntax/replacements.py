@@ -201,7 +201,7 @@ class IndexedArray(Array):  # type: ignore[misc]
 
 
 class FullRange(construct.GreedyRange):  # type: ignore[misc]
-    """A GreedyRange that reads all bytes of the part in which it is.
+    """A GreedyRange that reads all bytes of its enclosing part.
 
     construct's GreedyRange ends without an error at an element that fails, and loses all bytes
     after it.

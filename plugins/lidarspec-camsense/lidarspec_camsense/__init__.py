@@ -2,11 +2,11 @@
 
 They rotate and send without a request.
 
-There is no public manual. Source: packets of both (thijses/camsense-X1, "a few data packets";
-kaiaai/LDS, issue 17), all with valid checksums, and the drivers kaiaai/LDS (LDS_CAMSENSE_X1,
-LDS_LDS08RR_CAMSENSE) and lds2d. The drivers call the checksum an unknown CRC-16, but it is a folded
-sum over all bytes before it. Two different sensors are called LDS08RR. The other LDS08RR sends
-packets of 3iRobotix, which begin with AA.
+There is no public manual. Source: packets of both lidars (thijses/camsense-X1, "a few data
+packets"; kaiaai/LDS, issue 17), all with valid checksums, and the drivers kaiaai/LDS
+(LDS_CAMSENSE_X1, LDS_LDS08RR_CAMSENSE) and lds2d. The drivers call the checksum an unknown CRC-16,
+but it is a folded sum over all bytes before it. Two different sensors are called LDS08RR. The other
+LDS08RR sends packets of 3iRobotix, which begin with AA.
 """
 
 from __future__ import annotations

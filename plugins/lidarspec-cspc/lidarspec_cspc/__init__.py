@@ -2,8 +2,8 @@
 
 The host starts them over a UART. They measure by triangulation or by time of flight.
 
-Source: CSPC M1C1_Mini development manual, sections 1 and 2. Facts missing there come from the
-vendor's SDK (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1
+Source: CSPC M1C1_Mini development manual, sections 1 and 2. Facts that the manual lacks come from
+the vendor's SDK (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1
 (2020-01-22), or captures of a COIN-D4 and a COIN-D6.
 
 Known errors of the manual: The printed sum of the device information, 0x0402, should be 0x0403, as
@@ -230,7 +230,8 @@ OLDER_DATA = make_data(
 def is_ack_plausible(f: Fields) -> Any:
     """Return whether the mode is that of a reply: 50 to 5F.
 
-    Commands have the modes F0 to FF, their replies the command's mode ^ A0 (manual 2.1.3, SDK).
+    Commands have the modes F0 to FF. The mode of a reply is the mode of its command XOR A0 (manual
+    2.1.3, SDK).
     """
     return (f.mode >= 0x50) & (f.mode <= 0x5F)
 

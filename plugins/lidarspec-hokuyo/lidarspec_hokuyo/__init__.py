@@ -63,7 +63,7 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 
 
 def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
-    """Return how to distinguish a scanner from another one."""
+    """Return how to distinguish a scanner from another scanner."""
     if own.last == other.last:
         return "the scans are identical; the reply to get_parameters names the model"
     if other.last > own.last:

@@ -97,7 +97,7 @@ def make_line(name: str, letters: str) -> Construct:
 def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
     """Return the frame of a reply with these lines.
 
-    `lines` has the first four letters of each line by name.
+    `lines` maps the name of each line to its first four letters.
     """
     struct = Struct(
         "head" / Const(command + b"\n00P\n"),

@@ -188,7 +188,7 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
 
 
 def pace(f: Fields, rate: float) -> Any:
-    """Return the seconds from a scan to the next, nan for single scans.
+    """Return the seconds from a scan to the next; nan for single scans.
 
     A command may request that revolutions between scans are left out (SCIP 2.0, 8.1).
 

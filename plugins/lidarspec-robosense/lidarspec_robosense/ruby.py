@@ -120,7 +120,7 @@ def plausible(f: Fields) -> Any:
 
 
 def is_plus(f: Fields) -> Any:
-    """Return whether a packet contains the series of the Ruby Plus."""
+    """Return whether a packet contains the series number of the Ruby Plus."""
     return (f.series == PLUS_SERIES) | (f.type_30 == PLUS_SERIES)
 
 

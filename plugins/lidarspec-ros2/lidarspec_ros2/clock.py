@@ -24,8 +24,8 @@ class MessageStamps:
 
     Args:
         wall: the host's clock, for a live sensor; None if a recording is played. If the computer's
-            clock is set, ROS's time jumps, but arrival times continue evenly. This clock shows the
-            difference.
+            clock is set, ROS's time jumps, but arrival times continue evenly. The difference is
+            found with this clock.
 
     Attributes:
         clock: converts the sensor's clock to the host's.

@@ -26,8 +26,8 @@ def make_status(
     Args:
         name: the name of the node.
         reading: the statistics of the last second.
-        device_warnings: warnings in addition to those of the device.
-        more: further values.
+        device_warnings: warnings in addition to the warnings of the device.
+        more: further values to report, by name.
     """
     warnings = [*device.warnings, *device_warnings]
     figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}

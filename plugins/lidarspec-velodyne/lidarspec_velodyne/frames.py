@@ -192,7 +192,7 @@ CLOCK_STATUS = ClockStatus(
 
 
 def nmea_seconds(f: Fields) -> Any:
-    """Return the seconds since 1970 of the first valid sentence, nan for all others.
+    """Return the seconds since 1970 of the first valid sentence; nan for all others.
 
     A sentence is only valid if the clock is locked to the PPS.
     """

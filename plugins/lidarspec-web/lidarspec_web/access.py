@@ -112,7 +112,7 @@ class Guard:
         await self._app({**scope, "query_string": b""}, receive, send_with_headers)
 
     def _check_request(self, scope: Scope) -> Response | None:
-        """Return the response that refuses a request, None if the request is allowed."""
+        """Return the response that refuses a request; None if the request is allowed."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         origin = headers.get("origin")

@@ -240,7 +240,7 @@ class Broadcast:
         self._has_request.set()
 
     def play_at(self, times: float) -> None:
-        """Play a file at a multiple of its own speed.
+        """Play a file at a multiple of its recorded speed.
 
         Raises:
             UsageError: if the source is live, or the speed is out of range.

@@ -77,7 +77,7 @@ class Connections:
             self._admitted.pop(client).abort()
 
     async def close(self) -> None:
-        """Close all connections, including those of clients that do not read."""
+        """Close all connections, also if a client does not read."""
         waiting = [connection.transport for connection in self._waiting.values()]
         for transport in [*waiting, *self._admitted.values()]:
             transport.abort()

@@ -67,7 +67,7 @@ CSPC_MODELS = {
 
 
 def make_angle() -> Construct:
-    """Return the struct of FSA or LSA: steps of 1/64 degree, then a check bit of 1."""
+    """Return the struct of FSA or LSA: steps of 1/64 degree, and a check bit of 1."""
     return ByteSwapped(
         BitStruct(
             "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
@@ -165,7 +165,7 @@ def make_id(name: str) -> str:
 def has_state(f: Fields, slowest: float) -> Any:
     """Return whether the scan frequency is set in a packet other than a zero packet.
 
-    Most models send 0 there (protocol, CT).
+    In packets that are not zero packets, most models send the frequency 0 (protocol, CT).
     """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 
