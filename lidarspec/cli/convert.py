@@ -288,7 +288,7 @@ def _write_imu(
             if count is not None and number >= count:
                 break
     if not number:
-        raise _no_data_error(device, target, device.sensor.imu_frames)
+        raise _no_data_error(device, target, "IMU samples")
     samples = join_samples(batches)[:count]
     write_imu(target, samples)
     note(f"{target}: {len(samples)} IMU samples from {device.sensor.id}; {device.stats}")
@@ -367,7 +367,7 @@ def _write_frames(
     batches = _select_frames(device, types, selection, count)
     first = next(batches, None)
     if first is None:
-        raise _no_data_error(device, target, frames)
+        raise _no_data_error(device, target, " or ".join(frames))
     written = write_frames(target, itertools.chain([first], batches))
     noun = "rows" if any("." in name for name in types) else "frames"
     note(f"{target}: {written} {noun} from {sensor.id}; {device.stats}")
@@ -577,14 +577,14 @@ def _detect_sensor(source: str, target: str) -> Sensor:
         raise error if sample is None else nearest_fault_error(sample) from None
 
 
-def _no_data_error(device: Device, target: str, types: Sequence[str] = ()) -> Exception:
+def _no_data_error(device: Device, target: str, content: str = "") -> Exception:
     """Return the error that explains why a file contains no data of the sensor.
 
     The reason is that the file is empty or damaged, or that it has only other types of frames, data
     of another sensor, or no lidar data.
 
     Args:
-        types: the frame types, and the types of parts, that were searched; empty for data frames.
+        content: the searched content, such as a frame type or "IMU samples"; "" for points.
     """
     sensor = device.sensor
     stats = device.stats
@@ -597,8 +597,8 @@ def _no_data_error(device: Device, target: str, types: Sequence[str] = ()) -> Ex
     failure = stats.failure(sensor.id)
     if failure is not None:
         return failure
-    if types and stats.frames:
-        reason = f"{source} has no {' or '.join(types)}; it has {', '.join(stats.frames)}"
+    if content and stats.frames:
+        reason = f"{source} has no {content}; it has {', '.join(stats.frames)}"
         return suggest(
             WireError(reason, sensor=sensor.id), f"lidarspec stats {quote(source)} -s {sensor.id}"
         )

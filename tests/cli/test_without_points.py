@@ -265,6 +265,12 @@ def test_missing_frames_and_parts_are_named(
     frames.write_bytes(SHAPES["shape-tags"].build("data", number=0, tags=[], padding=b"\0"))
     words = ("convert", frames, target, "-s", TAGS, "-f", "data.tags.temperature")
     assert "has no data.tags.temperature; it has data" in ran(*words, code=4).stderr
+    packets = tmp_path / "packets.lsr"
+    sensor = ls.sensor("livox-mid360")
+    with ls.Recorder(packets, sensor) as recorder:
+        recorder.write(Chunk(sensor.example("data"), 1))
+    words = ("convert", packets, target, "-s", sensor.id, "--imu")
+    assert "has no IMU samples; it has data" in ran(*words, code=4).stderr
 
 
 def test_a_remark_lists_only_some_of_the_parts(
