@@ -16,6 +16,7 @@ If the time that was written cannot be read back from a frame, the clock cannot 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -47,9 +48,9 @@ MONTH_DAYS = (28, 29, 30, 31)
 #: Maximum raw value to write.
 MAX_RAW = 2**63 - 1
 #: Maximum number of values of a field that are tried to find the values of a calculated status. The
-#: next constant is the maximum number of fields that are tried.
+#: next constant is the maximum number of combinations of the values of several fields.
 MAX_STATUS_VALUES = 16
-MAX_STATUS_FIELDS = 2
+MAX_STATUS_COMBINATIONS = 256
 #: Time difference that is added to test whether a clock can be written, ns. It is more than a
 #: second.
 TEST_SHIFT_NS = 1_500_000_000
@@ -539,10 +540,12 @@ class StatusWriter:
             status = self._calculate(table, [path], [raw])
             if len(np.unique(status)) > 1:
                 self._paths.append(path)
-        if not self._paths or len(self._paths) > MAX_STATUS_FIELDS:
+        sizes = [
+            min(1 << table.schema.fields[path].bits, MAX_STATUS_VALUES) for path in self._paths
+        ]
+        if not self._paths or math.prod(sizes) > MAX_STATUS_COMBINATIONS:
             return
-        sizes = [1 << table.schema.fields[path].bits for path in self._paths]
-        ranges = [np.arange(min(size, MAX_STATUS_VALUES)) for size in sizes]
+        ranges = [np.arange(size) for size in sizes]
         raws = [grid.reshape(-1) for grid in np.meshgrid(*ranges, indexing="ij")]
         status = self._calculate(table, self._paths, raws)
         for value, raw in zip(status.tolist(), np.stack(raws, axis=1).tolist(), strict=True):

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Const,
+    Int8ul,
+    Int16ul,
+    Int32ul,
+    Int64ul,
+    Struct,
+)
 from numpy.typing import NDArray
 
 import lidarspec as ls
@@ -271,6 +281,32 @@ def test_a_status_in_reports_and_from_two_fields() -> None:
     found = sensor.split([data for _, data in device.outgoing(SECOND - 1)])
     values = [sensor.parse(item.data).sync for item in found if item.frame == "report"]
     assert values == [LOCKED] * 5 + [HOLDOVER] * 5
+
+
+def test_a_status_from_three_bits_follows_the_faults() -> None:
+    flags = ("date", "time", "resolved")
+    data = Struct(
+        "magic" / Const(b"\x5c\x04"),
+        "time" / Scaled(Int64ul, 1, "ns"),
+        "valid" / BitStruct(*(name / BitsInteger(1) for name in flags), "rest" / BitsInteger(5)),
+        "azimuth" / Scaled(Int16ul, 0.01, "deg"),
+        "distances" / Array(4, Scaled(Int16ul, 0.002, "m")),
+    )
+    states = {0: ClockState("not valid", False), 1: ClockState("valid", True)}
+    status = ClockStatus(
+        lambda f: (f.valid.date == 1) & (f.valid.time == 1) & (f.valid.resolved == 1), states
+    )
+    valid = {f"valid.{name}": 1 for name in flags}
+    sensor = replace(
+        SYNCED,
+        frames={"data": Frame(data, data=True)},
+        clock=Clock("time", status=status),
+        sequence=None,
+        simulation=Simulation(lambda i: {"time": i * PERIOD_NS, "azimuth": 0.0, **valid}),
+    )
+    for faults in ("unlock@0.4s", "restart@0.4s"):
+        packets = sensor.decode(simulate(sensor, 500, clock=parse_clock_faults(faults)))
+        assert read_clock_status(packets).tolist() == [1] * 200 + [0] * 300
 
 
 def test_a_sensor_without_a_lock_cannot_lose_it() -> None:
