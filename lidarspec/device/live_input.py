@@ -634,7 +634,7 @@ def _is_broadcast(link: Link | None) -> bool:
 
 
 def _join_chunks(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
-    """Return events; consecutive chunks of a link become one list, which a gap ends."""
+    """Return events, with consecutive chunks of a link in one list; a gap ends a list."""
     joined: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
     run: list[Chunk] = []  # the last list of chunks; empty after another event
     for link, item in events:

@@ -598,7 +598,7 @@ class Session:
     def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
         """Fail the oldest unanswered request if a frame is a refusal.
 
-        A refusal does not name the refused request, so the oldest one is assumed.
+        A refusal does not name the refused request, so the oldest request is assumed.
 
         Returns:
             Whether the frame is a refusal.

@@ -268,7 +268,7 @@ class Column(NDArrayOperatorsMixin):
     def gather(self, table: NDArray[np.float64]) -> Column:
         """Return the rows of a table that the values select.
 
-        The result has one more axis, whose array in the frame has k elements.
+        The result has one more axis: the axis of the array in the frame that has k elements.
 
         Args:
             table: (m + 1, k); the last row contains nan, and is used for indices out of range.

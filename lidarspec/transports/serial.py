@@ -197,7 +197,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
 
     Args:
         address: the SOURCE.
-        sensor: gives the defaults of the baud rate and the control lines; None for no defaults.
+        sensor: provides the defaults of the baud rate and the control lines; None for no defaults.
 
     Raises:
         UsageError: if the baud rate is unknown, or for an unknown option.

@@ -161,7 +161,7 @@ AUXILIARY = Checksummed(
 
 
 def make_angle() -> Construct:
-    """Return the struct of FSA or LSA: 1/64 degree above a check bit of 1.
+    """Return the struct of FSA or LSA: steps of 1/64 degree, then a check bit.
 
     Source: manual 2.2.3.
     """

@@ -7,11 +7,11 @@ their length and header. The time from point to point depends on the model, and 
 contain it.
 
 Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h)
-and livox_ros_driver (lds.h: packet sizes, points a second). In the latter, the size of a point of
-type 3 is given as 9 bytes, but is 10 bytes. Ranges and fields of view are assumed. The documents do
-not state which model sends which type of data, so all types are accepted for each model. Packet
-version 5 is assumed, because test vectors have this version, and drivers ignore the version. Hubs
-and the parameters of commands 0B to 0D are not supported.
+and livox_ros_driver (lds.h: packet sizes, points a second). In livox_ros_driver, the size of a
+point of type 3 is given as 9 bytes, but is 10 bytes. Ranges and fields of view are assumed. The
+documents do not state which model sends which type of data, so all types are accepted for each
+model. Packet version 5 is assumed, because test vectors have this version, and drivers ignore the
+version. Hubs and the parameters of commands 0B to 0D are not supported.
 """
 
 from __future__ import annotations
