@@ -217,7 +217,7 @@ class Plugin:
 
     @property
     def home(self) -> Home:
-        """Its distribution and module."""
+        """The distribution and the module of the plugin."""
         value = self.entry_point.partition(" = ")[2]
         entry = EntryPoint("", value, self.distribution, self.version)
         return self.distribution, entry.module

@@ -128,7 +128,7 @@ class LinkState:
         return self._senders.other_sender or self._transport.other_sender
 
     def _describe_others(self) -> str:
-        """Return a clause for a message about datagrams of other senders; "" without such."""
+        """Return a clause about datagrams of other senders; "" if there are none."""
         other = self._other_sender
         if other is None:
             return ""

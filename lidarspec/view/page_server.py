@@ -33,7 +33,7 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
 
     @property
     def device(self) -> Device:
-        """The open source."""
+        """The opened device or file."""
 
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
