@@ -36,7 +36,7 @@ from lidarspec.packets.packet_type import find_clock
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.clock_faults import ClockFaults, ClockTimeline
 from lidarspec.simulation.raw_values import PartRows, write_raw
-from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, Clock, ClockState
+from lidarspec.spec.timing import DAY_S, FIRST_DATE_NS, Clock, ClockState, ClockStatus
 from lidarspec.spec.tree import FieldInfo
 
 Times = NDArray[np.int64]
@@ -328,6 +328,15 @@ class FrameClock:
                 # The simulated sensor begins at a date as if it were set. A restart loses it.
                 first = _copy_first(self._first)
                 self._power_on_reading = self._writer.find_power_on_reading(first)
+
+    @property
+    def can_follow_dates(self) -> bool:
+        """Whether the clock can be set to a date."""
+        return self._writer is not None and self._writer.can_follow_dates
+
+    def read_state(self, status: ClockStatus) -> ClockState:
+        """Return the state of the clock at power-on, which the first frame contains."""
+        return status.state_of(frame_status(status, self._first)[0])
 
     @cached_property
     def _status(self) -> StatusWriter | None:

@@ -32,6 +32,7 @@ from lidarspec.simulation.simulator import (
     FrameSimulation,
     FramesWithoutPoints,
     check_clock_faults,
+    find_followed_scale,
     find_periodic_rates,
     frame_simulation,
 )
@@ -401,8 +402,9 @@ class SimulatedDevice:
             has. The address is "" if the command contained only a port.
         sent: number of sent frames by type, before faults.
         lines: name of each link -> the link with its faults.
-        utc_offset_ns: UTC minus the time that the caller passes, ns; used by clocks that follow
-            UTC. A change takes effect at the next `start`.
+        utc_offset_ns: UTC minus the time that the caller passes, ns. A clock that is synchronized
+            then shows the current date. None: the clock shows the dates that the spec's `sweep`
+            declares. A change takes effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
@@ -422,7 +424,7 @@ class SimulatedDevice:
         self.rate = rate
         self.faults = faults or Faults()
         self.present = True
-        self.utc_offset_ns = 0
+        self.utc_offset_ns: int | None = None
         self.commands_received = list[str]()
         self.destination: tuple[str, int] | None = None
         self.sent = Counter[str]()
@@ -468,7 +470,7 @@ class SimulatedDevice:
         self._powered = now
         self._time = 0.0
         self.destination = None
-        self._timeline = ClockTimeline(self.faults.clock, now + self.utc_offset_ns)
+        self._timeline = self._make_timeline(now)
         self._replies.use_timeline(self._timeline)
         self.present = True
         self._late = []
@@ -482,6 +484,15 @@ class SimulatedDevice:
             self._begin_periodic(0.0)
         if is_started and self.sensor.has_points:
             self._begin_data(0.0, self.sensor.data_frame)
+
+    def _make_timeline(self, now: int) -> ClockTimeline:
+        """Return the timeline of a clock that is switched on now."""
+        faults = self.faults.clock
+        if self.utc_offset_ns is None:
+            return ClockTimeline(faults, now)
+        if not faults.follows:
+            faults = replace(faults, follows=find_followed_scale(self.sensor))
+        return ClockTimeline(faults, now + self.utc_offset_ns)
 
     def _waits_for_a_command(self) -> bool:
         """Return whether the device sends no data until a start command is received.

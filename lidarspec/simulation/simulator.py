@@ -25,6 +25,7 @@ rate of the serial line.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import heapq
 import itertools
@@ -41,6 +42,7 @@ from lidarspec.frames.frame_table import CompiledTable, Table
 from lidarspec.framing.example_frames import example
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns, to_exact_ns
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.points.conventions import coordinates, find_direction
 from lidarspec.points.reference_evaluator import list_parts
 from lidarspec.sensor_operations import Sensor
@@ -52,7 +54,7 @@ from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
-from lidarspec.spec.timing import Every
+from lidarspec.spec.timing import DATED_EPOCHS, Every
 
 Times = NDArray[np.int64]
 #: Number of bits on a serial line for each byte: a start bit, eight data bits and a stop bit.
@@ -1102,6 +1104,48 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
             " frames, which the simulated sensor does not send"
         )
     others.find_clock(sent[0]).check_status()
+
+
+def find_followed_scale(sensor: Sensor) -> str:
+    """Return the time scale that the clock of a simulated sensor follows: "utc", "tai" or "gps".
+
+    Returns "" if the simulated clock is not synchronized, or if no date can be written into it.
+    """
+    others = FramesWithoutPoints(sensor)
+    periodic = find_periodic_rates(sensor)
+    with contextlib.suppress(UsageError):
+        if sensor.has_points:
+            name = sensor.data_frame
+            own = frame_simulation(sensor, name).clock
+        else:
+            name = next((name for name in periodic if others.find_clock(name).has_clock), "")
+            if not name:
+                return ""
+            own = others.find_clock(name)
+        clock = find_clock(sensor, name)
+        if clock is None or not own.can_follow_dates:
+            return ""
+        if clock.status is None:
+            return _find_scale(clock.epoch)
+        frame = clock.status.frame or name
+        if frame == name:
+            state = own.read_state(clock.status)
+        elif frame in periodic:
+            state = others.find_clock(frame).read_state(clock.status)
+        else:
+            return ""
+        if state.locked is not False:
+            return _find_scale(clock.epoch_in(state))
+    return ""
+
+
+def _find_scale(epoch: str) -> str:
+    """Return the time scale of an epoch of `Clock`; "" if it has none."""
+    if epoch == "hour":
+        return "utc"
+    if epoch in DATED_EPOCHS:
+        return epoch
+    return ""
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:

@@ -366,6 +366,33 @@ def test_a_clock_follows_the_computer(scale: str, ahead_s: int) -> None:
     assert times[500] == switched_on + (1 + ahead_s) * SECOND
 
 
+@pytest.mark.parametrize(
+    ("sensor", "ahead_s"),
+    [
+        (replace(SYNCED, clock=Clock("time", epoch="tai")), 37),
+        (with_states({LOCKED: ClockState("locked", True, "utc")}), 0),
+        (with_states({LOCKED: ClockState("not locked", False)}), None),
+        (replace(SYNCED, clock=Clock("time", epoch="boot")), None),
+        (replace(SYNCED, clock=Clock("time")), None),
+    ],
+    ids=["declared", "locked", "not locked", "since power-up", "not declared"],
+)
+def test_only_a_synchronized_clock_shows_the_current_date(
+    sensor: Sensor, ahead_s: int | None
+) -> None:
+    switched_on = 1_785_283_200 * SECOND  # 2026-07-29
+    device = SimulatedDevice(sensor)
+    device.utc_offset_ns = switched_on
+    device.start(0)
+    first = sensor.decode([data for _, data in device.outgoing(SECOND)]).time_ns[0]
+    declared = sensor.decode(simulate(sensor, 1)).time_ns[0]
+    assert first == (declared if ahead_s is None else switched_on + ahead_s * SECOND)
+    device.utc_offset_ns = None
+    device.start(SECOND)
+    again = sensor.decode([data for _, data in device.outgoing(2 * SECOND)]).time_ns[0]
+    assert again == declared
+
+
 def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:
     vlp16 = ls.sensor("velodyne-vlp16")
     device = SimulatedDevice(vlp16, faults=Faults(clock=parse_clock_faults("utc")))
