@@ -46,6 +46,7 @@ from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.imu import ImuSamples, join_samples
+from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import read_imu
 from lidarspec.plugins import sensor as named_sensor
@@ -301,12 +302,23 @@ def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
     Errors of a plugin are counted.
 
     Raises:
-        UsageError: if a required time is unknown.
+        UsageError: if a required time is unknown, or if only some of the samples have a clock.
     """
     batches = _select_frames(device, device.sensor.imu_frames, selection, None)
+    clocks = dict[bool, str]()
     with contextlib.closing(batches):
         for selected in batches:
             for packets in selected.values():
+                has_clock = find_clock(packets.sensor, packets.frame) is not None
+                clocks.setdefault(has_clock, packets.frame)
+                if selection.time == "sensor" and len(clocks) > 1:
+                    raise suggest(
+                        UsageError(
+                            f"the IMU samples of {clocks[True]} have the sensor's time, those of"
+                            f" {clocks[False]} have none, so one file cannot contain both"
+                        ),
+                        "repeat with --time host",
+                    )
                 samples = read_imu(packets)
                 yield samples if device.mount is None else samples.turn(device.mount.rotation)
 

@@ -485,6 +485,35 @@ def test_a_slice_without_imu_samples_states_the_times_of_the_file(tmp_path: Path
         assert "the selection is outside this range" in error
 
 
+def test_imu_samples_with_and_without_a_clock_are_not_mixed(tmp_path: Path) -> None:
+    plugin = tmp_path / "two.py"
+    plugin.write_text(
+        """
+from dataclasses import replace
+from lidarspec.spec import Frame, hookimpl
+from tests.shapes.inertia import DATA, SENSOR, beside
+
+FRAMES = {"fast": SENSOR.frames["imu"], "slow": Frame(DATA, imu=beside)}
+NOTHING = dict(points=None, scan=None, clock=None, sequence=None)
+TWO = replace(SENSOR, id="two-imus", frames=FRAMES, **NOTHING)
+
+@hookimpl
+def lidarspec_sensors():
+    return [TWO]
+"""
+    )
+    sensor = SHAPES["shape-inertia"]
+    recording = tmp_path / "drive.lsr"
+    with ls.Recorder(recording, sensor) as recorder:
+        for number, data in enumerate((*simulate(sensor, 4), sensor.example("imu"))):
+            recorder.write(Chunk(data, 1_785_283_200 * 10**9 + number))
+    words = ("convert", recording, tmp_path / "imu.csv", "-s", plugin, "--imu")
+    refused = ran(*words, code=2).stderr
+    assert "fast have the sensor's time, those of slow have none" in refused
+    assert "next: repeat with --time host" in refused
+    assert "13 IMU samples" in ran(*words, "--time", "host").stderr
+
+
 def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> None:
     """The clock of the shape counts from power-up: UTC is the arrival without its delay."""
     sensor = SHAPES["shape-inertia"]
