@@ -209,12 +209,14 @@ def test_tabs_are_tabs_and_the_keyboard_reaches_everything(desk: Visit) -> None:
     desk.until(lambda: desk.asked_for("frame"), "a point cannot be opened by keyboard")
     desk.page.locator("#bytes .live").click()
     desk.page.set_viewport_size({"width": 1440, "height": 600})
-    desk.page.locator("#side").focus()
-    desk.page.keyboard.press("End")
+    side = desk.page.locator("#side")
     desk.until(
-        lambda: desk.value("document.getElementById('side').scrollTop") > 0,
-        "the figures are not scrolled",
+        lambda: side.evaluate("side => side.scrollHeight > side.clientHeight"),
+        "the figures fit into the lower window",
     )
+    side.focus()
+    desk.page.keyboard.press("End")
+    desk.until(lambda: side.evaluate("side => side.scrollTop") > 0, "the figures are not scrolled")
     desk.page.set_viewport_size({"width": 1440, "height": 900})
     desk.page.click("#fold")
     assert not desk.page.locator("#bytes").is_visible()
