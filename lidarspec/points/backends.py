@@ -44,7 +44,7 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Add frames to the count of points, and return a kernel if it saves time.
+    """Count the points of some frames, and return a kernel if it saves time.
 
     Returns None if a kernel saves no time, or if Numba is missing or fails.
     """

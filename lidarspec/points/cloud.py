@@ -216,7 +216,7 @@ class PointCloud:
         """
         if self.shape is None or self.column is None:
             raise UsageError("an image requires organised points with column numbers")
-        column_size = grid_of(self).column
+        column_size = grid_of(self).column_size
         numbers, counts = np.unique(self.column[::column_size], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
@@ -265,12 +265,12 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at some indices, which together are whole columns.
+        """Return the points at these indices, which consist of whole columns.
 
-        The point at an index of -1 is invalid.
+        An index of -1 gives an invalid point.
         """
         indices = indices.reshape(-1)
-        column_size = grid_of(self).column
+        column_size = grid_of(self).column_size
         gaps = indices < 0
         picked = self[np.where(gaps, np.arange(len(indices)) % column_size, indices)]
         if gaps.any():
@@ -366,7 +366,7 @@ def grid_of(cloud: PointCloud) -> Grid:
 def find_organised_shape(number: int, grid: Grid) -> tuple[int, int] | None:
     """Return (columns, rows) for a number of points; None if they are not organised."""
     if grid.rows:
-        return (number // grid.column, grid.rows)
+        return (number // grid.column_size, grid.rows)
     return None
 
 

@@ -164,7 +164,7 @@ class Grid(NamedTuple):
     returns: int = 1
 
     @property
-    def column(self) -> int:
+    def column_size(self) -> int:
         """The number of points of a column."""
         return self.rows * self.returns
 
@@ -225,7 +225,7 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
         first: the index of the first point of the slice, counted from the start of any column.
         number: the number of points of the slice.
     """
-    if grid.rows and first % grid.column == 0 and number % grid.column == 0:
+    if grid.rows and first % grid.column_size == 0 and number % grid.column_size == 0:
         return grid
     return Grid()
 

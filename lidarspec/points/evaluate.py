@@ -117,7 +117,8 @@ def _make_group(
 
     Args:
         whole: the values of the whole batch.
-        remembered: the values of stateful nodes for the whole batch, by node number.
+        remembered: the values of nodes that depend on earlier packets, for the whole batch, by node
+            number.
     """
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:

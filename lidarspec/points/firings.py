@@ -85,8 +85,8 @@ def choose_returns(
     Args:
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
         names: the names of the returns, by return index (`Sensor.returns`). Without names, the
-            returns are in the order of their index. With names of which none is `which`, they are
-            in the order of their range.
+            first and the last return are found by the return index. If there are names, but `which`
+            is not one of them, they are found by the range.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.

@@ -164,7 +164,8 @@ class GroupPoints:
         """Return a group for some packets of a batch.
 
         Args:
-            remembered: the values of stateful nodes for all packets of the batch, by node number.
+            remembered: the values of nodes that depend on earlier packets, for the whole batch, by
+                node number.
         """
         own = batch.of(group)
         share = cls(plan, group, PlainValues(own), own)

@@ -18,8 +18,8 @@ A column in `extra` is compiled if it is float32, or if it contains the raw inte
 Compiled float32 columns are exact as well. The reference evaluator computes all other columns in
 `extra`, and converts them to their type.
 
-A value is called full if it has one value for each point. All other values have one value for each
-packet or block.
+An expression is called full if each point has its own value. All other expressions have one value
+for each packet or block.
 """
 
 from __future__ import annotations
@@ -282,8 +282,8 @@ class Plan:
     def _mark_distance(self, measured: TracedColumn) -> Any:
         """Return the distance of points, nan without a return.
 
-        If the distance is a product of a field and a factor that is not full, the factor is added
-        to `positive`.
+        If the distance is a product of a field and a factor for each packet or block, the factor is
+        added to `positive`.
         """
         node = measured.node
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:

@@ -4,7 +4,7 @@
 the function that computes the checksums for a decoder. Only ``backend="jit"`` requires this
 package. Numba is imported with the first kernel that runs. Modules in reading order:
 
-* `arithmetic`: the functions that kernels call. No other module imports Numba at its import.
+* `arithmetic`: the functions that kernels call. Importing this module imports Numba.
 * `writer`: writes the source of fields, tables and indices.
 * `source`: writes the source of expressions and of a whole kernel.
 * `cache`: stores compiled code on disk.

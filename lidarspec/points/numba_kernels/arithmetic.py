@@ -3,7 +3,8 @@
 The functions read bytes without bounds checks, compute sine and cosine in float32, and return the
 same results as NumPy for nan and infinity.
 
-This is the only module that imports Numba at its import. Only generated kernels import this module.
+Importing this module imports Numba; importing any other module does not. Only generated kernels
+import this module.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ def _compute_digest(key: bytes, name: str, data: bytes = b"") -> bytes:
 
 
 def _find_path(folder: Path, key: bytes, name: str, target: Any) -> Path:
-    """Return the path of the file of a kernel for the processor of this computer."""
+    """Return the path of the file with a kernel's code for this computer's processor."""
     processor = _compute_digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
     return folder / f"{_compute_digest(key, name).hex()}-{processor}"
 

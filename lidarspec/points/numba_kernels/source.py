@@ -111,7 +111,7 @@ def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
 
 @dataclass(frozen=True, eq=False)
 class DeferredFloat:
-    """A product or sum of float32 values that is computed in the flat loop.
+    """A product or sum in float32 that is computed in the flat loop over points.
 
     At least one operand depends on the sine or cosine of an angle of each point.
 
@@ -126,7 +126,7 @@ class DeferredFloat:
 
 @dataclass(frozen=True, eq=False)
 class Trig:
-    """The cosine or sine of an angle, computed in the flat loop.
+    """The cosine or sine of an angle, computed in the flat loop over points.
 
     Attributes:
         name: "cos" or "sin".
@@ -531,7 +531,10 @@ class KernelText:
 
 
 class KernelAssembly:
-    """Writes the lines of a kernel that store columns, in the nested or the flat loop."""
+    """Writes the lines of a kernel that store columns.
+
+    They are in the nested loops, or in the flat loop over points.
+    """
 
     def __init__(self, writer: Expressions) -> None:
         self.writer = writer
@@ -561,7 +564,7 @@ class KernelAssembly:
         lines += [f"put(out_{name}, o, {name} + bad)" for name in values]
 
     def text(self, value: Any) -> str:
-        """Return the text of an expression in the flat loop."""
+        """Return the text of an expression in the flat loop over points."""
         if isinstance(value, DeferredFloat):
             return f"({f' {value.sign} '.join(map(self.text, value.parts))})"
         if isinstance(value, Trig):
@@ -579,7 +582,7 @@ class KernelAssembly:
         return f"at({self._kept[value.text]}, k)"
 
     def turns(self) -> list[str]:
-        """Return the lines of the flat loop that compute cosines and sines."""
+        """Return the lines of the flat loop over points that compute cosines and sines."""
         return [
             f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
             for index, made in enumerate(self.writer.angles)

@@ -330,7 +330,7 @@ class KernelWriter:
         return KernelValue(f"v{self._made}", level)
 
     def index_text(self, shape: tuple[int, ...]) -> str:
-        """Return the text of the index of the current element in an array of this shape."""
+        """Return the text of the current element's index in an array of this shape."""
         return self.format_index(
             shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
         )

@@ -1,12 +1,14 @@
 """Compile the expressions of a plan to the steps of a program.
 
-Each step is one NumPy call for a chunk of packets. An expression of one field in at most two bytes
-becomes a lookup table (`points.lookup_tables`). Values that are not full, which have one value for
-each packet or block and not for each point, are evaluated by the reference evaluator for the whole
-batch, and then broadcast. All other expressions become the NumPy calls that the plugin wrote.
+Each step is one NumPy call for a chunk of packets. An expression of a single field of at most two
+bytes becomes a lookup table (`points.lookup_tables`). An expression is *full* if each point has its
+own value. The reference evaluator evaluates an expression with one value for each packet or block
+for the whole batch, and the program broadcasts the values. All other expressions become the NumPy
+calls that the plugin wrote.
 
-Columns that need not be exact may be computed in another order: products, offsets, cosines and
-sines are float32, and the terms of a sum that are not full are added before they are broadcast.
+Columns that need not be exact may be computed in float32 and in another order. Products, offsets,
+cosines and sines are float32. In a sum, the terms that are not full are added first, and the result
+is broadcast.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class Compiler:
 
     Attributes:
         program: the program, with an output for each column that was added.
-        low: the nodes that the program reads and that are not full.
+        low: the nodes that the program reads, and that have one value for each packet or block.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -74,7 +76,7 @@ class Compiler:
             self.program.outputs[name] = self._compile_double(value)
 
     def add_integers(self, name: str, leaf: Leaf) -> None:
-        """Add an output column of the integers of a field as they were sent."""
+        """Add an output column with the raw integers of a field."""
         assert leaf.info.dtype is not None
         kind = f"{leaf.info.dtype.kind}{leaf.info.dtype.itemsize}"
         self.program.outputs[name] = self._load_raw(leaf, kind)
@@ -146,9 +148,11 @@ class Compiler:
         return self.program.call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
-        """Compile the cosine or sine of a sum of angles that are not full.
+        """Compile the cosine or sine of a sum of angles, of which none is full.
 
-        The angle addition theorem needs no trigonometric function for each point.
+        An angle is full if each point has its own value.
+
+        By the angle addition theorem, no trigonometric function is computed for each point.
         """
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
@@ -311,9 +315,10 @@ class Compiler:
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
 
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
-        """Look up rows of a table that have the length of the innermost arrays.
+        """Compile a lookup of rows of a table.
 
-        Returns None if rows have another length, or if each point has its own index.
+        Returns None if each point has its own index, or if a row does not have one value for each
+        element of the innermost arrays.
         """
         index, table = node.args
         inner = table.shape[1]
@@ -332,9 +337,10 @@ class Compiler:
         return self.program.step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
-        """Compile a sum, with the terms that are not full first.
+        """Compile a sum; terms with one value for each packet or block are added first.
 
-        Returns None if all terms are full, or if a full term has an array as its factor.
+        Returns None if all terms have a value for each point, or if such a term is multiplied by an
+        array.
         """
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
@@ -365,7 +371,7 @@ class Compiler:
         return self.program.step(f"sum of {len(parts)} products", "double", run)
 
     def _add_term(self, sum_: int, part: Term) -> int:
-        """Add a full term to a sum."""
+        """Add a term with a value for each point to a sum."""
         assert part.full is not None
         before = RegisterRead(sum_)
         full = RegisterRead(self._compile_double(part.full))
@@ -378,7 +384,7 @@ class Compiler:
         return self.program.step(f"add {factor:.6g} times", "double", run, before, full)
 
     def _compile_call(self, node: Node, kind: str) -> int:
-        """Compile any other function of arrays, as NumPy evaluates it."""
+        """Compile a call that has no method of its own; NumPy evaluates it unchanged."""
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         reads = [self._make_argument(arg, depth) for arg in node.args]
         used = [
@@ -410,7 +416,7 @@ class Compiler:
         return lambda run: add_axes(run.part(run.values(value)), depth)
 
     def _broadcast(self, value: Any, kind: str) -> int:
-        """Broadcast a constant, or a value that is not full, to all points."""
+        """Broadcast a constant, or a value for each packet or block, to all points."""
         shape = self._shape
         if not isinstance(value, Node):
             return self.program.tile(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)
