@@ -7,8 +7,8 @@ stays active until a frame arrives whose type is named in another `after`. The a
 therefore change with every frame. To keep this fast, all candidates of one type in a piece are
 checked together when the type first becomes active.
 
-Weak types (`confirm` > 1) are checked in the same way, but only the first frame of a run is a live
-candidate (`weak_frames`).
+Weak types (`confirm` > 1) are checked in the same way, but of each run, only the first frame is
+used as a candidate (`weak_frames`).
 
 If the constants of a candidate have not all arrived, it is not checked yet, unless its type is
 weak. Such candidates are only at the end of the piece, but may be of many types.
@@ -145,7 +145,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return a filter by all constants of some types except the first two of each."""
+        """Return a filter for some types, by all constant bytes except the first two."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -390,7 +390,10 @@ class Candidates:
         ]
 
     def _find_by_type(self, mode: SearchState) -> dict[int, Offsets]:
-        """Return the offsets at which the constants of each new type match, by type index."""
+        """Return the offsets at which the constants of each type match, by type index.
+
+        Only active types that were not searched before are included.
+        """
         groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active_types(mode):
             if kind not in self._known:
@@ -446,7 +449,7 @@ def select_live(candidates: Frames, *, final: bool) -> Frames:
 
 
 def merge_by_offset(candidates: Sequence[Frames]) -> Frames:
-    """Merge the live candidates of several types, sorted by offset.
+    """Merge the valid and incomplete candidates of several types, sorted by offset.
 
     At each offset, only the candidate of the first type is kept.
     """

@@ -93,7 +93,8 @@ class _DatagramBatch:
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
         """Return the types of datagrams from `position` on.
 
-        They end with the first frame that changes the active types, or with the last datagram.
+        The result ends with the first frame that changes the active types, or with the last
+        datagram.
         """
         if mode.after not in self._known:
             frames, reasons = self._check(self._starts[position:], self._sizes[position:], mode)

@@ -2,9 +2,9 @@
 
 This module uses no clock, port or thread.
 
-A byte stream is divided into pieces that fit in the cache. Bytes at the end of a piece that cannot
-be decided yet are searched again with the next piece. On a datagram link, each datagram is one
-frame. The frames and counters do not depend on the division of the input.
+A byte stream is divided into pieces that fit in the cache. If it is not known yet whether the last
+bytes of a piece are a frame, they are searched again with the next piece. On a datagram link, each
+datagram is one frame. The frames and counters do not depend on the division of the input.
 """
 
 from __future__ import annotations
@@ -318,7 +318,7 @@ class Decoder:
         return np.diff(before)
 
     def _count_dropped(self, size: int) -> None:
-        """Count bytes before the next frame that belong to no frame."""
+        """Count skipped bytes, and add them to the gap before the next frame."""
         self._gap = self._gap + size
         self.stats.bytes_skipped = self.stats.bytes_skipped + size
 

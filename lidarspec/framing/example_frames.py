@@ -173,7 +173,7 @@ def _draw_header(
 
 
 def switch_keys(root: Node) -> Iterator[int]:
-    """Yield the integer keys of switches, except for labels of the field."""
+    """Yield the integer keys of all `Select` nodes, except for keys that have a label."""
     for node in nodes(root):
         if isinstance(node, Select):
             labels = node.key.info.labels if isinstance(node.key, Ref) else ()

@@ -100,7 +100,10 @@ class Codec:
         return self.prefix
 
     def make_checker(self, layout: Layout) -> CandidateChecker:
-        """Return the checker for candidates of one layout that have the checked constants."""
+        """Return the checker for candidates of one layout.
+
+        The checker does not check `_checked_constants` again.
+        """
         checker = layout.notes.get(CandidateChecker)
         if checker is None:
             self._conditions = self._conditions or StructConditions(

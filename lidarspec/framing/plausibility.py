@@ -73,8 +73,9 @@ class CandidateChecker:
         checks: the conditions of the plausibility function; None if the function has to be called.
 
     Attributes:
-        checks: all tests of values that do not call the plausibility function.
-        is_complete: whether no other tests of values are needed.
+        checks: the conditions in the arguments `met` and `checks`.
+        is_complete: whether these are all conditions on values, so that the plausibility function
+            need not be called.
     """
 
     def __init__(
@@ -186,7 +187,7 @@ def _check_valid_parts(
 def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """Check the parts of each frame, and return its status, (n,)."""
+    """Check the parts of each frame, and return the status of each frame, (n,)."""
     buffer, walked = region.find_parts(rows)
     status = STATUS_BY_PARTS[walked.status]
     errors += walked.errors
@@ -206,7 +207,10 @@ def _check_parts(
 def check_seal(
     seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """Check one checksum of each frame; return `VALID`, `CHECKSUM` or `PLUGIN`, (n,)."""
+    """Check one checksum of each frame, and return the status of each frame, (n,).
+
+    The status is `VALID`, `CHECKSUM` if the checksum is wrong, or `PLUGIN` if the plugin failed.
+    """
     try:
         wrong = ~seal.are_valid(rows, sums)
         return np.multiply(wrong.view(np.uint8), np.uint8(CHECKSUM))
@@ -216,7 +220,9 @@ def check_seal(
 
 
 def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
-    """Call `plausible` for frames; return `VALID`, `IMPLAUSIBLE` or `PLUGIN`, (n,).
+    """Call `plausible` for frames, and return the status of each frame, (n,).
+
+    The status is `VALID`, `IMPLAUSIBLE`, or `PLUGIN` if the function failed.
 
     Args:
         table: frames of one layout, so that no array is padded.
@@ -348,10 +354,11 @@ class _LookupTable:
     """The values of one or two bytes, read as an integer, for which a condition is true.
 
     Attributes:
-        limits: the first and the last of these values; None if they are not consecutive.
-        bits: if `limits` is None, a mask of the bits that the condition depends on, and the allowed
-            values of these bits; None if more than two values are allowed.
-        listed: whether the condition is true, for each value.
+        limits: the first and the last value for which the condition is true; None if there are
+            other values between them.
+        bits: (mask, allowed values) of the bits that the condition depends on; None if `limits` is
+            given, or if more than two values are allowed.
+        listed: for each value, whether the condition is true.
     """
 
     dtype: np.dtype[Any]

@@ -2,10 +2,10 @@
 
 In a stream without errors, each frame begins directly after the previous one. Datagrams of one size
 are at equal distances in a capture or an array. If all of them are frames of one layout, and no
-earlier type matches at their first bytes, the search would accept the same frames. They are
-therefore checked as rows, which takes a few calls of NumPy. In a stream, the search continues at
-the first invalid row. Datagrams are either all checked as rows, or none of them. Rows of a weak
-type are accepted only if they continue a run of frames of this type.
+type that is declared earlier matches at their first bytes, the search would accept the same frames.
+They are therefore checked as rows, which takes a few calls of NumPy. In a stream, the search
+continues at the first invalid row. Datagrams are either all checked as rows, or none of them. Rows
+of a weak type are accepted only if they continue a run of frames of this type.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def find_regular_datagrams(
     """Check datagrams at equal distances as frames of one type and layout.
 
     Returns None if this is not possible, because the datagrams differ in size, lack constants of
-    the type, have the constants of an earlier type, or change the active types.
+    the type, have the constants of a type that is declared earlier, or change the active types.
     """
     rows = _view_rows(buffer, starts, sizes)
     if rows is None:
@@ -91,7 +91,7 @@ def check_rows(
 ) -> Frames | None:
     """Check rows with the constants of a type as candidates of one layout.
 
-    Returns None if the type has no layout of this size.
+    Returns None if the rows do not have a common layout.
 
     Args:
         rows: the rows, which are at equal distances in the buffer.
@@ -143,7 +143,10 @@ def find_common_step(starts: Indices) -> int:
 
 
 def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
-    """Return the result for a piece with some frames, and the first bytes of another."""
+    """Return the result for a piece that begins with some frames.
+
+    The bytes after these frames may be the start of a further frame.
+    """
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
     need = 0
@@ -198,10 +201,10 @@ def _view_rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> By
 
 
 def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
-    """Return the type with the constants of the first datagram.
+    """Return the type whose constants are in the first datagram.
 
-    Returns None if there is no such type, or if a datagram also has the constants of an earlier
-    type.
+    Returns None if there is no such type, or if a datagram has the constants of a type that is
+    declared earlier.
     """
     first = rows[0].tobytes()
     before = list[int]()

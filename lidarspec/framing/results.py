@@ -313,7 +313,7 @@ class Frames:
 
     @cached_property
     def is_sound(self) -> bool:
-        """Whether all candidates are frames."""
+        """Whether all candidates are valid frames."""
         return not np.count_nonzero(self.status)
 
     def select(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
@@ -369,7 +369,14 @@ class Frames:
     ) -> Frames:
         """Return these frames with their offsets in the input and their arrival times.
 
-        Gathered rows replace the buffer, so that the memory of the buffer can be freed.
+        If the bytes of the frames were gathered to `rows`, the rows replace the buffer, so that its
+        memory can be freed.
+
+        Args:
+            names: the names of the frame types, as in `Frames`.
+            places: the offset of each frame in the input, (n,).
+            gaps: the number of bytes skipped before each frame, (n,).
+            at: the arrival time of each frame, ns, (n,).
         """
         if self.rows is None or isinstance(self._starts, range):
             return self._replace(names=names, places=places, gaps=gaps, at=at)

@@ -3,8 +3,8 @@
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
 invalid candidate, the search continues at the next byte. At one offset, the first type in order
 that matches is used. A type with `after` is active only if its `after` names the type of the last
-frame. For this, frames of a type that no `after` names are ignored. Frames of a type with `confirm`
-are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
+frame. Frames of a type that no `after` names do not change the active types. Frames of a type with
+`confirm` are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
 
 All candidates of a piece are checked together, and accepted together up to the next conflict or
 frame that changes the active types. The time is therefore linear in the size of the input for any
@@ -122,12 +122,12 @@ class _FrameWalk:
         self._continued: list[tuple[int, int]] = []  # kinds and offsets of continued runs
 
     def advance(self, position: int, piece: PieceResult) -> int:
-        """Accept valid candidates up to the end, or to a frame that changes the active types.
+        """Accept valid candidates until the piece ends or the active types change.
 
         Args:
             position: the offset to start from.
-            piece: the result for the piece. Its end and the bytes that it waits for are set, unless
-                the active types change.
+            piece: the result for the piece. If an incomplete candidate ends the search, its
+                attributes `end`, `waiting` and `need` are set.
 
         Returns:
             The end of the last accepted frame, or of the piece.
@@ -186,7 +186,7 @@ class _FrameWalk:
                 self._mode.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
-        """Accept further frames of the run that ended at an offset; return its new end."""
+        """Extend a run that ended at `position`, and return the new end of the run."""
         if self._mode.run_end != self._base + position:
             return position
         for kind, runs in self._runs.items():
@@ -201,7 +201,7 @@ class _FrameWalk:
         return position
 
     def _is_earlier(self, kind: int, position: int) -> bool:
-        """Return whether a live candidate at an offset has an earlier type than `kind`."""
+        """Return whether a candidate at an offset is of a type declared before `kind`."""
         starts = self._frames.starts
         row = int(starts.searchsorted(position))
         if row == len(starts) or starts.item(row) != position:
@@ -241,7 +241,8 @@ def count_rejected(
 ) -> None:
     """Count the rejected candidates outside the frames.
 
-    At the first byte of a frame, candidates of earlier types count as well.
+    At the first byte of a frame, rejected candidates of types that are declared earlier count as
+    well.
 
     Args:
         stays: for each stretch with the same active types, its offset and the value of

@@ -107,8 +107,7 @@ class TextCodec(Codec):
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
         """Return the status and the struct of a complete candidate.
 
-        If the struct is not None, it still has to be checked, and its status replaces the returned
-        one.
+        If the struct is not None, the caller has to check it, and replaces the returned status.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -132,8 +131,8 @@ class TextCodec(Codec):
     ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
         """Group structs by layout; return the groups and the refused structs.
 
-        Refused structs are given as pairs of a refusal and the indices of the structs. Structs
-        without a layout of their size are left out.
+        Refused structs are given as pairs of a refusal and the indices of the structs. A struct is
+        left out if its size differs from the size of its layout.
         """
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes

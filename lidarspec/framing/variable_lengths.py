@@ -273,8 +273,8 @@ def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
 def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
     """Return whether each candidate has the right checksum, (n,).
 
-    In each row, the bytes after the covered bytes are moved to the end of the row, where they are
-    in the longest layout.
+    The rows have the size of the longest layout. In each row, the bytes after the covered bytes,
+    such as the stored checksum, are first moved to the end of the row.
 
     Args:
         seal: the checksum of the longest layout, which fills its row.

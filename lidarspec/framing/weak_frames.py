@@ -6,11 +6,11 @@ follow one another without a gap. The whole run is then accepted.
 
 Weak candidates are checked like all others, and this module then selects the runs. The next frame
 of a run is the candidate that begins directly after the last byte of a candidate, unless a frame of
-an earlier type begins there. The first candidate of a run of at least k frames is called a head. If
-a run reaches the end of the bytes, its first candidate may become a head, and waits for more bytes.
-The search handles a head like any other candidate, with the end of the run as its end, so it skips
-the other frames of the run. If a run was accepted in the previous piece, any valid candidate
-directly after it continues the run.
+a type that is declared earlier begins there. The first candidate of a run of at least k frames is
+called a head. If a run reaches the end of the bytes, its first candidate may become a head, and
+waits for more bytes. The search handles a head like any other candidate, with the end of the run as
+its end, so it skips the other frames of the run. If a run was accepted in the previous piece, any
+valid candidate directly after it continues the run.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class WeakRuns:
         return None
 
     def members(self, offsets: Indices) -> Frames:
-        """Return the frames of the whole runs that begin at some offsets."""
+        """Return all frames of the runs that begin at these offsets."""
         is_member = np.zeros(len(self.frames), np.bool_)
         is_member[self.frames.starts.searchsorted(offsets)] = True
         for jumps in self._jumps:
@@ -119,10 +119,11 @@ def find_runs(
 
     Args:
         candidates: the candidates of the type with any status, sorted by offset.
-        earlier: the valid and incomplete candidates of types that are earlier in the order, sorted
-            by offset.
+        earlier: the valid and incomplete candidates of types that are declared before this type,
+            sorted by offset.
         confirm: the minimum length of a run that is accepted.
-        is_single: whether a frame of the type changes the active types.
+        is_single: whether a frame of the type changes the active types, so that frames have to be
+            accepted one at a time.
         final: whether no bytes follow, so that incomplete candidates are invalid.
     """
     frames = candidates.select(candidates.status <= (VALID if final else SHORT))
@@ -145,7 +146,7 @@ def find_runs(
 
 
 def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the rows of wanted values in an ascending array, and whether they exist."""
+    """Return the rows of wanted values in an ascending array, and whether each exists."""
     if not len(values):
         return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)
     rows = np.minimum(values.searchsorted(wanted), len(values) - 1)
