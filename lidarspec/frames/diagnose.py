@@ -230,7 +230,7 @@ def _iter_condition_faults(
 
 
 def _find_false_condition(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
-    """Return the path of a false condition, with the indices of the first such element."""
+    """Return the path of a condition, with the indices of the first false element."""
     raw = {info.path: layout.leaves[info.path].load(row) for info in condition.fields}
     holds = condition.values(raw)
     if holds.ndim == 1:

@@ -243,7 +243,11 @@ class CompiledTable:
         return column
 
     def _counts_of_elements(self, axis: str, path: str) -> NDArray[np.intp]:
-        """Return the length of an array of elements that differ in size, or of an array in it."""
+        """Return the length of an array in each frame, (n,).
+
+        The array at `path` is `axis`, which has elements that differ in size, or an array in these
+        elements.
+        """
         elements = self._elements(axis)
         if path == axis:
             return elements.counts

@@ -346,7 +346,7 @@ class Leaf:
         )
 
     def shift(self, offset: int) -> Leaf:
-        """Return the leaf with its offset counted from `offset`."""
+        """Return the leaf with `offset` subtracted from its own offset."""
         return replace(self, offset=self.offset - offset)
 
 
@@ -537,8 +537,8 @@ class Seal:
 class Condition:
     """A condition that frames have to meet.
 
-    Without a `formula`, the field must have one of its allowed values. With a `formula`, its value
-    must not be 0.
+    Without a `formula`, the field must have one of its allowed values. With a `formula`, the value
+    of the formula must not be 0.
     """
 
     fields: tuple[FieldInfo, ...]
@@ -591,7 +591,7 @@ class Condition:
 
 
 class FrameTest(Protocol):
-    """A test of fields that all valid frames pass."""
+    """A test of the values of some fields; it is true in all valid frames."""
 
     @property
     def fields(self) -> tuple[FieldInfo, ...]:
@@ -771,9 +771,9 @@ Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Return constant bytes sorted by offset, whole bytes before single bits.
+    """Return constant bytes in a list, whole bytes before single bits.
 
-    Whole bytes come first because they exclude more candidates.
+    Both groups are sorted by offset. Whole bytes come first because they exclude more candidates.
     """
     constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
     return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
@@ -813,7 +813,10 @@ def are_contradictory(some: Marks, others: Marks) -> bool:
 
 
 def match_word(values: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Return whether each of the values that were read at the offset of a word matches it."""
+    """Return whether each value matches a constant word.
+
+    The values were read at the offset of the word.
+    """
     _, _, mask, value = word
     return np.asarray((values if mask is None else values & mask) == value)
 

@@ -201,7 +201,7 @@ class HeaderWalk:
         return self.values[path]
 
     def _read_element(self, path: str) -> int:
-        """Return the value of an array element that is before the formula."""
+        """Return the value of one element of an array, given its path with indices."""
         base, indices = without_indices(path)
         if base in self.leaves:
             leaf = self.leaves[base].element(path, indices)
@@ -333,7 +333,7 @@ class HeaderWalk:
         """Add a sequence of parts.
 
         If no header field contains their total size, the size is requested in the same way as the
-        value of a selector.
+        value of a header field.
         """
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
         rule = PartRule(
@@ -502,7 +502,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield (field, value) for values that follow from constants and selectors."""
+        """Yield (field, value) for values that follow from constants and header fields."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -561,6 +561,8 @@ MAX_SEARCHED_VALUES = 4
 class HeaderNode:
     """A node of a `HeaderTree`, which has a selector or a result.
 
+    A selector is a header field, or a measured size, that the layout depends on.
+
     Attributes:
         values: the raw values of the selectors above this node, by path.
         above: the parent node; None for the root.
@@ -606,7 +608,7 @@ Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class _ValueClasses:
-    """Maps all values of a selector that lead to the same result to one representative.
+    """Maps all values of a header field with the same result to one representative.
 
     Random bytes in place of a header can contain billions of different lengths or keys. Values with
     the same result share one branch of the tree, so that the tree stays small.
@@ -735,7 +737,7 @@ def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
 
 
 def _is_increasing(formula: tree.Formula) -> bool:
-    """Return whether a formula depends on one field and never decreases when it increases."""
+    """Return whether a formula of a single field never decreases if the field grows."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
@@ -745,7 +747,7 @@ def _is_increasing(formula: tree.Formula) -> bool:
 
 
 def _evaluate_with(formula: tree.Formula, value: int) -> int:
-    """Return the value of a formula of one field for a value of this field."""
+    """Return the value of a formula with a single field, given the value of the field."""
     return int(tree.evaluate(formula, lambda _: value))
 
 
@@ -901,11 +903,13 @@ class HeaderTree:
             node, which = stack.pop()
             if len(which) == 1 and places is not None:
                 node = self._find_end(
-                    places.cut_longest(which), node, is_all=places.stops is not None
+                    places.cut_longest(which), node, is_whole_frame=places.stops is not None
                 )
             elif node.leaf is None and node.result is None:
                 data: bytes | memoryview = b"" if places is None else places.cut_longest(which)
-                self._explore(node, data, is_all=places is not None and places.stops is not None)
+                self._explore(
+                    node, data, is_whole_frame=places is not None and places.stops is not None
+                )
             if node.result is not None:
                 groups.append((node.result, which))
                 continue
@@ -939,7 +943,8 @@ class HeaderTree:
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of rows of bytes; None if their layouts differ.
 
-        All rows must have the same class of value in each selector.
+        If rows have different values of a header field, the values must be equivalent
+        (`_ValueClasses`).
         """
         node = self._root
         while node.result is None:
@@ -963,20 +968,20 @@ class HeaderTree:
         return None
 
     def header(
-        self, frame: bytes, *, since: HeaderNode | None = None, is_all: bool = False
+        self, frame: bytes, *, since: HeaderNode | None = None, is_whole_frame: bool = False
     ) -> HeaderNode:
         """Return the node that the available bytes of a header lead to.
 
-        The node has a result, or a selector that is not completely available.
+        The node has a result, or a header field that is not completely available.
 
         Args:
             frame: the available bytes.
             since: the node for fewer bytes of the same header, to continue from.
-            is_all: whether the frame has no more bytes.
+            is_whole_frame: whether no bytes of the frame follow.
         """
         if since is None:
             self._limit_cache()
-        return self._find_end(frame, since or self._root, is_all=is_all)
+        return self._find_end(frame, since or self._root, is_whole_frame=is_whole_frame)
 
     def _limit_cache(self) -> None:
         """Remove all nodes if there are too many."""
@@ -992,7 +997,7 @@ class HeaderTree:
         """Return the layout for these values of header fields.
 
         Args:
-            read: a function that returns the value of a selector.
+            read: a function that returns the value of a header field that the layout depends on.
 
         Raises:
             Exception: the same as `find_layout`, or any error of `read`.
@@ -1009,7 +1014,7 @@ class HeaderTree:
         return find_layout(self.root, node.values, self.limit, self._given)  # raises the error
 
     def _find_end(
-        self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
+        self, data: bytes | memoryview, node: HeaderNode, *, is_whole_frame: bool = False
     ) -> HeaderNode:
         """Return the last node for a header, starting from a node, as `_explore` does."""
         while node.leaf is not None:
@@ -1019,19 +1024,19 @@ class HeaderTree:
             node = node.child(node.find_representative(value))
         if node.result is not None:
             return node
-        return self._explore(node, data, is_all=is_all)
+        return self._explore(node, data, is_whole_frame=is_whole_frame)
 
     def _explore(
-        self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False
+        self, node: HeaderNode, data: bytes | memoryview = b"", *, is_whole_frame: bool = False
     ) -> HeaderNode:
         """Add the nodes for a header to the tree, as far as its bytes are available.
 
         Args:
-            is_all: whether the frame has no more bytes.
+            is_whole_frame: whether no bytes of the frame follow.
 
         Returns:
-            The last node. It has a result, or a selector that the available bytes do not contain,
-            or neither if the frame is longer than the available bytes.
+            The last node. It has a result, or a header field that the available bytes do not
+            contain, or neither if the frame is longer than the available bytes.
         """
 
         def read_selector(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:
@@ -1048,11 +1053,15 @@ class HeaderTree:
             walk.values = node.values
             return node.values[leaf.info.path]
 
-        if is_all and len(data) < node.least:
+        if is_whole_frame and len(data) < node.least:
             return node
         self._size += not node.least  # a node with a known size was counted before
         walk = HeaderWalk(
-            node.values, self.limit, self._given, read_selector, len(data) if is_all else None
+            node.values,
+            self.limit,
+            self._given,
+            read_selector,
+            len(data) if is_whole_frame else None,
         )
         try:
             node.result = walk_layout(walk, self.root)

@@ -96,7 +96,7 @@ class PartKind:
 
     @cached_property
     def is_checked(self) -> bool:
-        """Whether its parts have checksums or conditions, or contain parts that have some."""
+        """Whether parts of this kind have checksums or conditions, or contain such parts."""
         return any(
             isinstance(node, tree.Sealed | tree.Check)
             or any(info.allowed for info in tree.infos(node))
@@ -522,11 +522,11 @@ class PartsSize(MeasuredSize):
         if not np.count_nonzero(cut_off):
             return None, values
         # These frames already have as many bytes as the longest frame.
-        is_all = cut_off & (
+        is_whole_frame = cut_off & (
             offsets + self.region.limit <= (len(buffer) if stops is None else stops)
         )
-        values[is_all] = -LENGTH
-        there = np.flatnonzero(~cut_off | is_all)
+        values[is_whole_frame] = -LENGTH
+        there = np.flatnonzero(~cut_off | is_whole_frame)
         return there, values[there]
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:

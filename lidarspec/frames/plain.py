@@ -75,11 +75,11 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Return values with each code of an Enum as a string that also has the number.
+    """Return values with construct's strings in place of the numbers of an Enum.
 
-    construct returns codes in this way.
+    Such a string is the name of the number, and contains the number as well.
 
-    When construct builds a struct, `Const` and `Switch` compare the names of codes.
+    When construct builds a struct, `Const` and `Switch` compare these names.
     """
     if isinstance(value, Mapping):
         return Container(

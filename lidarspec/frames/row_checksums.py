@@ -464,9 +464,10 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return a value for each word that selects the sums into which it is XORed.
+    """Return for each word the sums that it is XORed into, as the bits of a number.
 
-    Bit n of the value, from 0 to 7, selects the sum of `_sum_words` that is advanced by n bytes.
+    Bit n of the number, from 0 to 7, stands for the sum of `_sum_words` that is advanced by n
+    bytes.
     """
     found = [1]
     while len(found) < number:
@@ -524,7 +525,7 @@ def _make_advance_table(distance: int, width: int, poly: int, refin: bool) -> by
 
 @lru_cache(maxsize=16)
 def _make_word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """Return the register after two bytes, (65536,).
+    """Return a table of the register after two bytes, (65536,).
 
     The index is the XOR of the little-endian word and the low 16 bits of the register.
     """
@@ -536,7 +537,7 @@ def _make_word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
 
 @lru_cache(maxsize=256)
 def _make_jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
-    """Return the register after 2**power zero bytes, (bytes, 256).
+    """Return a table that advances a register by 2**power zero bytes, (bytes, 256).
 
     The axes are the position and the value of a byte of the register.
     """

@@ -175,7 +175,7 @@ class FormCoder(Coder):
     def decode_whole(self, data: bytes) -> Decoded:
         """Decode a frame that consists of exactly these bytes.
 
-        The problem of the result, if any, may have no reason.
+        If the bytes are invalid, the `reason` of the result's `problem` may be empty.
         """
         return self.form.decode(data, _FieldFinder(self.tree))
 
@@ -197,7 +197,7 @@ class FormCoder(Coder):
             known = self.decode(spelling)
             if known.problem is None and known.struct == struct:
                 return spelling
-        layout = self.tree.header(struct, is_all=True).result
+        layout = self.tree.header(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
         data = self.form.encode(struct, list_runs(layout))
@@ -246,7 +246,7 @@ class FormCoder(Coder):
         if decoded.problem is not None and decoded.problem.reason:
             return decoded.problem
         struct = decoded.struct
-        node = self.tree.header(struct, is_all=True)
+        node = self.tree.header(struct, is_whole_frame=True)
         is_layout = isinstance(node.result, Layout) and node.result.size == len(struct)
         if decoded.problem is None and is_layout:
             return None

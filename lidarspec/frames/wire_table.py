@@ -55,7 +55,7 @@ class SizeFormula:
         return SizeFormula(self.number + other.number, self.terms + other.terms)
 
     def times(self, factor: int | str) -> SizeFormula:
-        """Return the size of this number of elements."""
+        """Return the product of this size and `factor`."""
         if isinstance(factor, int):
             return SizeFormula(
                 self.number * factor, tuple(f"{factor}*({term})" for term in self.terms)
