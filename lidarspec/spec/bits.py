@@ -153,10 +153,12 @@ def _make_field(
 
 
 def _iter_segments(targets: dict[int, int]) -> Iterator[Segment]:
-    """Yield runs of bits that are in one byte, in the same order as in the value.
+    """Yield the segments of a value: runs of bits in one byte.
+
+    The bits of a segment are consecutive in the block and in the value.
 
     Args:
-        targets: the bit of the value, by bit of the block.
+        targets: for each bit of the block that belongs to the value, its position in the value.
     """
     runs: dict[tuple[int, int, int], list[int]] = {}
     for number, bit in enumerate(sorted(targets)):

@@ -102,8 +102,8 @@ class Udp(Link):
     """UDP datagrams, which are frames or portions of a byte stream.
 
     Args:
-        ports: the default ports. For a data link, they are the ports of this computer to which the
-            sensor sends. For a link over which commands are sent, it is the port of the sensor.
+        ports: the default ports. For a data link: the ports of this computer to which the sensor
+            sends. For a link over which commands are sent: the port of the sensor.
         stream: whether the datagrams are portions of a byte stream, in which a frame can extend
             over several datagrams.
         assembled: the rule that joins datagrams to messages, if messages can be longer than a

@@ -127,7 +127,7 @@ class SensorDescription:
 
     @property
     def data_frame(self) -> str:
-        """The name of the frame type with the points; of several, the selected type.
+        """The name of the frame type with the points, or of the selected one of several.
 
         Raises:
             UsageError: for a sensor without points. The error lists its frame types.

@@ -589,7 +589,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Ending:
-    """What ends bytes of variable size: a mark, or the end of the datagram.
+    """The end of bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
         size: a field that represents the number of bytes before the end, for formulas.

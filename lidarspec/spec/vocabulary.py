@@ -102,8 +102,8 @@ class AlongAxis(NDArrayOperatorsMixin):
         Axes that the numbers do not have get the length 1.
 
         Args:
-            names: the arrays of the result's axes, in their order, each by the last name of its
-                path. They must include all arrays in `axes`.
+            names: for each axis of the result, the last name of the path of its array. Each array
+                of the attribute `axes` must be among them.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])

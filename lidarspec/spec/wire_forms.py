@@ -127,7 +127,7 @@ class NumberRun:
 
     @cached_property
     def _word_offsets(self) -> Offsets:
-        """The offset of each byte of the run in an array of big-endian words of eight bytes.
+        """For each byte of the run, its offset in an array of big-endian 8-byte words.
 
         The array has one word for each number.
         """
@@ -201,12 +201,15 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """For each byte of the struct, the offset of its field in the frame; then `end`."""
+        """A list with an offset in the frame for each byte of the struct.
+
+        The offset is where the field of the byte begins. The last item is `end`.
+        """
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return the offset in the encoded frame of the field that contains a struct byte.
+        """Return where the field of a struct byte begins in the encoded frame.
 
         Args:
             place: the offset of the byte in the struct.
@@ -298,7 +301,10 @@ class RunReader(Protocol):
 
     @property
     def position(self) -> int:
-        """The offset of the next field in the frame; the end of the frame after the last."""
+        """The offset of the next field in the frame.
+
+        After the last field, it is the end of the frame.
+        """
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
         """Read the fields of a run, up to the first invalid field.

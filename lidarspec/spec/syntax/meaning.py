@@ -926,7 +926,10 @@ def _differ_in_layout(element: tree.Node, axis: str) -> bool:
 
 
 def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tree.Formula]:
-    """Yield the formulas of all nodes and fields of a frame, and others that are not None."""
+    """Yield the formulas of all nodes and fields of a frame, and then `others`.
+
+    A None in `others` is left out.
+    """
     for node in tree.nodes(root):
         yield from tree.formulas(node)
         for info in tree.infos(node):

@@ -239,10 +239,11 @@ def _build_elements(
 
 
 class CheckedConst(Const):  # type: ignore[misc]
-    """A Const that can be parsed without verification, and reports a wrong value.
+    """A Const that can be parsed without verification.
 
-    ``parse(verify=False)`` and `explain` parse frames with wrong constants, and a `WireError` has
-    the offset, the expected and the actual value. construct's Const supports neither.
+    With verification, a wrong constant raises `MismatchError` with its offset and both values.
+    Without it, as in ``parse(verify=False)`` and `explain`, the frame is parsed. construct's Const
+    supports neither.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -402,7 +403,10 @@ class RawPart(Construct):  # type: ignore[misc]
 
 
 class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
-    """A Checksum that can be parsed without verification, and reports a wrong value."""
+    """A Checksum that can be parsed without verification.
+
+    With verification, a wrong checksum raises `MismatchError` with its offset and both values.
+    """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()

@@ -406,7 +406,7 @@ def _is_fixed(con: Construct) -> bool:
 
 
 def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: str) -> str | None:
-    """Return the name of the part that is the number of elements of an array in a FocusedSeq.
+    """Return the name of the part with the length of an array in a FocusedSeq.
 
     Args:
         parts: the parts of the FocusedSeq, by name.
