@@ -138,7 +138,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """The values that are known while the function runs, here all values."""
+        """All values. In a traced column, this property has only the sample values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -150,7 +150,7 @@ class Column(NDArrayOperatorsMixin):
         raise SpecError(NO_TRUTH, rule="LS213")
 
     def __getitem__(self, index: int) -> Column:
-        """Return one element of an array field for each packet; nan if a packet has fewer."""
+        """Return one element of an array field for each packet; nan if it is missing."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
                 "only a field can be indexed, with one index for each array, as in"
@@ -426,7 +426,7 @@ def align(
     """Align columns and other arrays, so that they broadcast.
 
     Returns:
-        The arrays, the names of their common axes, and the smallest `ready`.
+        The arrays, the names of their common axes, and the smallest `ready` of the columns.
 
     Raises:
         SpecError: if the values belong to different arrays of the frame.
@@ -502,9 +502,9 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
-    """Return the name of an axis that has a name in each of two values.
+    """Return the common name of an axis of two values.
 
-    A name may be None.
+    A name is None if the axis of this value has no name.
 
     Raises:
         SpecError: if the names belong to different arrays, and neither was guessed.
@@ -574,8 +574,9 @@ def _find_axis(
 ) -> int:
     """Return the index in `axes` of the axis that the first axis of a plain array belongs to.
 
-    The axis is found by its length. The axes of the other operands are compared first, and the
-    arrays of the frame after them.
+    The axis is found by its length. First, the length is compared with the axes of the columns that
+    are combined with the array, which `axes` and `lengths` describe. After them, it is compared
+    with all arrays of the frame.
 
     Args:
         without: the positions that are excluded.
@@ -629,7 +630,8 @@ def align_points(
     """Align the coordinates and other columns that `points` returns.
 
     Returns:
-        The arrays, the names of their axes, the smallest `ready`, and their common shape (n, ...).
+        The arrays, the names of their axes, the smallest `ready` of the columns, and the common
+        shape of the arrays, (n, ...).
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
@@ -661,10 +663,10 @@ def align_points(
 
 
 def _find_extent(table: Table, axis: str, length: int) -> int:
-    """Return the length of values along an axis.
+    """Return the length to use for values along an array.
 
-    If some frame lacks an array that contains this one, the length is limited to the length of the
-    array in the frames.
+    It is `length`. If an array that contains this array is empty in some frame, it is at most the
+    maximum length of this array in the frames.
     """
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
@@ -675,7 +677,7 @@ def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> 
     """Extend an array with nan, or cut it, to the length of an array of the frame.
 
     Args:
-        place: the index of the axis of `array`.
+        place: the index of the axis to change.
         axis: the name of the array.
     """
     length = array.shape[place]

@@ -264,7 +264,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return `Column.steps` of the sample packets, and record how many indices it has."""
+        """Return `Column.steps` of the sample packets, and record the number of indices."""
         indices = self.node.sample.steps()
         self._tape.steps.append((self.node, len(indices)))
         return indices
@@ -678,8 +678,9 @@ class Term:
 
     Attributes:
         row: the factor, a number or a row of numbers that all packets share.
-        low: the node, if it is not full; None for 1.
-        full: the node, if each point has its own value.
+        low: the node, if it has one value for each packet or block.
+        full: the node, if each point has its own value. If both nodes are None, the term is the
+            factor alone.
     """
 
     row: NDArray[np.float64]
@@ -699,8 +700,8 @@ def is_full(value: Any, width: int) -> bool:
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
     """Return the condition and the two options of a ``np.where``.
 
-    Returns None if the condition is not low, or if an option is neither a number nor a full
-    expression of one field.
+    Returns None if each point has its own condition. Also returns None if an option is neither a
+    number nor an expression of one field with a value for each point.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
@@ -770,7 +771,8 @@ def split_sum(value: Any, width: int) -> list[Term]:
 def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Multiply the terms of a sum by a factor.
 
-    If a full term would be multiplied by a row, the whole product is returned as one term.
+    If a term with a value for each point would be multiplied by a row of numbers, the whole product
+    is returned as one term.
     """
     if np.ndim(factor) and any(part.full is not None for part in parts):
         return [Term(np.ones(()), full=value)]
