@@ -582,7 +582,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
 
 
 def _write_names(labels: Mapping[int, str], name: str) -> str:
-    """Return the C function that returns the name of a code; NULL for an unknown code."""
+    """Return the C function that returns the name of a number; NULL without a name."""
     cases = [f"    case {code}: return {quote(label)};" for code, label in labels.items()]
     head = f"static inline const char *{name}(long long code)"
     return "\n".join([head, "{", "    switch (code) {", *cases, "    }", "    return NULL;", "}"])

@@ -28,7 +28,7 @@ def to_text(sensor: Sensor) -> str:
     """Return the spec as JSON.
 
     Raises:
-        ExportError: if a frame contains Python code that data cannot represent.
+        ExportError: if the content of a frame depends on Python code, which JSON cannot express.
     """
     return json.dumps(to_data(sensor), indent=2, ensure_ascii=False) + "\n"
 
@@ -37,7 +37,7 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
     """Return the spec as plain data: dicts, lists, numbers, texts.
 
     Raises:
-        ExportError: if a frame contains Python code that data cannot represent.
+        ExportError: if the content of a frame depends on Python code, which JSON cannot express.
     """
     return {
         "lidarspec": FORMAT_VERSION,

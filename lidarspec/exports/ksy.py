@@ -126,7 +126,7 @@ def number(formula: tree.Formula, scope: Scope) -> str:
 
 
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula of the fields of the last part; Kaitai's name for it is "_".
+    """Return a formula of fields of the last part, which Kaitai calls "_".
 
     Args:
         scope: the scope of the frame around the parts.
@@ -261,7 +261,7 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the entry "if" of an attribute for its instances; {} if it has none."""
+    """Return the "if" of an attribute for use in its instances; {} without an "if"."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
@@ -498,7 +498,10 @@ class _KaitaiWriter:
         kaitai.seq.append({"id": name, "type": name, **more})
 
     def _type(self, node: tree.Node, scope: Scope) -> Attribute:
-        """Return the type of a struct; for any other node, a type with it as `value`."""
+        """Return the Kaitai type of a node.
+
+        A node that is neither a struct nor a bit block is the member `value` of the type.
+        """
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
         kaitai = _KaitaiType()
@@ -608,7 +611,7 @@ class _KaitaiWriter:
 
 
 def _make_enum(labels: Mapping[int, str]) -> Attribute:
-    """Return an enum of Kaitai: names by code, documented by the original names."""
+    """Return a Kaitai enum: the name of each number, documented by its original name."""
     members: dict[Any, Any] = {}
     taken = set[str]()
     for code, label in labels.items():
