@@ -129,7 +129,7 @@ def holds_several_types(path: str | Path) -> bool:
 def _iter_tables(batches: Iterable[Batch]) -> Iterator[Columns]:
     """Yield the columns of the packets of each batch.
 
-    All tables have the columns of the first; missing values are nan.
+    All tables have the columns of the first table; missing values are nan.
     """
     names: list[str] = []
     for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
