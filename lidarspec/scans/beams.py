@@ -58,10 +58,11 @@ class PlanarScans:
     def project(self, scan: Scan) -> LaserScan | None:
         """Return the scan on the grid; None if the points are not in one plane.
 
-        With `ring` or `heights`, the points of this ring or layer are projected.
+        If this object was made with `ring` or `heights`, only the points of this ring or layer are
+        projected.
 
         Raises:
-            UsageError: if the points do not have the ring.
+            UsageError: if the points do not have this ring.
         """
         level = self._take_level(scan)
         if level is None:

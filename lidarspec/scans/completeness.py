@@ -31,7 +31,7 @@ class PacketCounts:
         counts: 1 for each packet; for parts, 1 for the first part of a frame, and 0 for the others.
         sizes: the sizes of the packets, in bytes or in points.
         missing: the number of packets missing directly before each packet.
-        is_broken: whether there is a break directly before each packet.
+        is_broken: whether an unknown number of packets is missing directly before each packet.
     """
 
     times: Integers
@@ -115,11 +115,11 @@ class OpenScan(NamedTuple):
 
     Attributes:
         has_start: whether the start of the scan has arrived.
-        since: the time of its first packet, ns.
-        packets: the number of its packets.
-        size: its size, in bytes or in points.
-        lost: the number of packets missing in it.
-        is_broken: whether there is a break in it.
+        since: the time of the first packet of the scan, ns.
+        packets: the number of packets of the scan.
+        size: the size of the scan, in bytes or in points.
+        lost: the number of packets missing in the scan.
+        is_broken: whether an unknown number of packets is missing in the scan.
     """
 
     has_start: bool = False

@@ -1,4 +1,4 @@
-"""Find the masked sector of a rotating sensor, and mark the packets at it.
+"""Find the masked sector of a rotating sensor, and mark the packets after it.
 
 The sector is found in the first revolutions of a stream. Packets are released at once until the
 angle leaps. The following packets are held until the leap recurs one revolution later, or until

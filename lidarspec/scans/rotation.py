@@ -192,7 +192,7 @@ class PassDetector:
         self._turned = 1.0  # turns since it passed
 
     def restart(self, at: float, direction: int, angle: float | None) -> None:
-        """Detect another angle from now on.
+        """Detect passes of another angle from now on.
 
         Args:
             at: the angle to pass.
@@ -204,7 +204,7 @@ class PassDetector:
         self._angle = angle
 
     def push(self, angles: Floats) -> NDArray[np.intp]:
-        """Return the rows at which the angle passes the given angle.
+        """Return the rows at which the angle passes the angle of this detector.
 
         Args:
             angles: the angles of the next rows, (k,).

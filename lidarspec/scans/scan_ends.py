@@ -191,7 +191,7 @@ class EndFinder:
         return np.flatnonzero(np.abs(steps) > rule.by)
 
     def _find_periods(self, rule: Every, packets: Packets, points: EvaluatedPoints) -> Indices:
-        """Return the rows of the first packets of each period."""
+        """Return the row of the first packet of each period."""
         times = packets.time_ns[: points.ready]
         if not len(times):
             return np.empty(0, np.intp)

@@ -352,7 +352,7 @@ class ScanSelector:
         """Return the selected parts of the next scan; None if it is not selected.
 
         Raises:
-            UsageError: if a required time is unknown, or if the points do not have the columns.
+            UsageError: if a required time is unknown, or if the points lack a selected column.
         """
         selection = self._selection
         number = self._seen
@@ -444,7 +444,7 @@ class ScanSelector:
         """Return the selected parts of a scan.
 
         Args:
-            stamp_ns: the time of its first point by the selected clock, ns.
+            stamp_ns: the time of the scan's first point by the selected clock, ns.
         """
         selection = self._selection
         cloud = scan.points
