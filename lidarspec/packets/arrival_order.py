@@ -75,7 +75,7 @@ class ArrivalOrder:
         return partial(_make_index_with_gaps, first, count, rows, missing), batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clock of the next packet with the last one: input was lost."""
+        """Do not compare the clocks of the last and next packet, because input was lost."""
         self._time = None
 
     def _count_skipped(

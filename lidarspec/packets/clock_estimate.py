@@ -105,8 +105,8 @@ class DeviceClock:
     time that a packet needs in the sensor and on the line to the host.
 
     Args:
-        parts: the number of quarters of a second that determine the line. With more parts the drift
-            is more precise; with fewer parts it follows changes sooner.
+        parts: the number of quarters of a second to which the line is fitted. With more parts the
+            drift is more precise; with fewer parts it follows changes sooner.
 
     Attributes:
         jumps: how often the sensor's clock was set.
@@ -193,9 +193,8 @@ class DeviceClock:
     def stamp_packets(self, device: Times, host: Times) -> Times:
         """Return the times of packets by the host's clock, (n,) ns.
 
-        Each time is later than all earlier stamps. This also updates the conversion: while the
-        clock runs evenly, once for each quarter of a second, and otherwise with each packet, as in
-        `stamp`.
+        Each time is later than all earlier stamps. The conversion is updated once for each quarter
+        of a second, or, while the clock does not run evenly, with each packet, as in `stamp`.
 
         Args:
             device, host: as for `observe`.
@@ -210,7 +209,7 @@ class DeviceClock:
         return stamps
 
     def _is_regular(self, device: Times, host: Times) -> bool:
-        """Return whether the packets of a part are in order and near to a reliable line."""
+        """Return whether packets are in order and close to the line, and it is reliable."""
         if self._last_stamped is None or self._outliers or not self.is_settled or not len(device):
             return False
         if (np.diff(device, prepend=self._last_stamped.device) <= 0).any():
@@ -219,9 +218,9 @@ class DeviceClock:
         return bool(-EARLY_LIMIT_NS < lowest < LATE_LIMIT_NS)
 
     def _stamp_part(self, device: Times, host: Times) -> Times:
-        """Return the times of the packets of a part by the host's clock, (n,) ns.
+        """Return the host's times of the packets of a quarter of a second, (n,) ns.
 
-        The delay changes evenly from that of the previous packet to that of the last packet.
+        The delay changes evenly from the delay of the previous packet to the delay of the last one.
         """
         before = self._last_stamped
         assert before is not None
@@ -240,7 +239,10 @@ class DeviceClock:
         return stamps
 
     def _slewed_delay(self, device: int) -> int:
-        """Return the delay of a stamp at a time of the sensor, ns; it approaches the line."""
+        """Return the delay of the stamp at a time of the sensor, ns.
+
+        If the line has changed, the delays of successive stamps approach it smoothly.
+        """
         if self._last_stamped is None:
             return self._line.delay_at(device)
         step = device - self._last_stamped.device
@@ -250,7 +252,7 @@ class DeviceClock:
         return unchanged + round(min(max(correction, -limit), limit))
 
     def _add_sample(self, sample: ClockSample) -> ClockJump | None:
-        """Update the line with the sample of smallest delay, or store it as an outlier.
+        """Update the line with a sample, or store the sample as an outlier.
 
         Returns a jump of the clock if the outliers show one.
         """
@@ -284,7 +286,7 @@ class DeviceClock:
         self._last_stamped = None
 
     def _deviation(self, sample: ClockSample) -> int:
-        """Return the height of a sample above the line, ns."""
+        """Return how much later a sample arrived than a packet on the line, ns."""
         return sample.delay - self._line.delay_at(sample.device)
 
     def _was_set(self, lasting: int) -> bool:
@@ -327,7 +329,7 @@ class DeviceClock:
         return jump
 
     def _update_line(self, sample: ClockSample) -> None:
-        """Store a sample if it is the lowest of its part, and fit the line again."""
+        """If a sample is the lowest of its quarter of a second, store it and fit the line."""
         slope = self._line.slope
         if self._min_delays and sample.device // PART_NS <= self._min_delays[-1].device // PART_NS:
             last = self._min_delays[-1]

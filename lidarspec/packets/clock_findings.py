@@ -19,7 +19,7 @@ class FindingType(NamedTuple):
     Attributes:
         text: what was found.
         advice: the next step; "" if none is needed.
-        is_fault: whether something is wrong.
+        is_fault: whether the finding is a fault, not only information.
     """
 
     text: str
@@ -130,7 +130,7 @@ class ClockFinding:
 
     @property
     def is_fault(self) -> bool:
-        """Whether something is wrong."""
+        """Whether the finding is a fault, not only information."""
         return FINDING_TYPES[self.code].is_fault
 
     @property

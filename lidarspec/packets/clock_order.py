@@ -217,7 +217,7 @@ class ClockOrder:
         else:
             self._leap = None
         if missing and self._gaps is not None:
-            self._stats.lost -= self._gaps.find_unlost(row, newest.angle, angle, self._newest)
+            self._stats.lost -= self._gaps.revoke_losses(row, newest.angle, angle, self._newest)
         return self._newest
 
     def _get_angle(self, row: int) -> float:
@@ -237,7 +237,7 @@ class ClockOrder:
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock goes back further than for a late packet."""
+        """Return whether the clock goes back further than a late packet explains."""
         if pace > 0:
             return passed < -self._max_places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE

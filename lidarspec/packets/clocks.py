@@ -177,7 +177,9 @@ class ClockEpoch:
         return self._find_nearest_time(reference.reading_ns, reference.reported_s) - time - passed
 
     def _find_nearest_time(self, reading: int, seconds: float) -> int:
-        """Return the time nearest to a date at which the clock shows a reading, ns.
+        """Return the time at which the clock shows a reading, ns since 1970.
+
+        The clock shows each reading repeatedly. The result is the time nearest to a date.
 
         Args:
             reading: the reading, ns.
@@ -245,7 +247,7 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
 
 
 def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
-    """Return the times of packets, (n,); a packet without a time gets the previous one.
+    """Return the times of packets, (n,); the previous time if a packet has none.
 
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
@@ -316,7 +318,7 @@ def part_times(
         times: the time of the frame of each part, (k,). If parts have the clock, it is the time of
             the first part.
     """
-    if not len(which) or sensor.clock is None or not _is_in_parts(sensor.clock, place):
+    if not len(which) or sensor.clock is None or not _has_fields_in_parts(sensor.clock, place):
         return times
     readings = _read_parts(sensor, place, table)
     first = np.searchsorted(which, which)
@@ -328,7 +330,7 @@ def part_times(
     return times + ((steps + period_ns // 2) % period_ns - period_ns // 2 if period_ns else steps)
 
 
-def _is_in_parts(clock: Clock, place: tuple[str, str]) -> bool:
+def _has_fields_in_parts(clock: Clock, place: tuple[str, str]) -> bool:
     return any(path.startswith(f"{_prefix(place)}.") for path in clock_fields(clock))
 
 
@@ -345,12 +347,12 @@ def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table)
 
 @lru_cache(maxsize=256)
 def to_exact_ns(seconds: float) -> int:
-    """Return seconds as nanoseconds, exact for the shortest decimal form of the number."""
+    """Return seconds as nanoseconds, exact for the number's shortest decimal form."""
     return int(to_exact(seconds) * 10**9)
 
 
 def clock_fields(clock: Clock) -> tuple[str, ...]:
-    """Return the paths of the fields that add up to a clock; () if a function computes it."""
+    """Return the paths of the fields whose sum is a clock; () if it is a function."""
     if isinstance(clock.source, str):
         return (clock.source,)
     if callable(clock.source):

@@ -6,7 +6,8 @@ late and duplicate packets and the completeness of scans follow from the index.
 
 A clock with a declared pace also shows how often the counter wrapped in a gap, and whether a jump
 of the counter comes from a corrupt value. Without a pace, the loss of a whole period of the counter
-is not found, and a single corrupt value causes two breaks, but no loss.
+is not found. A single corrupt value then breaks the stream before and after its packet, but no
+packet is counted as lost.
 
 A gap at a masked sector (`masked_sector`) is not a loss.
 """
@@ -193,7 +194,7 @@ class CounterOrder:
         return index, batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clock of the next packet with the last one: input was lost."""
+        """Do not compare the clocks of the last and next packet, because input was lost."""
         self._time = None
         self._arrived = None
         self._gaps.forget()
@@ -400,7 +401,7 @@ class CounterOrder:
             loss.missing -= loss.masked
             self._stats.lost += loss.missing
             if loss.missing:
-                self._stats.lost -= self._gaps.find_unlost(row, self._angle, angle, loss)
+                self._stats.lost -= self._gaps.revoke_losses(row, self._angle, angle, loss)
         oldest = self._index - MAX_PLACES_LATE
         kept = {index: each for index, each in self._missing.items() if index > oldest}
         added = range(max(before + 1, oldest), self._index)

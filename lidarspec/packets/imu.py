@@ -58,7 +58,7 @@ class ImuSamples:
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """`time_ns`, and a column for each axis, by the names used in files."""
+        """The column `time_ns` and a column for each axis, by the names used in files."""
         values = np.concatenate([self.angular_velocity, self.linear_acceleration], axis=1).T
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 

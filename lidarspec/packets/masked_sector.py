@@ -316,7 +316,7 @@ class MaskedGaps:
             return missing
         return min(self.masked, missing)
 
-    def find_unlost(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
+    def revoke_losses(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
         """Compare a loss with earlier losses, and mark all of them as masked if it recurs.
 
         Args:
@@ -343,9 +343,9 @@ class MaskedGaps:
             return 0
         losses = [self._losses[-each] for each in ago]
         self.masked = max(loss.missing, losses[0].missing)
-        unlost = 0
+        revoked = 0
         for each in (*losses, loss):
-            unlost += each.missing
+            revoked += each.missing
             each.masked = each.missing
             each.missing = 0
-        return unlost
+        return revoked

@@ -101,8 +101,9 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
     """Return the clock of the frames of a type; None without a clock.
 
-    A frame type that declares a clock uses this clock. Otherwise data frames, IMU frames, and all
-    frames of a sensor without points use the clock of the sensor if they have its fields.
+    A frame type that declares a clock uses this clock. Other frame types use the clock of the
+    sensor if they have the fields of this clock, and are data frames, IMU frames, or frames of a
+    sensor without points.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock

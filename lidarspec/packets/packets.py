@@ -249,7 +249,7 @@ class Packets:
         return packets
 
     def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
-        """Return the arguments of `Packets` that have one value for each packet.
+        """Return those arguments of `Packets` that have one value per packet.
 
         Args:
             indices: the selected packets, (k,).
@@ -383,7 +383,8 @@ def _nested_dtype(
     """Return the structured dtype of one level of the struct.
 
     Raises:
-        SpecError: if one name is a value, a struct or an array in different branches.
+        SpecError: if a name is a value in some branches of the struct, and a struct or an array in
+            others.
     """
     members: list[Any] = []
     seen: set[str] = set()

@@ -62,11 +62,13 @@ def describe_incomplete_groups(count: int) -> str:
 
 
 class GroupCounter:
-    """Counts the incomplete groups of packets with the returns of the same firings.
+    """Counts the incomplete groups of packets.
+
+    The packets of a group contain the returns of the same firings.
 
     Args:
         rule: the counter of the packets.
-        stats: `incomplete_returns` counts the groups.
+        stats: the counters; the groups are added to `incomplete_returns`.
     """
 
     def __init__(self, rule: PacketCounter, stats: Counters) -> None:

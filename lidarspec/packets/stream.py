@@ -103,7 +103,7 @@ class PacketStream:
         Args:
             batches: frames of all types, in stream order.
             whole: whether the frames are the whole input. If so, packets before the first frame of
-                a state type use this frame.
+                a type that they need as their state use this frame.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join_columns([self._read_columns(part) for part in parts])
@@ -232,9 +232,10 @@ class PacketStream:
         return times + self._epoch_offset_ns
 
     def _count_skipped_bytes(self, part: OwnFrames) -> Integers:
-        """Return the number of bytes outside frames before each own frame, (n,).
+        """Return the number of bytes outside frames before each packet, (n,).
 
-        The bytes after the last own frame are added to the count of the next piece of input.
+        The bytes after the last packet are added to the count of the first packet in the next piece
+        of input.
         """
         gaps = part.piece.gaps
         rows = part.rows
@@ -254,7 +255,7 @@ class PacketStream:
         return np.diff(own_sums, prepend=0)
 
     def _read_columns(self, part: OwnFrames) -> _Columns:
-        """Return the columns of the own frames in one piece of input."""
+        """Return the columns of the packets in one piece of input."""
         frames = part.frames
         skipped = self._count_skipped_bytes(part)
         return _Columns(self._type.codec.gather(frames), frames.places, frames.at, skipped)
@@ -266,9 +267,10 @@ class PacketStream:
     def _find_states(
         self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return, for each state type, its frames and the row of each packet's frame.
+        """Return the frames of each type that packets need as their state.
 
-        The frame of a packet is the last one before the packet.
+        The frames of a type come with the row of each packet's frame, which is the last frame of
+        this type before the packet.
         """
         others = self._select_others(parts)
         return {
@@ -279,7 +281,7 @@ class PacketStream:
         }
 
     def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
-        """Return the frames of the state types, by name."""
+        """Return the frames of the types that packets need as their state, by name."""
         selected: dict[str, list[OtherFrames]] = {}
         packet_count = 0
         for part in parts:
@@ -301,12 +303,12 @@ class PacketStream:
     def _find_state(
         self, name: str, others: Sequence[OtherFrames], *, packet_count: int, whole: bool
     ) -> StateOf:
-        """Return the frames of a state type, and the row of each packet's frame, (n,).
+        """Return the frames of another type, and the row of each packet's frame, (n,).
 
         The newest frame is stored for the next packets.
 
         Args:
-            name: the state type.
+            name: the frame type, which packets need as their state.
             others: its frames in this input.
         """
         last_frame = self._last_frames.get(name)
@@ -399,7 +401,7 @@ class ImuStream:
 
 
 def read_imu(packets: Packets) -> ImuSamples:
-    """Return the IMU samples of packets; if the plugin's function fails, count it and return none.
+    """Return the IMU samples of packets; an error of the plugin's function is counted.
 
     Args:
         packets: packets of a frame type with IMU samples.
@@ -427,7 +429,7 @@ class OwnFrames:
 
     @classmethod
     def of(cls, piece: Frames, name: str) -> OwnFrames:
-        """Return the frames of one type in a piece."""
+        """Return the frames of one type in a piece of input."""
         own_kind = -1
         if name in piece.names:
             own_kind = piece.names.index(name)
@@ -444,7 +446,7 @@ class OwnFrames:
 
     @property
     def has_others(self) -> bool:
-        """Whether there are frames of other types in the piece."""
+        """Whether there are frames of other types in the piece of input."""
         return len(self.frames) < len(self.piece)
 
 

@@ -217,7 +217,7 @@ class UtcTimes:
         return times + hours * HOUR_NS
 
     def _find_source(self, time_ns: int, status: float) -> UtcSource:
-        """Return the source of UTC at a time by the sensor's clock, with this status."""
+        """Return the source of UTC at a time of the sensor's clock, and in a clock status."""
         clock = self._clock
         if clock is None:
             raise self._explain_no_clock()
