@@ -38,7 +38,7 @@ DISK_TIMEOUT_S = 60.0
 Size = Callable[[bytes | bytearray, int], int]
 
 
-class RecordFile:
+class RecordingFile:
     """A new file. An existing file with the same path is kept until `settle`.
 
     Args:
@@ -116,7 +116,7 @@ class RecordFile:
             os.replace(self._opened, self._place)
             self._opened = self._place
 
-    def keep(self) -> None:
+    def flush_to_disk(self) -> None:
         """Wait until all data is on the disk. For pipes and devices, this does nothing."""
         try:
             os.fsync(self._file.fileno())
@@ -172,7 +172,7 @@ class BackgroundWriter:
 
     Args:
         path: the path of the file.
-        size_at: returns the length of a record, as in `RecordFile`.
+        size_at: returns the length of a record, as in `RecordingFile`.
         overwrite: whether an existing file may be replaced.
 
     Attributes:
@@ -197,7 +197,7 @@ class BackgroundWriter:
         self._records_added = 0
         self._records_requested = 0
         self._records_synced = 0
-        self._file = RecordFile(self.path, size_at, overwrite=overwrite)
+        self._file = RecordingFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(
             target=self._write_records, name=f"recorder of {path}", daemon=True
         )
@@ -346,7 +346,7 @@ class BackgroundWriter:
                 if is_begun:
                     self._file.settle()
                 if asked or time.monotonic() >= due:
-                    self._file.keep()
+                    self._file.flush_to_disk()
                     due = time.monotonic() + SYNC_PERIOD_S
                     with self._changed:
                         self._records_synced = taken

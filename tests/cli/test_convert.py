@@ -20,7 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
-from lidarspec.recording.background_writer import RecordFile
+from lidarspec.recording.background_writer import RecordingFile
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
@@ -547,12 +547,12 @@ def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> Non
 def test_full_disk_names_the_output_and_leaves_nothing(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def append(self: RecordFile, records: bytes) -> None:
+    def append(self: RecordingFile, records: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     (path := tmp_path / "in.bin").write_bytes(EXAMPLE * 3)
     target = tmp_path / f"out{suffix}"
-    monkeypatch.setattr(RecordFile, "append", append)
+    monkeypatch.setattr(RecordingFile, "append", append)
     failed = ran("convert", path, target, "-s", "ldrobot-stl27l", code=3)
     assert failed.stderr.startswith(f"{target}: No space left on device; nothing was written\n")
     assert os.listdir(tmp_path) == ["in.bin"]
