@@ -102,9 +102,9 @@ def clock(
 ) -> None:
     """Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.
 
-    Arrival times are compared with the times in the packets: of a live source with the clock of
-    this computer, of a file with that of the computer that recorded it. Several sources are read at
-    the same time, and compared with each other. The exit code is 1 if a clock is at fault.
+    The times in the packets are compared with their arrival times. The arrival times are by the
+    clock of this computer, or, for a file, of the computer that recorded it. Several sources are
+    read at the same time, and compared with each other. The exit code is 1 if a clock is at fault.
     """
     with contextlib.ExitStack() as stack:
         clocks = [

@@ -434,7 +434,7 @@ def _select_frames(
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
-    """Return packets by type: the packets and their parts, as far as in `types`."""
+    """Return the packets and their parts by type, for the types in `types`."""
     found = dict[str, Packets]()
     for name in types:
         frame, _, path = name.partition(".")

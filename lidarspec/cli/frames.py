@@ -76,7 +76,7 @@ def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
 
 
 def _iter_names(parsed: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield (path, name) of each enum value in a parsed frame; "" for an unknown one."""
+    """Yield (path, name) of each enum value in a parsed frame; "" if it has no name."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             yield from _iter_names(value, f"{path}.{name}" if path else name)
@@ -218,12 +218,12 @@ def listing(
 
 
 class FrameSelection:
-    """Selects which pieces of an input to show, and counts all pieces.
+    """Selects the frames and other bytes of an input to show, and counts all of them.
 
     Args:
         frame: show only this frame type.
         count: maximum number of frames to show; with `bad`, maximum number of damaged frames.
-        bad: show only damaged pieces.
+        bad: show only damaged frames and bytes outside frames.
         at: show only the byte at this offset.
         stretch: show only the bytes in this range of offsets, "FROM:TO".
 

@@ -155,7 +155,7 @@ def view(
                 record=switch,
                 duration=duration,
             ),
-            taken=source == "-",
+            stdin_is_data=source == "-",
         )
         conclude(device)
     if switch is not None:
@@ -251,14 +251,14 @@ def _show_in_rerun(
         conclude(device)
 
 
-def _run_window(device: Device, window: Window, *, taken: bool) -> None:
+def _run_window(device: Device, window: Window, *, stdin_is_data: bool) -> None:
     """Run the window until the user closes the window or the terminal.
 
     Args:
-        taken: whether standard input is the source, so that no keys can be read.
+        stdin_is_data: whether standard input is the source, so that keys cannot be read from it.
     """
     try:
-        with Screen(sys.stdout, keyboard(taken=taken)) as screen:
+        with Screen(sys.stdout, keyboard(stdin_is_data=stdin_is_data)) as screen:
             window.run(screen)
     except TerminatedError as end:
         click.get_current_context().exit(end.code)

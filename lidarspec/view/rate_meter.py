@@ -131,7 +131,7 @@ class RateTally:
 
         Args:
             counters: the current counters of the decoder.
-            seconds: the duration; None to use the sum of the gaps.
+            seconds: the duration; None to use the sum of the times between packets.
             counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
         """
         duration = seconds or self._gap_sum or None

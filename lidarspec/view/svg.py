@@ -128,8 +128,8 @@ class _ViewDrawer:
         cloud: the valid points.
         look: the appearance.
         side: side of the view from above, in pixels.
-        most: maximum number of dots in a view; None for no limit. colours: the colour of each
-            point, as a step of the colour ramp, (n,).
+        most: maximum number of dots in a view; None for no limit.
+        colours: the colour of each point, as a step of the colour ramp, (n,).
     """
 
     cloud: PointCloud
@@ -232,7 +232,8 @@ class _ViewDrawer:
     ) -> tuple[int, list[str]]:
         """Return the number of dots, and for each colour an SVG path that draws its dots.
 
-        The dots are on the finest grid of `GRIDS_PX` that gives at most `most` dots.
+        The dots are on the finest grid of `GRIDS_PX` with which their number does not exceed the
+        attribute `most`.
 
         Args:
             across: horizontal coordinates of the points, (n,) pixels.

@@ -108,9 +108,9 @@ if sys.platform == "win32":
                 raise KeyboardInterrupt
             return [key for key in keys if key]
 
-    def keyboard(*, taken: bool = False) -> KeyReader:
+    def keyboard(*, stdin_is_data: bool = False) -> KeyReader:
         """Return the keyboard of the console, or `KeyReader()` if there is none."""
-        if sys.stdin.isatty() and not taken:
+        if sys.stdin.isatty() and not stdin_is_data:
             return Keyboard()
         return KeyReader()
 
@@ -150,14 +150,14 @@ else:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
-    def keyboard(*, taken: bool = False) -> KeyReader:
+    def keyboard(*, stdin_is_data: bool = False) -> KeyReader:
         """Return the keyboard of the terminal, or `KeyReader()` if there is none.
 
         Args:
-            taken: whether standard input is the data. Keys are then read from /dev/tty.
+            stdin_is_data: whether standard input is the data. Keys are then read from /dev/tty.
         """
         try:
-            if sys.stdin.isatty() and not taken:
+            if sys.stdin.isatty() and not stdin_is_data:
                 return Keyboard(sys.stdin.fileno())
             return Keyboard(os.open("/dev/tty", os.O_RDONLY))
         except (OSError, ValueError, termios.error):
