@@ -198,7 +198,7 @@ def find_records(
 def _count_equal_lengths(
     storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form
 ) -> int:
-    """Return the number of consecutive records with this length, at most `count`."""
+    """Return the number of consecutive records of `length` bytes, at most `count`."""
     field_offset, kind, value = form.length_field(length)
     values: NDArray[Any] = np.ndarray((count,), kind, storage, at + field_offset, (length,))
     others = values != value

@@ -234,7 +234,7 @@ class CaptureReader(ClosingContext):
 
     @contextmanager
     def _count_end(self) -> Iterator[None]:
-        """At the end of the block, close the file and record whether it was truncated."""
+        """On exit from the context, close the file and record whether it was truncated."""
         try:
             yield
         except TruncatedError:

@@ -87,8 +87,8 @@ class CapturedPacket(NamedTuple):
         link: link-layer type.
         at: capture time in ns since 1970, in the range of int64; 0 if the record has no time.
         data: the captured bytes.
-        original: length of the packet on the network; larger than that of `data` if the packet was
-            truncated at the snap length.
+        original: length of the packet on the network. It is larger than the length of `data` if the
+            packet was truncated at the snap length.
     """
 
     link: int
@@ -211,9 +211,9 @@ class PcapRecords:
         return self._head.size + captured if self._is_sure(captured, original) else 0
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, type, value) of the length fields of a record of this length.
+        """Return (offset, type, value) of both length fields of a record, as one number.
 
-        Both fields are read as one number. The packet is not truncated.
+        The record has this length, and its packet is not truncated.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -237,7 +237,7 @@ class PcapRecords:
         # The missing parts of a sparse or damaged file are read as zeros.
         if captured > MAX_PACKET_BYTES or not any(head):
             raise DamagedRecordError
-        if not self._is_sure(captured, original) and self._is_false(captured, original):
+        if not self._is_sure(captured, original) and self._has_wrong_length(captured, original):
             raise DamagedRecordError
         self._began = seconds if self._began is None else self._began
         self._source.skip(self._head.size)
@@ -296,7 +296,7 @@ class PcapRecords:
         """
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
-    def _is_false(self, captured: int, original: int) -> bool:
+    def _has_wrong_length(self, captured: int, original: int) -> bool:
         """Return whether the length of a record is wrong.
 
         The length is wrong if neither a record nor the end of the input follows the record, and if
@@ -386,7 +386,7 @@ class PcapngBlocks:
             self._knows_all = True
             self.sections = self.sections + 1
         kind, length = struct.unpack_from(self.order + "II", head)
-        if self._is_false(kind, length):
+        if self._has_wrong_length(kind, length):
             self._knows_all = self._knows_all and kind != _INTERFACE
             raise DamagedRecordError
         if length > MAX_BLOCK_BYTES:
@@ -428,7 +428,7 @@ class PcapngBlocks:
         right = offsets[words[ends - 4] == lengths[offsets]].tolist()
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
-    def _is_false(self, kind: int, length: int) -> bool:
+    def _has_wrong_length(self, kind: int, length: int) -> bool:
         """Return whether the length of a block is wrong.
 
         The length is wrong if it is impossible for the type of the block, or if the last word of
