@@ -384,7 +384,7 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Location | None:
-        """Return the location of the field that matches most names at the end of the path."""
+        """Return the location of the field with the longest path that ends `parts`."""
         fitting = [
             (len(chain), location)
             for chain, location in self._iter_fields

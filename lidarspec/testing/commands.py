@@ -103,7 +103,7 @@ def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, flo
             assert read == raw, f"{argument} is {read!r}, expected {value!r}"
 
 
-def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> None:
+def arguments_outside_ranges_are_errors(subject: SensorUnderTest, name: str) -> None:
     """Check that arguments outside their ranges raise an error."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind

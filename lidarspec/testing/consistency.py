@@ -81,7 +81,7 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
 
 
 def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
-    """Check that points turn by the same angle as the angles of their packet."""
+    """Check that a shift of the angles in a packet turns its points by the same angle."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return

@@ -497,7 +497,7 @@ def _check_strength(
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
-    if weakest <= _find_weak_bits(subject.sensor, frame):
+    if weakest <= _find_strength_limit(subject.sensor, frame):
         yield (
             "LS206",
             (
@@ -508,8 +508,8 @@ def _check_strength(
         )
 
 
-def _find_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the maximum number of constant and checksum bits of a weak frame."""
+def _find_strength_limit(sensor: Sensor, frame: Frame) -> int:
+    """Return the number of constant and checksum bits up to which a frame is weak."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:

@@ -164,7 +164,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
             )
 
 
-def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
+def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> None:
     """Check that a frame is invalid if the value of a `Rebuild` field is wrong.
 
     Otherwise, building the parsed values would give a different frame.
@@ -394,7 +394,7 @@ def _check_edit(
 
 
 def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
-    """Return the author's strategy for a field's raw value, else a strategy for any."""
+    """Return the author's strategy for a field's raw values, else one for all values."""
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits

@@ -142,7 +142,7 @@ def trace_points(subject: SensorUnderTest, name: str) -> Any:
     Returns None if the frame is not compiled.
 
     Raises:
-        UntraceableError: if it cannot be traced, with the reason.
+        UntraceableError: if `points` cannot be traced, with the reason.
     """
     if name not in subject.traced:
         subject.traced[name] = _trace_points(subject, name)
@@ -318,7 +318,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
         )
 
 
-def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> None:
+def the_full_circle_equals_zero(subject: SensorUnderTest, name: str) -> None:
     """Check that an angle of exactly 360 degrees gives the same points as 0.
 
     Nothing is tested if no frame with 360 degrees is plausible.

@@ -165,7 +165,7 @@ PROPERTIES = (
     Property(frames.examples_are_valid_and_repeat, "frame", "LS301"),
     Property(frames.bytes_survive_parsing_and_building, "frame", "LS302"),
     Property(frames.every_raw_value_survives, "frame", "LS302", unless=("LS302", "LS303")),
-    Property(frames.what_follows_is_held, "frame", "LS312", unless=("LS302", "LS303")),
+    Property(frames.wrong_rebuild_values_are_invalid, "frame", "LS312", unless=("LS302", "LS303")),
     Property(
         frames.values_in_units_build_the_same_bytes, "frame", "LS304", unless=("LS302", "LS303")
     ),
@@ -203,7 +203,7 @@ PROPERTIES = (
         depends_on=DECODING_ATTRIBUTES,
     ),
     Property(
-        geometry.the_full_circle_is_the_same_as_none,
+        geometry.the_full_circle_equals_zero,
         "data",
         "LS505",
         unless=(*FAILING_RULES, "LS503"),
@@ -272,7 +272,7 @@ PROPERTIES = (
         unless=("LS201", "LS218", *FAILING_RULES, "LS502", "LS415", "LS503"),
     ),
     Property(commands.a_command_parses_back, "command", "LS601", lacks=_no_commands),
-    Property(commands.arguments_are_held_to_their_ranges, "command", "LS602", lacks=_no_commands),
+    Property(commands.arguments_outside_ranges_are_errors, "command", "LS602", lacks=_no_commands),
     Property(commands.replies_can_match, "command", "LS603", lacks=_no_commands),
     Property(
         commands.the_simulated_sensor_answers,

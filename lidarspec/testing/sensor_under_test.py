@@ -276,7 +276,10 @@ class SensorUnderTest:
         return self._known[frame, seed]
 
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
-        """Return the author's functions for raw values of fields of this frame, by path."""
+        """Return the functions that the plugin's author gives to draw raw values.
+
+        The key of each is the path of the field in this frame type.
+        """
         if frame not in self._drawers:
             own = {
                 path.removeprefix(f"{frame}."): how

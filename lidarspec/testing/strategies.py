@@ -93,7 +93,8 @@ def frames(sensor: str | Sensor, frame: str, fields: Fields | None = None) -> Se
     Args:
         sensor: an id or a Sensor.
         frame: the name of the frame type, incoming or outgoing.
-        fields: field path -> a strategy of its raw value; of each element, if it is in an array.
+        fields: field path -> a strategy for the raw value of the field, or of each element if the
+            field is in an array.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not have.
@@ -118,7 +119,8 @@ def values(
     Args:
         sensor: an id or a Sensor.
         frame: the name of the frame type, incoming or outgoing.
-        fields: field path -> a strategy of its raw value; of each element, if it is in an array.
+        fields: field path -> a strategy for the raw value of the field, or of each element if the
+            field is in an array.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not have.
@@ -433,7 +435,7 @@ def _integers(low: int, high: int, named: tuple[int, ...] = ()) -> SearchStrateg
 
 @functools.lru_cache
 def _floats(width: int) -> SearchStrategy[float]:
-    """Return a strategy for floats of a width in bits. A NaN is never equal to itself."""
+    """Return a strategy for floats of a width in bits, without NaN."""
     return st.floats(width=width, allow_nan=False)  # type: ignore[arg-type]
 
 
@@ -458,7 +460,7 @@ def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[A
 
 
 class _DrawnNumbers(random.Random):
-    """A random generator that draws its numbers by Hypothesis."""
+    """A random generator that takes its numbers from Hypothesis."""
 
     def __init__(self, draw: DrawFn, ranges: Mapping[str, tuple[int, int]]) -> None:
         super().__init__(0)
@@ -475,7 +477,7 @@ class _DrawnNumbers(random.Random):
         """Draw a raw value of a field.
 
         Args:
-            bits: its width.
+            bits: the width of the field.
             kind: "u" or "i" for an integer, "f" for a float.
         """
         if kind == "f":

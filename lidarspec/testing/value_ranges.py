@@ -322,7 +322,7 @@ def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...
 
 
 def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, int], ...]:
-    """Return the fields of a struct that its layout depends on, with their values."""
+    """Return the values of those fields of a struct that determine its layout."""
     values: dict[str, int] = {}
     while True:
         try:

@@ -5,8 +5,9 @@
       "units": {"start_angle": 324.27},
       "points": {"0": {"range": 0.224, "x": 0.18186, "y": 0.13078}}}]
 
-`values` are raw integers, `units` physical values in the fields' units, `points` columns of single
-points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further column). All
+`values` are raw integers. `units` are physical values in the fields' units. `points` are the
+columns of single points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a
+further column). All
 three may be omitted. In any case, the bytes must be a frame of this type, and building the parsed
 values must give the same bytes. `sensor` is the id or a list of ids of the sensors that an entry
 belongs to; it may be omitted if the file belongs to a single sensor. An entry with `command` has
