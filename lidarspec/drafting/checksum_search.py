@@ -247,8 +247,8 @@ def _iter_matches(
     """
     computed = few.compute_checksums(algorithm, place, span)
     mask = np.uint64((1 << 8 * place.size) - 1)
-    orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
-    for order in orders:
+    byte_orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
+    for order in byte_orders:
         stored = few.fields(place, order)
         algorithms: list[Checksum]
         if isinstance(algorithm, Fletcher | Fold15):

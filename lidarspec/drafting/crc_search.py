@@ -103,7 +103,7 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a degree that have the constant term 1.
+    """Return the divisors of a polynomial that have a degree and the constant term 1.
 
     CRC polynomials have this term.
 
@@ -259,8 +259,8 @@ def crc_matches(
         place for places in zip_longest(*by_width) for place in places if place is not None
     ):
         width = 8 * place.size
-        orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
-        readings = [_BitOrder(width, order, *mirror) for order in orders for mirror in mirrors]
+        byte_orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
+        readings = [_BitOrder(width, order, *mirror) for order in byte_orders for mirror in mirrors]
         for span, reading in product(iter_spans(place, samples), readings):
             tried += 1
             at_end = place.offset == -place.size

@@ -92,8 +92,8 @@ class Draft:
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: other checksums that match.
-        common_bytes: if the length field counts bytes, the number of bytes that nearly all frames
-            have at least; else 0. These first bytes are searched for fields.
+        common_bytes: the number of first bytes that nearly all frames have, and that are searched
+            for fields; 0 unless the length field counts bytes.
     """
 
     datagrams: bool

@@ -179,7 +179,7 @@ def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
 
 
 def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """Return the share of frames with `last` between `first` and the next `first`.
+    """Return the share of frames whose `last` is between `first` and the next `first`.
 
     Args:
         first: a field of each frame, (n,).
@@ -195,10 +195,10 @@ def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[RisingField]:
     for offset in _select_offsets(rows, 1):
         if varied[offset] and len(rows) >= FEW_FRAMES:
             yield from _iter_counters(rows, offset, 1, "little")
-    orders: tuple[ByteOrder, ...] = ("little", "big")
+    byte_orders: tuple[ByteOrder, ...] = ("little", "big")
     for size in (2, 4) if len(rows) >= FEW_FRAMES else (2,):
         for offset in _select_offsets(rows, size):
-            for order in orders:
+            for order in byte_orders:
                 if order == "little":
                     from_low = range(size)
                 else:

@@ -222,10 +222,11 @@ class SampleFrames:
         return SampleFrames(self.frames[::step][:number])
 
     def take_similar(self, number: int, pick: int) -> SampleFrames:
-        """Return frames of the most frequent length, and two of each of other lengths.
+        """Return frames of the most frequent length, and up to two of each other length.
 
         Args:
-            number: the maximum number of frames of the most frequent length, and of other lengths.
+            number: the maximum number of frames of the most frequent length, and the maximum number
+                of other lengths.
             pick: index of the selection. Different indices select different frames.
         """
         largest = max(self.groups, key=len)
@@ -365,9 +366,9 @@ def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredS
 
 
 def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
-    """Return the bits of evidence of a match.
+    """Return the evidence for a match, in bits.
 
-    One of 2**bits wrong checksums would match as well by coincidence.
+    If there are k bits, one of 2**k wrong checksums would match as well by coincidence.
 
     Args:
         width: width of the checksum, in bits.
