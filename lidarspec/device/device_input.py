@@ -94,7 +94,10 @@ class DeviceInput(Protocol):
                 self.info_frames = {**self.info_frames, role: item}
 
     def _lacks_values(self, role: str, item: Found) -> bool:
-        """Return whether a frame with parts lacks facts that the stored frame contains."""
+        """Return whether a frame lacks facts that the stored frame contains.
+
+        Only a frame with parts can lack facts.
+        """
         earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False

@@ -268,7 +268,7 @@ class LiveInput(DeviceInput):
                 command.timeout * (1 + command.retries) if timeout is None else timeout,
             )
         with self._session_lock:
-            self._find_own_endpoint(name)
+            self._set_own_endpoint(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
             failure = self._send_outgoing()
         if failure is not None and pending.done and pending.failure is None:
@@ -294,8 +294,8 @@ class LiveInput(DeviceInput):
                 remarks = []
             raise type(error)("; ".join([str(error), *remarks])) from None
 
-    def _find_own_endpoint(self, name: str) -> None:
-        """Set address and port of the session, if a command contains them."""
+    def _set_own_endpoint(self, name: str) -> None:
+        """Set `host` and `port` of the session, if a command contains them."""
         command = self.sensor.commands.get(name)
         if command is not None and command.has_own_port:
             self._session.port = self._captures["data"].transport.own_port
@@ -555,7 +555,7 @@ class LiveInput(DeviceInput):
         with self._session_lock:
             names = self.sensor.on_open if self._was_opened else ()
             for name in names:
-                self._find_own_endpoint(name)
+                self._set_own_endpoint(name)
             self._restart_replies += [
                 self._session.request(name, self._clock.now()) for name in names
             ]

@@ -167,7 +167,7 @@ class SenderFilter(SenderCheck):
     def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
         """Return the frames from the ports of the sensor, and count the other frames.
 
-        The other ports at the address of the sensor belong to other sensors.
+        Frames from other ports at the same address are those of other sensors.
 
         Args:
             sent: the type and the sender of each frame. If one sender sent all frames, each type is

@@ -184,7 +184,7 @@ class ExpectedReply:
         ]
 
     def overlaps(self, other: ExpectedReply) -> bool:
-        """Return whether a frame could be the reply to both requests."""
+        """Return whether the same frame could be the reply to this and to another request."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -259,7 +259,7 @@ class _PendingCommand:
 
     @property
     def max_reply_delay(self) -> int:
-        """The time after each sending until which a late reply can arrive, ns."""
+        """The maximum time from a sending of the command to a late reply, ns."""
         return 2 * max(self.timeout, _to_ns(self.command.timeout))
 
 

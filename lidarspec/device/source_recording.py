@@ -113,7 +113,7 @@ class TimedLog:
         return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record sent data, and received data until the limit."""
+        """Record sent data, and received data until the time limit."""
         if direction == "in" and chunk.at is not None:
             if self.first is None:
                 self.first = chunk.at
@@ -365,7 +365,7 @@ class SourceRecording:
 def _next_arrival_times(device: Device) -> NDArray[np.int64]:
     """Return the arrival times of the next packets, (n,) ns since 1970.
 
-    If the sensor has no points, they are the arrival times of its main frames.
+    If the sensor has no points, they are the arrival times of `Sensor.main_frames`.
     """
     if device.sensor.has_points:
         packets = next(device.packets(wait=CHECK_PERIOD_S), None)

@@ -127,7 +127,7 @@ class HexText:
             raise ValueError("a comment begins with /* but does not end")
 
     def _read_form(self, text: str) -> Chunk | None:
-        """Return the bytes and the time of a line of `FORMS`; None for other lines.
+        """Return the bytes and the time of a line in one of the `FORMS`, else None.
 
         Raises:
             ValueError: if the line comes from another bus or sender than the lines before, or if

@@ -322,7 +322,7 @@ class Served(ClosingContext):
             raise failures[0]
 
     def delay(self, seconds: float) -> None:
-        """Hold back the data of the next `seconds`, and send all of it at their end."""
+        """Hold back all data for `seconds`, and then send it at once."""
         get_now = self._clock or time.monotonic_ns
         self._call_in_thread(lambda: self.device.delay_output(seconds, get_now()))
 
@@ -366,7 +366,10 @@ class Served(ClosingContext):
             raise self._failure
 
     def _call_in_thread(self, function: Callable[[], None]) -> None:
-        """Call a function between two passes of the loop, and wait for the next pass."""
+        """Call a function in the serving thread, and wait until it was called.
+
+        It is called between two passes of the loop.
+        """
         self._calls.put(function)
         while not self._calls_done.acquire(timeout=_PASS_TIMEOUT_S):
             if not self._thread.is_alive():

@@ -602,7 +602,9 @@ def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | N
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return a warning if a receive buffer is smaller than requested; else [].
+    """Return a list with a warning if a receive buffer is smaller than requested.
+
+    Otherwise, the list is empty.
 
     Args:
         requested: the requested size, in bytes.
