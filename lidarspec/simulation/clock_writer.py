@@ -369,7 +369,7 @@ class FrameClock:
             )
 
     def check_status(self) -> None:
-        """Raise UsageError if these frames, which have the status, cannot show a lost lock."""
+        """Raise UsageError if the status in these frames cannot report a lost lock."""
         status = self._status  # raises UsageError
         assert status is not None, self._frame
 

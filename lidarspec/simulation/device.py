@@ -157,7 +157,10 @@ class ReplyMaker:
         self._decoders = {link: _command_decoder(sensor, link) for link in links}
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
-        """Return the commands that received bytes complete; ignore other bytes."""
+        """Return the commands whose last bytes are in the received bytes.
+
+        Bytes that are not part of a command are ignored.
+        """
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
@@ -196,7 +199,10 @@ class ReplyMaker:
         return ReplyPart(name, self._frames.make(name, given))
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
-        """Return the physical values that a reply copies from its request, or must have."""
+        """Return a reply's fixed values, and the values that it repeats from its request.
+
+        The values are physical.
+        """
         fields = get_codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
@@ -530,7 +536,7 @@ class SimulatedDevice:
         self._replies.use_timeline(self._timeline)
 
     def delay_output(self, seconds: float, now: int) -> None:
-        """Hold back the data of the next `seconds`, and send all of it at their end."""
+        """Hold back all data for `seconds`, and then send it at once."""
         self._late_until = now + round(seconds * SECOND)
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:

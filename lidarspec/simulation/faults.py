@@ -110,8 +110,8 @@ class FaultyLink:
 
     Attributes:
         sent: number of packets that were passed to `transmit`.
-        intact: number of packets that arrived without a corrupt byte. lost: number of packets that
-            were dropped.
+        intact: number of packets that arrived without a corrupt byte.
+        lost: number of packets that were dropped.
 
     Raises:
         UsageError: if a byte stream is to be reordered.

@@ -51,7 +51,8 @@ class Scene(Protocol):
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: x, y and z of the start of the beams, metres; each broadcasts against the beams.
+            origin: x, y and z of the start of the beams, metres. Each coordinate broadcasts against
+                the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
 
@@ -143,7 +144,8 @@ class Room:
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: x, y and z of the start of the beams, metres; each broadcasts against the beams.
+            origin: x, y and z of the start of the beams, metres. Each coordinate broadcasts against
+                the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
         level = np.cos(elevation)

@@ -93,8 +93,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: index of the points that the field determines, in those last axes of the points that
-            the field does not have.
+        inner: the points may have more axes than the field. This is the index, in these last axes,
+            of the points that the field determines.
         step: metres per raw step; None if it differs between packets, for example because of a
             value in the header or a calibration.
         zero: range of the raw value 0, metres.
@@ -482,9 +482,10 @@ class PointPlacement(Measurement):
         return raw_values
 
     def _probe_coordinates(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
-        """Return the coordinates if all fields are 0, and if one field has a probe value.
+        """Return the coordinates for several sets of field values.
 
-        The list has one array for all fields 0, and one array for each probed field. Each array has
+        In the first set, all fields are 0. In each other set, one field has a probe value and all
+        others are 0. Each array has
         the shape (3, n, ...). The table is restored afterwards.
         """
         before = {path: table.raw(path) for path in paths}
@@ -898,7 +899,7 @@ class FrameSimulation:
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
 
     def _with_points(self, table: CompiledTable) -> CompiledTable:
-        """Return the rows with points: the frames, or the parts in the frames."""
+        """Return a table whose rows have points: the frames, or the parts of the frames."""
         if self._parts:
             return PartRows(table, self._parts)
         return table
@@ -918,7 +919,7 @@ class FrameSimulation:
             return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
     def _angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a frame that would not change if the rotor did not turn."""
+        """Return those values of a frame that change only because the rotor turns."""
         fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
         assert rule is not None  # as of every sensor with points
@@ -1011,7 +1012,7 @@ class FramesWithoutPoints:
 
 
 def find_periodic_rates(sensor: Sensor) -> dict[str, float]:
-    """Return {type: rate in Hz} of the frames without points that are sent periodically."""
+    """Return {type: rate in Hz} of the periodic frames without points."""
     return {
         name: frame.simulation.rate
         for name, frame in sensor.incoming.items()
