@@ -307,7 +307,8 @@ class _Builder:
         )
         value = self.node(con.subcon, inside)
         size = tree.size(value)
-        unknown = tree.Untraced(f"{info.path}: the offset of a part of unknown size", "?")
+        reason = "RawCopy is used in an array, or contains or follows a part of unknown size"
+        unknown = tree.Untraced(f"{info.path}: {reason}", "?")
         start = None if place.offset is None else place.offset()
         end = tree.combine("+", start, size)
         for name, content in {"offset1": start, "offset2": end, "length": size}.items():
