@@ -176,7 +176,10 @@ def _check_permission(port: str) -> Iterator[Diagnosis]:
 
 
 def _udev_rule_command(port: str) -> str:
-    """Return a command that adds a udev rule, so that all users may open such ports."""
+    """Return a command that adds a udev rule.
+
+    All users may then open this port and ports of the same kind.
+    """
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"

@@ -151,7 +151,7 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
     """Return related models that have sent the frames instead, as {id: difference}.
 
-    More than half of the packets have a property that only such a model has.
+    A model is returned if more than half of the packets have a property that only this model has.
     """
     distinct_relatives = {
         name: relative

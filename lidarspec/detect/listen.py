@@ -125,7 +125,9 @@ def read_samples(
         ports = ",".join(map(str, list_udp_ports()))
         if not ports:
             example = with_option(text, "port", EXAMPLE_PORT)
-            raise SourceError(f"{text}: no installed sensor declares a port; add one: {example}")
+            raise SourceError(
+                f"{text}: no installed sensor declares a port; add a port to the source: {example}"
+            )
         yield from _read_sample(with_option(text, "port", ports), seconds, None, text)
     else:
         baud = None
@@ -156,7 +158,10 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
 
 
 def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a tuple with a warning if all datagrams came from other senders, else ()."""
+    """Return a warning if no datagram came from the requested sender.
+
+    The result is a tuple, which is empty without a warning.
+    """
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)

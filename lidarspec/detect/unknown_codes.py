@@ -15,7 +15,7 @@ MAX_PARSED_FRAMES = 4
 
 
 def find_unknown_codes(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return a text for each field outside of arrays with a code that has no name.
+    """Return a text for each unnamed code in the fields that are not in arrays.
 
     A code of 0 is ignored, because sensors often leave fields that they do not use at 0.
     """

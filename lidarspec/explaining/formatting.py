@@ -90,7 +90,8 @@ class FieldValue:
         unit: the unit; "" if the field has none.
         digits: number of decimals to print; None for a float field.
         label: the name of the raw value; "" if it has none.
-        is_unknown: whether this raw value has no name, but others of the field have names.
+        is_unknown: whether this raw value has no name although other values of the field have
+            names.
         bits: a text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
         docs: the documentation of the field.
         start: offset of the first byte in the frame.
@@ -484,7 +485,7 @@ def describe_declared_clock(clock: Clock) -> str:
 
 
 def describe_declared_status(clock: Clock) -> str:
-    """Return the field with the state of a clock, and the meaning of its values, in Markdown."""
+    """Return the field with a clock's state and the meaning of its values, as Markdown."""
     status = clock.status
     assert status is not None
     if callable(status.source):

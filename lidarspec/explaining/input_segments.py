@@ -115,7 +115,7 @@ def iter_pieces(
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor with a frame type that is first, incoming, and has no `after`."""
+    """Return the sensor with a frame type moved first, incoming and without `after`."""
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
