@@ -189,7 +189,11 @@ def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Return a list of the piece with its number of scans, and the next piece if any."""
+    """Count the scans of a piece.
+
+    Returns a list with the piece, which has the number of its scans, and with the next piece, if
+    there is one.
+    """
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -611,7 +615,10 @@ def _iter_results(
 
 
 def _is_large(piece: FilePiece) -> bool:
-    """Return whether a file is larger than a piece; False if its size is unknown."""
+    """Return whether a file must be cut, because it is larger than a piece.
+
+    Returns False if its size is unknown, or if the selection needs all scans of a file.
+    """
     if piece.select.needs_all_scans:
         return False
     with contextlib.suppress(LidarSpecError):

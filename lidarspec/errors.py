@@ -146,7 +146,7 @@ def printable(text: str) -> str:
 
 
 def shown_path(file: str) -> str:
-    """Return a path below the working directory as a relative path, others unchanged."""
+    """Return a path as text; it is relative if it is below the working directory."""
     if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
         return os.path.relpath(file)
     return file

@@ -53,12 +53,12 @@ class LeapSeconds:
     path: str = ""
 
     def tai_minus_utc(self, utc_s: float) -> int:
-        """Return TAI minus UTC in seconds at a time, seconds since 1970 in UTC."""
+        """Return TAI minus UTC in seconds at a UTC time (seconds since 1970)."""
         index = bisect_right(self.starts_s, utc_s) - 1
         return self.offsets_s[max(index, 0)]
 
     def gps_minus_utc(self, utc_s: float) -> int:
-        """Return GPS time minus UTC in seconds at a time, seconds since 1970 in UTC."""
+        """Return GPS time minus UTC in seconds at a UTC time (seconds since 1970)."""
         return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
 
     def scale_offsets(self, utc_s: float) -> dict[str, int]:
@@ -88,7 +88,7 @@ class LeapSeconds:
         return utc_s
 
     def has_expired(self, utc_s: float) -> bool:
-        """Return whether the table may lack leap seconds before a time, seconds since 1970."""
+        """Return whether the table may lack leap seconds before a time, s since 1970."""
         return self.expires_s is not None and utc_s >= self.expires_s
 
 

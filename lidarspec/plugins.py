@@ -592,7 +592,7 @@ class Registry:
         return replace(sensor, frames=frames, points=ask(sensor.points), hooked=self.apply_hooks)
 
     def call(self, hook: str, **arguments: Any) -> Any:
-        """Call another hook and return its result."""
+        """Call the hook with this name in all plugins, and return its result."""
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _apply_checksum_hooks(self, sensor: Sensor, frame: Frame) -> Frame:
@@ -750,7 +750,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
 
 def _describe_location(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER", where a thread imports a module; "" if unknown."""
+    """Return where a thread imports a module: " at FILE, line NUMBER"; "" if unknown."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -921,8 +921,8 @@ def _try_loading(*homes: Home) -> tuple[str, str]:
 def load_alone() -> None:
     """Load the plugins in `sys.argv`, print the threads that keep running, and exit.
 
-    `_try_loading` runs this function in a process. In the output, a marker precedes the names of
-    the threads.
+    `_try_loading` runs this function in another process. In the output, a marker precedes the names
+    of the threads.
     """
     import faulthandler
 

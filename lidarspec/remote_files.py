@@ -217,9 +217,9 @@ def _failures(url: str) -> Iterator[None]:
 
 
 def _failure_reason(url: str, error: Exception) -> str:
-    """Return the reason of a store's failure.
+    """Return the reason why a store failed.
 
-    Many drivers report only the URL or path of a missing file.
+    Many drivers report only the URL or path of a missing file, which is not a reason.
     """
     text = str(error)
     if (
