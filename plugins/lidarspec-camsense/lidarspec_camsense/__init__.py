@@ -117,9 +117,9 @@ def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
 
 
 def configure(sensor: Sensor, *, zero: Literal["data", "housing"] = "data") -> Sensor:
-    """Return the X1 with angles from the zero of the data or of the housing.
+    """Return the X1 with angles from the zero direction of the data or the housing.
 
-    The vendor's SDK counts from the zero of the housing.
+    The vendor's SDK counts angles from the zero direction of the housing.
     """
     offset = HOUSING_ZERO_DEG if zero == "housing" else 0.0
     return dataclasses.replace(sensor, points=partial(points, count=8, zero=offset))

@@ -97,7 +97,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the points, converted from the axes right, ahead, up to ahead, left, up."""
+    """Return the points, converted from axes (right, ahead, up) to (ahead, left, up)."""
     members = f.points
     return Cartesian(
         members.y,

@@ -300,9 +300,10 @@ def configure(
     *,
     zero: Literal["data", "housing"] = "data",
 ) -> Sensor:
-    """Return the sensor with angles from the zero of the data or of the housing.
+    """Return a sensor with angles from the zero direction of the data or the housing.
 
-    The data on the wire count from the zero of the data, which is 12 degrees clockwise from the
+    The angles in packets count from the zero direction of the data, which is 12 degrees clockwise
+    from the
     mark on the housing. Source: manual 2.2.2, bytes 13 and 14, for the angle; its edition v1.1,
     page 4, for the direction. Whether the host should add the angle is not documented.
     """
@@ -367,7 +368,7 @@ class Turning:
 
 
 def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
-    """Return the values from packet i on, with another speed after the current revolution.
+    """Return the values from packet i on, with a new speed after this revolution.
 
     Args:
         sweep: the values so far.
@@ -445,7 +446,10 @@ def has_bits_beside_firmware(f: Fields) -> Any:
 
 
 def reports_firmware(f: Fields) -> Any:
-    """Return whether an acknowledgement contains the firmware (manual 2.1.3; SDK for 5C)."""
+    """Return whether an acknowledgement contains the firmware.
+
+    Source: manual 2.1.3; SDK for 5C.
+    """
     return ((f.mode == 0x50) | (f.mode == 0x5C)) & (f.firmware > 0)
 
 

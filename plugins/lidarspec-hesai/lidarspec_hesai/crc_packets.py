@@ -188,10 +188,10 @@ def distance(f: Fields) -> Any:
 
 
 def packet_values(values: dict[str, Any], **more: int) -> dict[str, Any]:
-    """Return the values of a simulated packet with single return and a sequence.
+    """Return the values of a simulated packet with single return and the UDP sequence.
 
     Args:
-        values: the values of the packet; azimuths are moved into the body.
+        values: the values of the packet. Paths that begin with `blocks` are moved below `body`.
         more: further flags and fields of the header.
     """
     flags = {

@@ -70,9 +70,9 @@ VALUE_REPLIES = {f"get_{name}": name for name in REPORTED_VALUES}
 
 @dataclass(frozen=True)
 class LineCheck(Checksum):
-    """The lowest six bits of the sum of a line's characters, plus 30 in hexadecimal.
+    """The check character of a line: the lowest six bits of a sum, plus 0x30.
 
-    The semicolon at the end of the line is not part of the sum.
+    The sum is that of all characters of the line, except the semicolon at its end.
     """
 
     width: int = 8

@@ -129,9 +129,10 @@ def points(f: Fields, rate: int, *, correct_parallax: bool = False) -> Polar:
     Args:
         f: the fields of n frames.
         rate: points per second.
-        correct_parallax: convert the angles of a triangulating model.
+        correct_parallax: whether to convert angles at the receiver to angles around the axis of
+            rotation, which a model that measures by triangulation needs.
 
-    Source: manual 3.2.
+        Source: manual 3.2.
     """
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
     if correct_parallax:
@@ -168,7 +169,7 @@ def make_id(name: str) -> str:
 
 
 def matches_rate(f: Fields, rate: int) -> Any:
-    """Return whether `rate` fits the speed and angles of a frame best of all rates.
+    """Return whether `rate` is the rate that best fits a frame's speed and angles.
 
     `rate` is in points per second.
     """
@@ -233,8 +234,7 @@ def make_lidar(
     Args:
         name: a key of `POINT_RATES_HZ`.
         turns: simulated revolutions per second.
-        correct_parallax: convert the angles of a triangulating model.
-        older_rate: points per second of older units.
+        correct_parallax: as for `points`. older_rate: points per second of older units.
         frames: the frames other than the data.
         more: further arguments of `Sensor`.
     """

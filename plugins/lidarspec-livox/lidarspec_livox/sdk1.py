@@ -149,7 +149,10 @@ def make_packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Return four exact terms of the time in seconds, from a date or from nanoseconds."""
+    """Return four exact terms whose sum is the time in seconds.
+
+    A packet contains the time as a date or as nanoseconds.
+    """
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high

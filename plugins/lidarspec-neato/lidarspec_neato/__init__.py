@@ -151,7 +151,7 @@ XV11_DIRECTIONS = {"neato-xv11": 1, "xiaomi-lds01rr": 1, "xiaomi-lds02rr": -1}
 
 
 def describe_differences(own: str) -> dict[str, str]:
-    """Return id -> the difference to this model, of each model with the packets of an XV-11."""
+    """Return how models with the packets of an XV-11 differ from one of them, by id."""
     texts = {}
     for other, direction in XV11_DIRECTIONS.items():
         if other == own:

@@ -152,7 +152,7 @@ MS200 = Sensor(
         "ldrobot-ld14p": IDENTICAL,
     },
     status="manual",
-    source="the vendor's SDK and node in oradar_lidar (see the module)",
+    source="the vendor's SDK and its ROS node, as published with oradar_lidar",
 )
 
 

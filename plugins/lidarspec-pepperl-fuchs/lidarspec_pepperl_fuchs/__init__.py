@@ -379,10 +379,7 @@ R2000 = Sensor(
     vendor_axes=("forward", "left", "up"),
     turn=(10, 50),
     status="manual",
-    source=(
-        "R2000 Ethernet communication protocol 1.04; pf_lidar_ros_driver and pepperl_fuchs_r2000"
-        " (see the module)"
-    ),
+    source="R2000 Ethernet communication protocol 1.04; pf_lidar_ros_driver; pepperl_fuchs_r2000",
 )
 
 

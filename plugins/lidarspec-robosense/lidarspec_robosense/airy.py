@@ -205,7 +205,7 @@ def is_plausible_imu(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return the points of 96 lasers; the second block of a pair has the upper half."""
+    """Return the points of 96 lasers; the second block of a pair has the upper 48."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
     difop = f.state.difop

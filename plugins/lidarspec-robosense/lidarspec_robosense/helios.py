@@ -188,7 +188,7 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether two blocks have the same azimuth, as two returns have."""
+    """Return whether pairs of blocks have the same azimuth, as with two returns."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 

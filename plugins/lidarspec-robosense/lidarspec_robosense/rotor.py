@@ -2,8 +2,8 @@
 
 DIFOP, the device information, contains the configured speed, the return mode and the angles of each
 laser of the unit. It has three layouts. RS-LiDAR-16, -32 and RS-Bpearl have the first layout, and
-Helios has the second. The Ruby family has the beginning of the second and the end of the first, for
-128 lasers.
+Helios has the second. The layout of the Ruby family begins like the second layout and ends like the
+first layout, with 128 lasers.
 
 Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hpp: layouts,
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
@@ -318,8 +318,9 @@ def make_points(
 ) -> Polar:
     """Return the points of lasers with an optical centre away from the axis.
 
-    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). Until the first
-    valid step between the azimuths of shots, the step is computed from the speed in DIFOP.
+    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step from one
+    shot to the next is the difference of their azimuths. Until the first valid difference, it is
+    computed from the speed in DIFOP.
 
     Args:
         lasers: elevation, and the clockwise angle from the rotor's direction, in degrees.

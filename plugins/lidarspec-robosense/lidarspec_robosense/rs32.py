@@ -184,7 +184,7 @@ def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
 def points_16(f: Fields) -> Polar:
     """Return the points of blocks with two firings of 16 lasers each.
 
-    DIFOP contains only vertical angles, and no signs. The signs are the same in every unit.
+    DIFOP contains only the magnitudes of vertical angles. Their signs are the same in every unit.
     """
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
     return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))

@@ -156,9 +156,10 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 
 
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
-    """Return the firing time of each laser in seconds, for two rows of 16 times.
+    """Return the firing time of each laser in seconds.
 
-    The times are 3.236 us apart. `counts` has the number of lasers that fire at each time. Source:
+    There are 16 times, 3.236 us apart, and then the same 16 times again. `counts` has the number of
+    lasers that fire at each of these 32 times. Source:
     rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)

@@ -219,9 +219,9 @@ def common_columns(f: Fields) -> dict[str, Any]:
 def points(f: Fields, returns: bool = False) -> Polar:
     """Return a point of each channel.
 
-    As in rs_driver, the range is multiplied by the length of the vector, which is 1 except for
-    rounding. `returns` is whether blocks contain the number of the return. If they do, two packets
-    contain the returns of the same firings, which is assumed because it is so for the M1.
+    As in rs_driver, the range is multiplied by the length of the direction vector, which is 1
+    except for rounding. `returns` is whether blocks contain the number of the return. In this case,
+    it is assumed that two packets contain the returns of the same firings, as in the M1.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
@@ -259,7 +259,8 @@ def imu(f: Fields) -> Imu:
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
     """Return the values of simulated packet i.
 
-    Lines run to and fro, from the top to the bottom; each channel scans an equal part of a line.
+    Lines run back and forth, from the top to the bottom; each channel scans an equal part of a
+    line.
     """
     number = i % model.packets
     time = i / (model.packets * FRAME_RATE_HZ)

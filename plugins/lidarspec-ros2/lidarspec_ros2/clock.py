@@ -1,4 +1,7 @@
-"""The stamps of messages, in ROS's time, from the sensor's clock or arrival times."""
+"""Calculate the stamps of messages in ROS's time.
+
+They are calculated from the times of the sensor's clock, or from arrival times.
+"""
 
 from __future__ import annotations
 

@@ -230,7 +230,7 @@ class Settings:
     """The values of the parameters, by name.
 
     Raises:
-        UsageError: if a value is invalid for all sensors.
+        UsageError: if a value is invalid whatever the sensor is.
     """
 
     values: Mapping[str, Any]

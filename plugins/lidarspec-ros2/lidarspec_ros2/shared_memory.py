@@ -110,7 +110,7 @@ def choose_shared_memory(
 
 
 def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
-    """Return the shared memory for clouds of a size; the size is None if unknown."""
+    """Choose the shared memory for clouds of at most `cloud_bytes`; None if unknown."""
     assumed = ASSUMED_CLOUD_BYTES if cloud_bytes is None else cloud_bytes
     if MIN_CLOUDS * assumed <= DEFAULT_SEGMENT_BYTES:
         return SharedMemory(max_cloud_bytes=DEFAULT_SEGMENT_BYTES // MIN_CLOUDS)

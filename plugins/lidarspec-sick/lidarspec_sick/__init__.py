@@ -1,4 +1,5 @@
-"""SICK scanners with LMDscandata, multiScan and picoScan with compact telegrams, microScan3."""
+"""SICK scanners: models with LMDscandata, multiScan and picoScan (compact telegrams),
+microScan3."""
 
 from __future__ import annotations
 

@@ -226,5 +226,5 @@ MICROSCAN3 = Sensor(
     info={"serial": "data.serial"},
     range_limits=(0.1, 64.0),
     status="manual",
-    source="sick_safetyscanners (see the module); the port is assumed",
+    source="the vendor's driver sick_safetyscanners; the port is an assumption",
 )

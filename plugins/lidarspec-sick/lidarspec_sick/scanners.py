@@ -151,9 +151,10 @@ def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
 
 
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
-    """Return the scanner for commands in CoLa A or B, and a number of echoes.
+    """Return the scanner with commands in CoLa A or B, and with a number of echoes.
 
-    Scans are read in CoLa A and in CoLa B, with one echo or with `echoes` echoes, by default all.
+    Scans in CoLa A and in CoLa B are read, with one echo or with `echoes` echoes. If `echoes` is 0,
+    it is the maximum of the scanner.
 
     Raises:
         UsageError: if the scanner has fewer echoes.

@@ -131,7 +131,7 @@ def make_stream_descriptor(kind: int, size: int) -> Frame:
 
 
 def is_config_plausible(f: Fields) -> Any:
-    """Return whether the length agrees with the width of the value, if it is known."""
+    """Return whether the length agrees with the value's width, if this width is known."""
     size = take(_VALUE_BYTES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 

@@ -64,7 +64,7 @@ SIMULATED_QUALITY = 47
 
 
 def make_nibbles(sync: int) -> Construct:
-    """Return the struct of a sync nibble above a nibble of the checksum."""
+    """Return the struct of a byte with a sync nibble, and below it a checksum nibble."""
     return BitStruct("sync" / Const(sync, BitsInteger(4)), "checksum" / BitsInteger(4))
 
 
@@ -191,12 +191,13 @@ def dense_points(f: Fields) -> Polar:
 
 
 def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
-    """Return a predicted distance in mm; 0 for two predictions that mean no return.
+    """Return a predicted distance in mm; 0 if the prediction means no return.
 
     Args:
         base: the reference distance in mm.
-        level: the level of the reference's code.
-        prediction: the difference in steps of that level.
+        level: the level of the code from which the reference distance was decoded.
+        prediction: the difference from the reference in steps of 2**level mm; 511 and -512 mean no
+            return.
     """
     return np.where(
         (prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level)

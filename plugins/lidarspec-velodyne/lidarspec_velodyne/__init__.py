@@ -172,8 +172,8 @@ VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 def make_vls128_firings(returns: int) -> Firings:
     """Return the firing pattern for 1 or 2 returns.
 
-    The 128 lasers are in four blocks, or in four pairs of blocks with dual return. Eight lasers
-    fire at once, and a pause follows eight such groups.
+    The 128 lasers are in four blocks, or in four pairs of blocks with dual return. Lasers fire in
+    groups of eight at once. After eight groups there is a pause.
     """
 
     def fill_blocks(values: Any) -> Any:

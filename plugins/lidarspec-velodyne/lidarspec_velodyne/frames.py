@@ -192,7 +192,9 @@ CLOCK_STATUS = ClockStatus(
 
 
 def nmea_seconds(f: Fields) -> Any:
-    """Return the seconds since 1970 of the first valid sentence; nan for all others.
+    """Return the seconds since 1970 in the first valid sentence.
+
+    The result has this value for the packet with the sentence, and nan for all other packets.
 
     A sentence is only valid if the clock is locked to the PPS.
     """

@@ -299,8 +299,7 @@ class Broadcast:
     def _read(self, read: Callable[[], None]) -> None:
         """Read from the feed.
 
-        If the source was moved beyond the end of a file, no packets are selected, which is not an
-        error.
+        A seek beyond the end of a file selects no packets, which is not an error.
         """
         try:
             read()
@@ -327,7 +326,7 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Store a new scan, new statistics and the end of a file; call `news` on changes."""
+        """Store what is new: a scan, statistics, the end of a file; then call `news`."""
         has_news = self._update_scan()
         if self._update_figures():
             has_news = True

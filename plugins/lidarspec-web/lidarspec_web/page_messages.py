@@ -74,7 +74,7 @@ class PageMessages:
 
         Args:
             frozen: whether the page has paused a live source.
-            since: the number of damaged pieces that the page has received so far.
+            since: the number of `DamagedBytes` that the page has received so far.
             at: the scan at which the page is paused; by default the newest scan.
         """
         broadcast = self.broadcast
@@ -153,7 +153,7 @@ class PageMessages:
         return self.frame(stored, "point", point_origin)
 
     def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
-        """Return a damaged piece with the changes that would explain the damage."""
+        """Return the damaged bytes with a number, and the changes that would explain them."""
         piece = backlog.find_damaged(number)
         if piece is None:
             return _discarded_reply(f"damaged piece {number}")
@@ -189,7 +189,7 @@ class PageMessages:
 
         Raises:
             UsageError: if commands are not sent, or an argument is missing or invalid.
-            CommandError: if the sensor refuses it or does not reply.
+            CommandError: if the sensor refuses the command or does not reply.
         """
         if self.why_no_control:
             raise UsageError(self.why_no_control)
@@ -217,7 +217,7 @@ class PageMessages:
         return (at - began_ns) * 1e-9
 
     def _list_damaged(self, since: int) -> list[dict[str, Any]]:
-        """Return the newest damaged pieces whose number is at least `since`."""
+        """Return the newest damaged bytes whose number is at least `since`."""
         backlog = self.broadcast.backlog
         return [
             {

@@ -36,10 +36,10 @@ MAX_DAMAGED_BYTES = 1 << 13
 
 @dataclass(frozen=True)
 class DamagedBytes:
-    """Bytes outside valid frames: a damaged frame, or other bytes.
+    """A damaged piece: consecutive bytes of the input that are not in valid frames.
 
     Attributes:
-        number: number of the damaged piece, from 0.
+        number: number of this piece among all damaged pieces, from 0.
         offset: offset in the input.
         size: number of bytes.
         at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
@@ -137,7 +137,7 @@ class RecentBytes:
 
     Attributes:
         sensor: the sensor that sends the bytes.
-        damaged: number of damaged pieces so far.
+        damaged: number of damaged pieces (`DamagedBytes`) so far.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -185,7 +185,7 @@ class RecentBytes:
             self._end = 0
 
     def freeze(self) -> RecentBytes:
-        """Return a copy of the current frames and damaged pieces, which does not change."""
+        """Return an unchanging copy of the stored frames and damaged bytes."""
         copy = RecentBytes(self.sensor)
         with self._lock:
             copy._results = deque(self._results)
@@ -227,18 +227,18 @@ class RecentBytes:
         return StoredFrame(None, point_origin.frame, point_origin.host_ns or -1, point_origin.data)
 
     def find_damaged(self, number: int) -> DamagedBytes | None:
-        """Return a damaged piece by its number; None if it is no longer stored."""
+        """Return damaged bytes by their number; None if they are no longer stored."""
         return next((piece for piece in self.list_damaged(number) if piece.number == number), None)
 
     def list_damaged(self, number: int) -> list[DamagedBytes]:
-        """Return the stored damaged pieces whose number is at least `number`."""
+        """Return the stored `DamagedBytes` whose number is at least `number`."""
         with self._lock:
             return [piece for piece in self._damaged if piece.number >= number]
 
     def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
-        """Return the explanation of a damaged piece, as `Explanation.to_dict` returns it.
+        """Return the explanation of damaged bytes, in the form of `Explanation.to_dict`.
 
-        It has the rows of each damaged frame in the piece, with the change that would explain the
+        It has the rows of each damaged frame in these bytes, with the change that would explain the
         damage, and the rows of the bytes between these frames.
         """
         parts = list(

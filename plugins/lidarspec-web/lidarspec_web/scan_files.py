@@ -89,7 +89,10 @@ class ScanSaver:
             path.unlink()
 
     async def _write(self, path: Path, shown: ShownScan) -> None:
-        """Write a scan, after the previous one and an equally long pause for open pages."""
+        """Write a scan, after a pause that is as long as the previous scan took to write.
+
+        The pause leaves processor time to open pages.
+        """
         loop = asyncio.get_running_loop()
         async with self._writing:
             await asyncio.sleep(self._rests_until - time.monotonic())
