@@ -289,7 +289,7 @@ def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]
         return []
     axis, kind_name, _ = location
     struct = frame_coder(frame).decode(data).struct
-    examined = examine(frame.tree, struct, frame.room)
+    examined = examine(frame.tree, struct, frame.max_struct_bytes)
     node = make_schema(frame.tree).parts[axis]
     kind = next(kind for kind in node.kinds if kind.name == kind_name)
     return [part.prefix for part in examined.parts_of(axis) if part.root is kind.root]

@@ -396,7 +396,7 @@ def format_argument_type(kind: Taken, between: str = "..") -> str:
     """Return the range of a numeric command argument, or the type of any other."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
-    return kind.words(None)
+    return kind.describe(None)
 
 
 def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:

@@ -75,7 +75,7 @@ class FrameRows:
         """
         if isinstance(frame_layouts(frame), NotCompilableError):
             return plain_fields(frame, struct)
-        examined = examine(frame.tree, struct, frame.room)
+        examined = examine(frame.tree, struct, frame.max_struct_bytes)
         with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
             self._verdicts = {seal.path: _describe_checksum(seal) for seal in examined.seals()}
         fields = list(examined.fields())

@@ -596,7 +596,7 @@ class _KaitaiWriter:
     def _physical(
         self, kaitai: _KaitaiType, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
     ) -> None:
-        """Add instances with the physical value and the name of a field that has them."""
+        """Add instances for the physical value and the name of a field, if it has them."""
         own = identifier(name or info.name)
         if info.labels and own:
             kaitai.enums[own] = _make_enum(info.labels)

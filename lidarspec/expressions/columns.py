@@ -70,6 +70,8 @@ class Batch:
         defaults: the declared defaults of state columns, by frame type and path.
         carry: values from the previous batch, for each call of `previous` or `last`, by the number
             of the call.
+        nominal: whether a declared default of a state column was used.
+        left: for each such call, a function that returns the values for the next batch.
     """
 
     table: Table

@@ -89,7 +89,7 @@ def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 
 def _make_scan_fields(path: Path | None) -> list[Any]:
-    """Return the fields about the scan of a point, except those that the path gives."""
+    """Return the fields about the scan of a point that are not in the path."""
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
     named = {part.partition("=")[0] for part in folders if "=" in part}

@@ -57,10 +57,11 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
 
     Points have coordinates, intensity, time, ring (as row), column, return, and the additional
     columns. `timeStamp` is in seconds since acquisitionStart, which is the stamp of the scan as GPS
-    time with 18 leap seconds. `returnCount` of each point is the maximum of the scan. Additional
-    columns have names of an extension, lidarspec:NAME, which other readers ignore; the description
-    of the scan has their units. With `every_point`, a point without a return has the coordinates 0
-    and cartesianInvalidState 2. The library keeps the headers in memory until the file is closed.
+    time with 18 leap seconds. `returnCount` of each point is the largest number of returns in the
+    scan. Additional columns have names of an extension, lidarspec:NAME, which other readers ignore;
+    the description of the scan has their units. With `every_point`, a point without a return has
+    the coordinates 0 and cartesianInvalidState 2. The library keeps the headers in memory until the
+    file is closed.
     """
     pye57 = import_library("pye57", "e57")
     libe57 = import_library("pye57.libe57", "e57")

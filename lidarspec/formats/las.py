@@ -50,9 +50,10 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
 
     `intensity` is the raw value, rounded and limited to 65535. The stamp is interpreted as a time
     since 1970. It is written as adjusted standard GPS time with 18 leap seconds, exact to 0.1
-    microseconds. `number_of_returns` of each point is the maximum of the scan. With `every_point`,
-    a point without a return has the flag "withheld" and the coordinates of the file's offset,
-    because LAS has no nan. Range and angles are omitted, because they follow from the coordinates.
+    microseconds. `number_of_returns` of each point is the largest number of returns in the scan.
+    With `every_point`, a point without a return has the flag "withheld" and the coordinates of the
+    file's offset, because LAS has no nan. Range and angles are omitted, because they follow from
+    the coordinates.
 
     Raises:
         UsageError: if a coordinate is more than 214 km from the offset, which 32-bit steps cannot

@@ -245,7 +245,7 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
         data = kind.pack(value, slot.length)
     except ValueError:
         raise UsageError(
-            f"{place}: {argument} must be {kind.words(slot.length)}, not {value!r:.60}"
+            f"{place}: {argument} must be {kind.describe(slot.length)}, not {value!r:.60}"
         ) from None
     if info.kind == "other":
         if isinstance(value, bytes):

@@ -567,7 +567,7 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Return the value of a count field for which a formula is a given length.
+    """Return the value of a count field with which a formula is equal to a length.
 
     To find this value, the field is set to one value after another.
     """

@@ -1129,6 +1129,6 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
             raise NotCompilableError(
                 next(iter(endings)), "bytes up to a terminator, in a frame with a wire form"
             )
-        return HeaderTree(frame.tree, frame.room)
+        return HeaderTree(frame.tree, frame.max_struct_bytes)
     except NotCompilableError as reason:
         return reason

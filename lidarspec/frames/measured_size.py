@@ -131,7 +131,7 @@ class TextSize(MeasuredSize):
     def _find_few(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find` for a few frames, in steps of growing size."""
+        """Return the same as `_find` for a few frames, searched in steps of growing size."""
         step = len(self.ending.mark)
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)

@@ -186,7 +186,7 @@ def _find_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
             got=problem.got,
             data=data,
         )
-    examined = examine(frame.tree, decoded.struct, frame.room)
+    examined = examine(frame.tree, decoded.struct, frame.max_struct_bytes)
     return _find_field_fault(sensor, name, data, examined, decoded.offset)
 
 
@@ -261,7 +261,7 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
         except Exception:
             raise plain_fault(sensor, name, data) from None
     decoded = frame_coder(frame).decode(data)
-    examined = examine(frame.tree, decoded.struct, frame.room)
+    examined = examine(frame.tree, decoded.struct, frame.max_struct_bytes)
     shortage = _run_search(sensor, name, diagnose.find_shortage, examined)
     if shortage is not None or examined.layout is None:
         assert shortage is not None

@@ -522,11 +522,11 @@ class PartsSize(MeasuredSize):
         if not np.count_nonzero(cut_off):
             return None, values
         # These frames already have as many bytes as the longest frame.
-        is_whole_frame = cut_off & (
+        is_too_long = cut_off & (
             offsets + self.region.limit <= (len(buffer) if stops is None else stops)
         )
-        values[is_whole_frame] = -LENGTH
-        there = np.flatnonzero(~cut_off | is_whole_frame)
+        values[is_too_long] = -LENGTH
+        there = np.flatnonzero(~cut_off | is_too_long)
         return there, values[there]
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:

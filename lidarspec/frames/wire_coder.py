@@ -58,7 +58,7 @@ class Coder:
     """
 
     def __init__(self, frame: Frame) -> None:
-        known = find_prefix(frame.tree, frame.room)
+        known = find_prefix(frame.tree, frame.max_struct_bytes)
         self.begins = _join_bytes(
             {offset: value for offset, (mask, value) in known.items() if mask == 0xFF}
         )

@@ -6,7 +6,8 @@ rows of an array (`lidarspec.framing.regular_rows`). Otherwise the datagrams are
 type, each type with the datagrams that no earlier type has accepted. A datagram for which a plugin
 raises an error is checked alone, so that the other datagrams are not lost.
 
-The fragments of a message are joined before this (`lidarspec.framing.datagram_assembly`).
+The fragments of a message are joined before its frame type is found
+(`lidarspec.framing.datagram_assembly`).
 """
 
 from __future__ import annotations

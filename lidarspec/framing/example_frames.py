@@ -158,7 +158,7 @@ def _draw_header(
     values: dict[str, int] = {}
     while True:
         try:
-            return find_layout(frame.tree, values, frame.room), values
+            return find_layout(frame.tree, values, frame.max_struct_bytes), values
         except UnknownSelectorError as unknown:
             if isinstance(unknown.leaf, MeasuredSize):
                 raise SpecError(

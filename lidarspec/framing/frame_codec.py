@@ -40,7 +40,7 @@ class Codec:
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
         self.schema = make_schema(frame.tree)
-        self.prefix = find_prefix(frame.tree, frame.room)
+        self.prefix = find_prefix(frame.tree, frame.max_struct_bytes)
         self.marks = sort_constants(self.prefix)
         self.size = fixed_size(frame.prepared) or None
         self._conditions: StructConditions | None = None

@@ -153,7 +153,7 @@ class CompiledCodec(Codec):
         """
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:
-            is_fitting = stops - offsets <= self.frame.room
+            is_fitting = stops - offsets <= self.frame.max_struct_bytes
         kept = [(layout, which[is_fitting[which]]) for layout, which in groups]
         refused = (LayoutRefusal(), np.flatnonzero(~is_fitting))
         return [group for group in (*kept, refused) if len(group[1])]

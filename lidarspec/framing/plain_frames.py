@@ -56,7 +56,9 @@ class PlainCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        ends = np.minimum(offsets + self.frame.room, len(buffer) if stops is None else stops)
+        ends = np.minimum(
+            offsets + self.frame.max_struct_bytes, len(buffer) if stops is None else stops
+        )
         status = np.full(len(offsets), VALID, np.uint8)
         if self.frame.endless is not None:
             # The frame is the rest of a datagram: a stream or a longer datagram has no such frame.
@@ -97,7 +99,7 @@ class PlainCodec(Codec):
         except construct.CheckError:
             return IMPLAUSIBLE, 0
         except construct.StreamError:
-            return (LENGTH if len(data) >= self.frame.room else SHORT), 0
+            return (LENGTH if len(data) >= self.frame.max_struct_bytes else SHORT), 0
         except SpecError:
             raise
         except construct.ConstructError:

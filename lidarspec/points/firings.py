@@ -66,7 +66,10 @@ def _count_occurrences(*keys: NDArray[Any]) -> NDArray[np.intp]:
 
 
 def _find_changes(*keys: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return a mask of the points that differ from the point before in a key, (n,)."""
+    """Return a mask of the points with another key than the point before, (n,).
+
+    The key of a point consists of its values in all the arrays.
+    """
     changes = np.ones(len(keys[0]), np.bool_)
     changes[1:] = False
     for key in keys:

@@ -142,7 +142,7 @@ class ScanCutter:
     def _add(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int, points: EvaluatedPoints
     ) -> list[ScanCut]:
-        """Add packets without an end to the scan, and return cuts if it reaches its limits."""
+        """Add packets in which no scan ends; return cuts if the scan reaches its limits."""
         if start >= stop:
             return []
         part = counts.part(start, stop)

@@ -203,7 +203,7 @@ class TimeSlice:
 
     @property
     def time_until_start(self) -> int:
-        """The time from the first time to the start of the slice, ns."""
+        """The time from the first time of the stream to the start of the slice, ns."""
         if self._times[0] is None:
             return 0
         return (self.ns(self._times[0]) or 0) - (self.first or 0)

@@ -55,7 +55,7 @@ class FrameMaker:
         }
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
-        self._set_up(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
+        self._set_up(sensor.id, engine.frame.tree, engine.frame.max_struct_bytes, {}, elsewhere)
 
     @classmethod
     def of_struct(cls, sensor: str, frame: Frame) -> FrameMaker:
@@ -64,7 +64,7 @@ class FrameMaker:
         Args:
             sensor: the id of the sensor, for errors.
         """
-        return cls._of_parts(sensor, frame.tree, frame.room, {})
+        return cls._of_parts(sensor, frame.tree, frame.max_struct_bytes, {})
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:

@@ -83,14 +83,14 @@ class Text:
         if self.size < 1 or len(self.fill) != 1:
             raise SpecError("Text(size, fill) requires a size of at least 1 and a fill of one byte")
 
-    def words(self, room: int | None) -> str:
+    def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""
         return (
-            f"a string of up to {min(self.size, room or self.size)} bytes in"
+            f"a string of up to {min(self.size, field_size or self.size)} bytes in"
             f" {self.encoding.upper()}"
         )
 
-    def pack(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, field_size: int | None) -> bytes:
         """Return the bytes of a text.
 
         Raises:
@@ -100,9 +100,9 @@ class Text:
             data = value.encode(self.encoding)
         else:
             data = b""
-        if not isinstance(value, str) or len(data) > min(self.size, room or self.size):
+        if not isinstance(value, str) or len(data) > min(self.size, field_size or self.size):
             raise ValueError
-        return data.ljust(room or 0, self.fill)
+        return data.ljust(field_size or 0, self.fill)
 
 
 @dataclass(frozen=True)
@@ -114,15 +114,15 @@ class Address:
     address, as seen by the sensor.
     """
 
-    def words(self, room: int | None) -> str:
+    def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""
-        if room == 16:
+        if field_size == 16:
             return "an IPv6 address"
-        if room:
+        if field_size:
             return "an IPv4 address"
         return "an IP address"
 
-    def pack(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, field_size: int | None) -> bytes:
         """Return the bytes of an address.
 
         Raises:
@@ -134,7 +134,7 @@ class Address:
             address = ip_address(value)
         else:
             address = value
-        if not hasattr(address, "packed") or room not in (None, len(address.packed)):
+        if not hasattr(address, "packed") or field_size not in (None, len(address.packed)):
             raise ValueError
         return bytes(address.packed)
 
@@ -143,19 +143,19 @@ class Address:
 class Octets:
     """Plain bytes; a plugin writes `bytes` after the path."""
 
-    def words(self, room: int | None) -> str:
+    def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""
-        if room is None:
+        if field_size is None:
             return "bytes"
-        return f"{room} bytes"
+        return f"{field_size} bytes"
 
-    def pack(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, field_size: int | None) -> bytes:
         """Return the bytes.
 
         Raises:
             ValueError: for another type, or if the length differs from that of the field.
         """
-        if not isinstance(value, bytes | bytearray) or room not in (None, len(value)):
+        if not isinstance(value, bytes | bytearray) or field_size not in (None, len(value)):
             raise ValueError
         return bytes(value)
 
@@ -259,7 +259,7 @@ class Template:
         return self.text.format_map(texts).encode()
 
     def match(self, data: Any) -> dict[str, str] | None:
-        """Return the values in a text that matches the template, by name; else None."""
+        """Return the values in a text, by name; None if it does not match the template."""
         if not isinstance(data, bytes):
             return None
         matched = self._pattern.fullmatch(data.decode("latin-1"))

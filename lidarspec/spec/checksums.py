@@ -333,7 +333,7 @@ def mirrored_bytes(register: int) -> int:
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """Return the table of a CRC, by which a byte changes the register, (256,)."""
+    """Return the table by which a byte changes the register of a CRC, (256,)."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):

@@ -85,8 +85,8 @@ class Simulation:
             that do not depend on the scene, such as angles, counters and time.
         encode: a function that gets the simulated points of a batch as `Polar`, and returns the raw
             values of the fields, by path. Needed if there is no field that contains only the range.
-        rate: the number of frames per second. Data frames need it only if neither the clock nor the
-            times of the points determine it. Other frames need it if the sensor sends them
+        rate: the number of frames per second. Data frames need it only if it does not follow from
+            the clock or from the times of the points. Other frames need it if the sensor sends them
             periodically.
         answers: for each command, a list of the items that the sensor sends before any data, or a
             function that returns this list, given the raw fields of the request. An item is the
@@ -98,9 +98,9 @@ class Simulation:
         directions: a function of the frame number i that returns the azimuths and elevations of its
             points, radians, as two arrays that broadcast to the points of a frame. Needed for
             `Cartesian` points.
-        effects: command -> a function that returns the sweep that is used after the command. Its
-            arguments are the sweep so far and the number of the next frame. The new sweep counts
-            frames from 0. Only for a sensor, not for a frame type.
+        effects: by command, a function that returns the sweep to use after the command. The
+            arguments of the function are the sweep so far and the number of the next frame. The new
+            sweep counts frames from 0. Only for a sensor, not for a frame type.
         date: a function of seconds since 1970 that returns physical values, by path, of fields that
             contain a date in addition to the clock, such as an NMEA sentence. It is used if the
             simulated clock follows UTC.
@@ -146,8 +146,9 @@ class Frame:
         simulation: facts for the simulation of this frame type. Needed if the sensor has several
             data frames, if random values never make a valid frame, or if the sensor sends this
             frame periodically.
-        acknowledged: findings of `lidarspec check` that are accepted: "LS204", or "LS205
-            path.of.a.field" -> the reason.
+        acknowledged: the reasons why findings of `lidarspec check` are accepted, by finding. A
+            finding is a code such as "LS204", or a code and the path of a field, such as "LS205
+            path.of.a.field".
         wire: the wire form, if the frame is encoded so that its fields have no fixed offsets:
             `Tokens`, `Lines`, `Escaped`, or a wire form of a plugin. In this case, the struct
             describes the decoded content, and `max_length` is required, in encoded bytes.
@@ -197,7 +198,9 @@ class Frame:
             )
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)
-        object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
+        object.__setattr__(
+            self, "prepared", prepare(self.struct, self.max_struct_bytes or sys.maxsize)
+        )
         object.__setattr__(self, "endless", check_struct(self.prepared))
         if not longest:
             raise SpecError(
@@ -224,7 +227,7 @@ class Frame:
         )
 
     @property
-    def room(self) -> int:
+    def max_struct_bytes(self) -> int:
         """The maximum size of the struct in bytes.
 
         With a wire form, this is more than the maximum length of the encoded frame, because two

@@ -111,11 +111,11 @@ class Polar:
         azimuth: radians, counter-clockwise as seen from above; nan for an invalid point.
         elevation: radians above the horizon.
         intensity: the number on the wire; None if the sensor has none.
-        time: seconds after the packet's clock.
+        time: seconds after the time of the packet.
         ring: number of the laser or channel; None if there is none.
         return_index: 0 for the first or only return, 1 for the second ...; None if there is only
             one.
-        invalid: True if the sensor marks a point as invalid (becomes nan).
+        invalid: True for a point that the sensor marks as invalid; its coordinates become nan.
         origin: (x, y, z) of the start of the beam, metres, in REP-103 axes; numbers or columns.
         nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
             reports it.
@@ -152,11 +152,11 @@ class Cartesian:
         x, y, z: metres, x forward, y left, z up. A point without a return has three zeros. A point
             with a nan or infinite coordinate is invalid.
         intensity: the number on the wire; None if the sensor has none.
-        time: seconds after the packet's clock.
+        time: seconds after the time of the packet.
         ring: number of the laser or channel; None if there is none.
         return_index: 0 for the first or only return, 1 for the second ...; None if there is only
             one.
-        invalid: True if the sensor marks a point as invalid (becomes nan).
+        invalid: True for a point that the sensor marks as invalid; its coordinates become nan.
         nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
             reports it.
         column: number of the column in its revolution, from 0, if points form columns of rings;
@@ -197,7 +197,7 @@ class Imu:
             is positive about z.
         linear_acceleration: three columns, along x, y and z, m/s2, including gravity. A level
             sensor at rest has +9.80665 along z.
-        time: seconds after the packet's clock.
+        time: seconds after the time of the packet.
 
     Raises:
         SpecError: for another number of columns.

@@ -1050,7 +1050,7 @@ class Lines:
 
     @cached_property
     def _head_ends(self) -> Sequence[int]:
-        """The offset of the end of each line of the head in a frame."""
+        """For each line of the head, the offset in a frame at which the line ends."""
         lengths = [size + self._has_check(number) + 1 for number, size in enumerate(self.head)]
         return [end - 1 for end in itertools.accumulate(lengths)]
 

@@ -379,7 +379,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
     asked = ""
     while True:
         try:
-            find_layout(declared.tree, header, declared.room)
+            find_layout(declared.tree, header, declared.max_struct_bytes)
         except UnknownSelectorError as unknown:
             info = unknown.leaf.info
             asked = info.path

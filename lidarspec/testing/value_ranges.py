@@ -337,7 +337,7 @@ def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, in
 
 def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
     declared = sensor.frames[frame]
-    return find_layout(declared.tree, header, declared.room)
+    return find_layout(declared.tree, header, declared.max_struct_bytes)
 
 
 def _are_valid(

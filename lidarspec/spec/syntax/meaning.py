@@ -151,7 +151,7 @@ class _Context:
     in_bits: bool = False
     #: The number of bytes up to the end of the enclosing part, if another field declares its
     #: length.
-    room: tree.Formula | None = None
+    bytes_left: tree.Formula | None = None
     #: A function that returns the formula of the construct's offset in the frame, or None if there
     #: is no formula. There is never a formula in parts.
     offset: Callable[[], tree.Formula | None] | None = lambda: 0
@@ -228,8 +228,8 @@ class _Builder:
             isinstance(inner, construct.FixedSized)
             and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
         ):
-            room = self._formula(inner.length, place)
-            return self.node(inner.subcon, replace(place, room=room))
+            bytes_left = self._formula(inner.length, place)
+            return self.node(inner.subcon, replace(place, bytes_left=bytes_left))
         if isinstance(inner, construct.GreedyRange | construct.RepeatUntil) and not place.in_bits:
             return self._fill_with_elements(inner, place)
         if isinstance(inner, RawPart):
@@ -303,7 +303,11 @@ class _Builder:
 
         default = info.default.get("value") if isinstance(info.default, dict) else None
         inside = _Context(
-            field("value", default=default), scope, "value", room=place.room, offset=place.offset
+            field("value", default=default),
+            scope,
+            "value",
+            bytes_left=place.bytes_left,
+            offset=place.offset,
         )
         value = self.node(con.subcon, inside)
         size = tree.size(value)
@@ -498,10 +502,13 @@ class _Builder:
                 filler = unwrap(filler.thensubcon)
             if isinstance(filler, PaddingField):
                 size = _sum_member_sizes(members, filler.of[0])
-                inside = replace(inside, room=self._padding(filler, inside, size))
-            elif place.room is not None and child is con.subcons[-1]:
+                inside = replace(inside, bytes_left=self._padding(filler, inside, size))
+            elif place.bytes_left is not None and child is con.subcons[-1]:
                 inside = replace(
-                    inside, room=tree.combine("-", place.room, tree.total(map(tree.size, members)))
+                    inside,
+                    bytes_left=tree.combine(
+                        "-", place.bytes_left, tree.total(map(tree.size, members))
+                    ),
                 )
             members.append(self.node(child, inside))
         for index, member in enumerate(members):
@@ -569,7 +576,7 @@ class _Builder:
             con.subcon,
             replace(
                 place.with_changes(axes=(*place.info.axes, axis)),
-                room=None,
+                bytes_left=None,
                 offset=None if place.offset is None else _return_no_offset,
             ),
         )
@@ -577,11 +584,11 @@ class _Builder:
         kind = author_class(con)
         if isinstance(con, construct.RepeatUntil) or not isinstance(size, int):
             until = getattr(con, "predicate", None)
-            within = place.room if until is None else None
+            within = place.bytes_left if until is None else None
             sequence = self._make_sequence(con.subcon, element, place, within=within, until=until)
             if sequence is not None:
                 return sequence
-        if isinstance(con, construct.RepeatUntil) or place.room is None:
+        if isinstance(con, construct.RepeatUntil) or place.bytes_left is None:
             return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
             reason = (
@@ -589,7 +596,7 @@ class _Builder:
                 " within=...)"
             )
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
-        return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)
+        return tree.Repeat(place.name, axis, tree.calculate("//", place.bytes_left, size), element)
 
     def _parts(self, con: Partition, place: _Context) -> tree.PartSequence:
         info = place.info
@@ -780,12 +787,12 @@ class _Builder:
             node: tree.Node = _make_number(info, con.length, is_big=big)
         elif isinstance(con, BytesInteger) and not _is_variable_integer(con) and con.length <= 8:
             node = _make_number(info, con.length, is_big=not con.swapped)
-        elif place.room is not None and (
+        elif place.bytes_left is not None and (
             isinstance(con, PaddingField) or con is construct.GreedyBytes
         ):
             if isinstance(con, PaddingField):
                 info = replace(info, default=con.pattern)
-            node = tree.Blob(name, info, place.room, info.const)
+            node = tree.Blob(name, info, place.bytes_left, info.const)
         elif isinstance(con, Bytes) and not isinstance(con, PaddingField):
             if isinstance(con, Reserved):
                 info = replace(info, default=con.pattern)
@@ -820,7 +827,7 @@ class _Builder:
         info = place.info
         if not place.name or info.const is not None or info.labels or info.rebuilt:
             return None
-        ending = _find_ending(con, info, is_bounded=place.room is not None)
+        ending = _find_ending(con, info, is_bounded=place.bytes_left is not None)
         adapter: tree.Adapter | None
         if ending is not None:
             size: tree.Formula | None = tree.Ref(ending.size.path, ending.size)
@@ -829,7 +836,7 @@ class _Builder:
             size = self._text_size(con, place)
             adapter = text_adapter(con)
         else:
-            size = fixed_size(con) or place.room
+            size = fixed_size(con) or place.bytes_left
             adapter = None if size is None else part_adapter(con)
         if size is None or (adapter is None and ending is None):
             return None
@@ -845,7 +852,7 @@ class _Builder:
         """
         inner = con.subcon
         if inner is construct.GreedyBytes:
-            return place.room
+            return place.bytes_left
         if isinstance(inner, BoundedPart | construct.FixedSized):
             content = inner.subcon
             if isinstance(content, construct.NullStripped):
@@ -1188,7 +1195,7 @@ def _is_text(con: Construct) -> bool:
 
 
 def _find_opaque_reason(con: Construct) -> str:
-    """Return the reason why only construct can read a part, or the first reason inside it."""
+    """Return the reason, in a part or inside it, why only construct can read the part."""
     below = con
     while author_class(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
         below = below.subcon

@@ -93,7 +93,9 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
 
 
 class MarkedStruct(Struct):  # type: ignore[misc]
-    """A Struct that also parses to the (start, end) of each member, under ``_marks``.
+    """A Struct that adds the (start, end) of its members to the parsed value.
+
+    They are the entry ``_marks``.
 
     construct's Struct does not keep these offsets. `Checksummed` needs them to find its bytes,
     `SizeOf` and `PaddingField` to measure parts, and `explain` to list the fields of a frame
