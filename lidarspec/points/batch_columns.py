@@ -228,7 +228,8 @@ class BatchColumns(ColumnSource):
         """Return a column of the points from `start` to `stop`, in stream order.
 
         Args:
-            values: for each layout, the values of all points of its packets in `_packet_range`.
+            values: for each layout, the values of all points of the packets with this layout in
+                `_packet_range`.
         """
         if self._is_regular:
             skipped = start % self._plan.width

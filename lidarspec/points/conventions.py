@@ -170,7 +170,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
-    """Return how points with a shape are organised.
+    """Return how points of a given shape are organised.
 
     Args:
         shape: the lengths of the axes of the points.
@@ -202,7 +202,8 @@ class Grids(NamedTuple):
     def between(self, start: int, stop: int) -> Grid:
         """Return how the points from `start` to `stop` are organised.
 
-        They are not organised if their packets differ, or if they are not whole columns.
+        The points are not organised if their packets are organised differently, or if the points
+        are not whole columns.
         """
         first = self.ends.searchsorted(start, side="right")
         last = self.ends.searchsorted(stop)

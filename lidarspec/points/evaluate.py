@@ -127,7 +127,7 @@ def _make_group(
 
 
 def _is_valid(share: GroupPoints) -> bool:
-    """Return whether a plan is valid for its packets.
+    """Return whether the plan of a group is valid for the packets of the group.
 
     This checks the lengths of axes, the signs of factors, and the magnitude of floating-point
     fields.

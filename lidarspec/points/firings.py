@@ -89,7 +89,7 @@ def choose_returns(
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
         names: the names of the returns, by return index (`Sensor.returns`). Without names, the
             first and the last return are found by the return index. If there are names, but `which`
-            is not one of them, they are found by the range.
+            is not one of them, these returns are found by the range.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.

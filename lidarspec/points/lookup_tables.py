@@ -107,7 +107,7 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
-    Returns None unless the expression depends on one field, which has a window.
+    Returns None unless the expression depends on a single field with a window.
     """
     source = get_only_field(node)
     if source is not None:

@@ -146,7 +146,7 @@ def _float_at(bits, kind):
 
     Args:
         bits: the size of the float.
-        kind: its type in LLVM.
+        kind: the type of the float in LLVM.
     """
 
     def maker(is_swapped):

@@ -574,7 +574,10 @@ class KernelAssembly:
         return self._store(value, "float32")
 
     def _store(self, value: KernelValue, kind: str) -> str:
-        """Add a scratch array for a value; return the text that reads it in the flat loop."""
+        """Add a scratch array for a value; return the text that reads it.
+
+        The array is read in the flat loop over points.
+        """
         if value.text not in self._kept:
             name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")

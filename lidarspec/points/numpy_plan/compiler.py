@@ -65,7 +65,7 @@ class Compiler:
         """Add an output column.
 
         Args:
-            kind: "single" or "double".
+            kind: the type of the column, "single" (float32) or "double" (float64).
             exact: whether operations are computed in float64 in the written order. If not, products
                 may be float32, and sums may have another order.
         """
@@ -257,7 +257,7 @@ class Compiler:
     def _make_table(
         self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str
     ) -> NDArray[Any]:
-        """Return the value of an expression for each value of its window."""
+        """Return the value of an expression for each value of the field window."""
         name = (
             kind,
             field_window.offset - leaf.offset,
