@@ -267,9 +267,9 @@ class LiveCandidates:
     """The candidates of a piece that may be accepted under the same active types.
 
     Attributes:
-        frames: the valid and incomplete candidates, sorted by offset. There is at most one for each
-            offset, which is of the first type in declaration order. For a weak type, only the first
-            frame of each run is included.
+        frames: the valid and incomplete candidates, sorted by offset. At each offset there is at
+            most one candidate, of the first type in declaration order. For a weak type, only the
+            first frame of each run is included.
         ends: the end offset of each candidate, (n,); for the first frame of a run, the end of the
             run.
         runs: the runs of each weak type, by type index.

@@ -148,7 +148,7 @@ class Decoder:
         """Reject incomplete candidates, because no data has arrived for a while.
 
         Returns:
-            The frames that are found when their bytes are searched again.
+            The frames that are found when the bytes of these candidates are searched again.
         """
         return [found for frames in self.take_pending() for found in frames.found()]
 
@@ -156,7 +156,7 @@ class Decoder:
         """Reject incomplete candidates, because the input has ended.
 
         Returns:
-            The frames that are found when their bytes are searched again.
+            The frames that are found when the bytes of these candidates are searched again.
         """
         return self.idle()
 
@@ -196,7 +196,7 @@ class Decoder:
         return parts
 
     def take_pending(self) -> list[Frames]:
-        """Reject incomplete candidates; return the frames in their bytes, as arrays."""
+        """Reject incomplete candidates; return frames found in their bytes, as arrays."""
         parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:

@@ -147,9 +147,9 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse candidates of a frame that extends to the end of a datagram, if they are too long.
+        """Refuse candidates that are too long, for frames up to the end of a datagram.
 
-        A stream has no such frame.
+        A stream has no such frame type.
         """
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:
@@ -218,10 +218,10 @@ class CompiledCodec(Codec):
         """Check the candidates of one layout.
 
         Returns:
-            The status of each candidate; its size in bytes, or the number of bytes needed to
-            decide; and the bytes of complete candidates, (n, size), or None. The bytes are returned
-            only if `gathered` is set, no complete candidate follows an incomplete one, and there
-            are not too many.
+            Three values: the status of each candidate; the size of each candidate in bytes, or the
+            number of bytes needed to decide about it; and the bytes of complete candidates, (n,
+            size), or None. The bytes are returned only if `gathered` is set, no complete candidate
+            follows an incomplete one, and there are not too many.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))

@@ -4,8 +4,8 @@ In a stream without errors, each frame begins directly after the previous one. D
 are at equal distances in a capture or an array. If all of them are frames of one layout, and no
 type that is declared earlier matches at their first bytes, the search would accept the same frames.
 They are therefore checked as rows, which takes a few calls of NumPy. In a stream, the search
-continues at the first invalid row. Datagrams are either all checked as rows, or none of them. Rows
-of a weak type are accepted only if they continue a run of frames of this type.
+continues at the first invalid row. Either all datagrams are checked as rows, or none. Rows of a
+weak type are accepted only if they continue a run of frames of this type.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def check_rows(
 
 
 def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
-    """Return how many rows from the first on have the constants of a type.
+    """Return the number of rows at the start that have the constants of a type.
 
     Constants beyond the end of the rows are not compared. Returns None if no row has the constants.
     """

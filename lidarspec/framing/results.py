@@ -175,7 +175,7 @@ class Found:
 
     Attributes:
         frame: the name of the frame type.
-        offset: the offset of its first byte in the input. Datagrams count as if they were joined.
+        offset: the offset of the frame in the input. Datagrams count as if they were joined.
         data: the bytes of the frame.
         at: the arrival time of the bytes that completed the frame, ns; None if unknown.
         gap: the number of bytes that were skipped between the previous frame and this one, without

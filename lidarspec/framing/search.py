@@ -3,8 +3,9 @@
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
 invalid candidate, the search continues at the next byte. At one offset, the first type in order
 that matches is used. A type with `after` is active only if its `after` names the type of the last
-frame. Frames of a type that no `after` names do not change the active types. Frames of a type with
-`confirm` are accepted only in runs without gaps (`lidarspec.framing.weak_frames`).
+frame that changed the active types. Frames of a type that no `after` names do not change the active
+types. Frames of a type with `confirm` are accepted only in runs without gaps
+(`lidarspec.framing.weak_frames`).
 
 All candidates of a piece are checked together, and accepted together up to the next conflict or
 frame that changes the active types. The time is therefore linear in the size of the input for any
@@ -126,8 +127,8 @@ class _FrameWalk:
 
         Args:
             position: the offset to start from.
-            piece: the result for the piece. If an incomplete candidate ends the search, its
-                attributes `end`, `waiting` and `need` are set.
+            piece: the result for the piece. If the search ends at an incomplete candidate, the
+                attributes `end`, `waiting` and `need` of the result are set.
 
         Returns:
             The end of the last accepted frame, or of the piece.

@@ -56,7 +56,7 @@ class LayoutFamily:
     """The family of a layout; the layouts of a family differ only in the length of an array.
 
     Attributes:
-        number: the number of the family.
+        number: the number that identifies the family.
         lengths: the length of the outermost array of each test, in the order of
             `CandidateChecker.checks`; 0 for a test outside of arrays.
     """
@@ -188,7 +188,7 @@ class JointChecker:
         """Return some of the candidates with their layouts.
 
         Args:
-            chosen: a mask of `self.which`, (n,).
+            chosen: a mask that selects the candidates in `self.which`, (n,).
         """
         found = (
             (layout, self.which[chosen & (self.forms == form)])
@@ -277,7 +277,7 @@ def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) ->
     such as the stored checksum, are first moved to the end of the row.
 
     Args:
-        seal: the checksum of the longest layout, which fills its row.
+        seal: the checksum in the longest layout.
         sizes: the sizes of the candidates, (n,).
         sums: a function that computes checksums.
     """
