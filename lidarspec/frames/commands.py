@@ -116,7 +116,7 @@ class ArgumentSlot:
 
 
 def argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
-    """Return the field of its frame that a command argument is written to.
+    """Return the field that an argument of a command is written to.
 
     Raises:
         SpecError: if the field is not suitable for this kind of argument.

@@ -245,7 +245,7 @@ class CompiledTable:
     def _counts_of_elements(self, axis: str, path: str) -> NDArray[np.intp]:
         """Return the length of an array in each frame, (n,).
 
-        The array at `path` is `axis`, which has elements that differ in size, or an array in these
+        `axis` is an array of elements that differ in size. `path` is this array, or an array in its
         elements.
         """
         elements = self._elements(axis)
@@ -301,13 +301,13 @@ class CompiledTable:
         return CompiledTable(self.schema, groups)
 
     def walks(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
-        """Find the parts in the frames of each group that has them.
+        """Find the parts at a path in the frames of each group that has such parts.
 
         The result is cached, because the clock, the points and each kind of parts use it.
 
         Returns:
-            For each group, a tuple of the group, the buffer that contains its frames, and the parts
-            in these frames.
+            For each group with such parts, a tuple of the group, the buffer that contains the
+            frames of the group, and the parts in these frames.
         """
         if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)

@@ -106,7 +106,7 @@ class Leaf:
 
     Attributes:
         info: the field.
-        offset: the offset of its first element, in bytes from the start of the frame.
+        offset: the offset of the first element, in bytes from the start of the frame.
         shape: the number of elements along each array that contains the field.
         strides: the distance from one element to the next along each array, in bytes. An array
             inside a bit block has no stride.
@@ -609,7 +609,7 @@ class FrameTest(Protocol):
 def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
     """Return whether each frame, given as a row of bytes, passes a test, (n,).
 
-    A frame passes if the test is true for all its elements.
+    A frame passes if the test is true for all elements of the tested arrays.
     """
     raw = {
         info.path: leaf.load(rows)
@@ -714,7 +714,7 @@ class Layout:
     def is_valid(self, frame: bytes) -> bool:
         """Return whether one frame is valid.
 
-        This checks its size, constants, checksums and conditions.
+        This checks the size, constants, checksums and conditions of the frame.
         """
         return (
             len(frame) == self.size

@@ -127,7 +127,7 @@ ValueRequest = Callable[[Leaf | MeasuredSize, "HeaderWalk"], int]
 
 @dataclass
 class HeaderWalk:
-    """A walk through a tree for given values of header fields, and its results."""
+    """A walk through a tree for given values of header fields, with its results."""
 
     values: Mapping[str, int]
     limit: int
@@ -318,7 +318,7 @@ class HeaderWalk:
     ) -> None:
         """Add fields at the cursor without moving it.
 
-        Their bytes belong to the nodes after them.
+        The bytes of these fields belong to the following nodes.
         """
         start = self.cursor
         leaves = self.leaves
@@ -795,7 +795,8 @@ class _CandidateSet:
         Candidates that end before the field, and have a wrong constant, are added to `refuted`.
 
         Returns:
-            The indices of the candidates with the field (None: all), and their values.
+            The indices of the candidates with the field (None for all candidates), and the values
+            of the field.
         """
         assert node.leaf is not None
         there, values = node.leaf.read(

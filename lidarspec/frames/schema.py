@@ -171,7 +171,7 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The parts with columns of their own, by path: all but the elements of arrays."""
+        """The parts with columns of their own, by path; not the elements of arrays."""
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 
     @cached_property

@@ -369,7 +369,7 @@ def _find_element_types(
 
 @functools.lru_cache(maxsize=256)
 def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the offset of each element of all fields, and the index of its field.
+    """Return the offset of each element of all fields, and the element's field index.
 
     The offsets are ascending. All fields of a bit block have the index of the first of them.
     """

@@ -257,7 +257,7 @@ def _make_part_path(shown: str, part: tree.Part) -> str:
 def _describe_bits(part: tree.Part) -> tuple[str, str]:
     """Return the size and type of a part of a block.
 
-    The size is in bits. For an integer that is wider than 64 bits, it is in bytes.
+    The size is in bits. For an integer that is wider than 64 bits, the size is in bytes.
     """
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
@@ -371,7 +371,7 @@ def unit_text(info: tree.FieldInfo) -> str:
 def describe_field(info: tree.FieldInfo) -> str:
     """Return the description of a field.
 
-    It consists of its constant, the formula of its value, its documentation and its labels.
+    The description has the constant, the formula of the value, the documentation and the labels.
     """
     if info.const is not None:
         const = f"always {format_hex(info.const, info.bits)}"
