@@ -73,7 +73,7 @@ class Crc(Checksum):
         poly: the polynomial without its highest term; the highest bit is the highest power.
         init: the register before the first byte, not reflected.
         refin: whether each byte is processed from its lowest bit to its highest bit.
-        refout: whether the result is reflected.
+        refout: whether the bits of the result are in reverse order.
         xorout: the number that is XORed with the result.
 
     Raises:

@@ -575,7 +575,7 @@ class Parts(layer.Partition):
         """Build a part as the first kind that accepts its values.
 
         Returns:
-            The kind, the value of the part and its bytes.
+            The kind, the value and the bytes of the part.
         """
         faults = list[ConstructError]()
         for name, case in self.cases.items():

@@ -81,10 +81,10 @@ class OnChange:
 
     Args:
         name: a field path.
-        angle: the path of a field with the angle at which a packet begins, which increases evenly
-            as the sensor rotates; "" if the frame has no such field. It is used to find a masked
-            sector, and by `configure(cut=)`.
-        full: the increase of `angle` in one revolution, in its unit.
+        angle: the path of the field with the angle at which a packet begins; "" if the frame has no
+            such field. The angle has to increase evenly as the sensor rotates. It is used to find a
+            masked sector, and by `configure(cut=)`.
+        full: the increase of the angle in one revolution, in the unit of the field.
     """
 
     name: str
@@ -249,7 +249,7 @@ class Clock:
         return self.epoch
 
     def epoch_at(self, time_ns: int, state: ClockState | None) -> str:
-        """Return the epoch of the clock in a state, when its reading is `time_ns`."""
+        """Return the epoch of the clock in a given state, for a reading of `time_ns`."""
         epoch = self.epoch_in(state)
         if epoch == "hour" and time_ns >= FIRST_DATE_NS:
             return "utc"  # another frame has completed the hour

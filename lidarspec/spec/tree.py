@@ -75,8 +75,8 @@ class Adapter:
         decode: a function that decodes an integer, or the bytes of the field.
         encode: a function that encodes a value, given the value and the size of the field in bytes.
         dtype: the dtype of a column; uint8 if columns have the raw bytes.
-        allowed: the raw values that can be decoded; None if all values can be decoded, or if only
-            calling `decode` shows whether a value can be.
+        allowed: the raw values that can be decoded; None if all values can be decoded, or if this
+            is known only after calling `decode`.
         is_partial: whether a frame can be invalid because a raw value cannot be decoded.
         form: a text that describes how the value is stored; "" for a plain number.
         decode_bytes: a function that decodes an array of bytes along the last axis, for columns of
@@ -747,8 +747,8 @@ class Repeat:
     """An array of `count` elements.
 
     Attributes:
-        axis: the name of the array, which is its path, with "[]" appended for each array that
-            directly contains it.
+        axis: the name of the array. This is the path of the array, with "[]" appended for each
+            array that directly contains it.
     """
 
     name: str

@@ -110,7 +110,7 @@ class NumberRun:
 
     @cached_property
     def largest(self) -> Values:
-        """The largest unsigned value of each number, which has all bits set, (n,)."""
+        """The largest unsigned value of each number, with all bits set, (n,)."""
         return LARGEST_OF_BYTES[self.sizes]
 
     @cached_property
@@ -169,7 +169,7 @@ class Problem:
         offset: the offset of the error in the frame.
         reason: a description of the error; "" for a field that cannot be decoded.
         is_checksum: whether a checksum of the wire form is wrong.
-        path: the path of the field.
+        path: the path of the field with the error.
         expected: the expected value.
         got: the actual value.
     """
@@ -352,7 +352,7 @@ def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
 
 @lru_cache(maxsize=64)
 def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit, and whether it is one, (256,) each."""
+    """Return the value of each character as a digit, and a mask of digits, (256,) each."""
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):
@@ -366,8 +366,8 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 def _make_digit_weights(base: int) -> Values:
     """Return the weight of a digit, by its position counted from the end of its token.
 
-    Index 1 is the last digit. The weight is 0 at index 0, which is used for characters that are not
-    digits, and at the last index, which is used for digits that are too far from the end.
+    Index 1 is the last digit. Index 0 is for characters that are not digits, and the last index is
+    for digits that are too far from the end. The weight of both is 0.
     """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
@@ -750,7 +750,7 @@ class Echoes:
     Args:
         size: the number of characters of an echo.
         most: the maximum number of echoes of a step.
-        mark: the character between the echoes of a step, which must not be a digit.
+        mark: the character between the echoes of a step; it must not be a digit.
     """
 
     size: int

@@ -105,8 +105,8 @@ def _find_covered_part(
     """Find the RawCopy that a checksum covers.
 
     Returns:
-        The names that lead to the RawCopy, and whether the function of the checksum takes its whole
-        value. None if the checksum does not cover a RawCopy.
+        The names that lead to the RawCopy, and whether the function of the checksum takes the whole
+        value of the RawCopy. None if the checksum does not cover a RawCopy.
     """
     if not isinstance(checksum, construct.Checksum):
         return None

@@ -365,8 +365,8 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
     """Return the members that replace a FocusedSeq: its value, and a field for each other part.
 
-    The FocusedSeq is returned unchanged if one of its parts uses fields outside of itself, because
-    paths in its expressions have one more level. The only exception is the count of an array, as in
+    If a part uses fields outside of itself, the FocusedSeq is returned unchanged, because paths in
+    its expressions have one more level. An array may use another part as its count, as in
     construct's PrefixedArray.
     """
     focus = inner.parsebuildfrom
@@ -637,7 +637,7 @@ def field_path(path: str | None) -> str:
     """Return a path of construct as a field path.
 
     "(parsing) -> points[1] -> intensity" becomes "points[1].intensity". If a part has documentation
-    but no name, construct adds "None" to the path, which is removed.
+    but no name, construct adds "None" to the path. This is removed.
     """
     names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
     return ".".join(names)
