@@ -581,7 +581,7 @@ def _find_axis(
     with all arrays of the frame.
 
     Args:
-        without: the positions that are excluded.
+        without: positions in `axes` that are not considered.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
