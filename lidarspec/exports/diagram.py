@@ -60,7 +60,7 @@ class BoxGroup:
     """A group of boxes that are repeated together, or that are optional together.
 
     Attributes:
-        label: the count or the condition.
+        label: the number of repetitions, or the condition under which the group exists.
         items: the boxes and groups in the group.
         optional: whether some frames do not contain the group.
     """
@@ -76,7 +76,7 @@ Item = DiagramBox | BoxGroup
 def byte_order(message: ExportedFrame) -> str:
     """Return the byte order of all numbers of a frame type.
 
-    Returns "" if they differ, or if all numbers have a single byte.
+    Returns "" if the byte orders differ, or if all numbers have a single byte.
     """
     orders = {
         node.order
