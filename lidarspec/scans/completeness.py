@@ -53,8 +53,8 @@ class PacketCounts:
         Args:
             packets: the batch.
             number: the number of packets to count.
-            points: the number of points of each packet, (number,), used as its size; None to use
-                its number of bytes.
+            points: the number of points of each packet, (number,), used as the size of the packet;
+                None to use the number of bytes.
             previous_index: the index of the packet before the batch; None at the start of the
                 stream.
         """

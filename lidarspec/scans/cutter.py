@@ -1,7 +1,7 @@
 """Decide where the scans of a stream end, and whether each of them is complete.
 
-A scan ends where the sensor's rule finds an end (`scan_ends`). If no end arrives in time, it ends
-when it reaches its limits (`limits`). Missing packets are counted in `completeness`.
+A scan ends where the sensor's rule finds an end (`scan_ends`). If no end arrives in time, the scan
+ends when it reaches its limits (`limits`). Missing packets are counted in `completeness`.
 """
 
 from __future__ import annotations

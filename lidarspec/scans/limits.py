@@ -1,10 +1,10 @@
-"""Limit the length and the size of a scan, so that it ends even if its end does not arrive.
+"""Limit the duration and size of a scan, so that a scan without an end does end.
 
 The duration of a scan, by the times of the packets, is limited to twice the duration of the slowest
 revolution. If the number of points of a scan is constant, its size is limited to twice this number.
 Otherwise its size is limited to the bytes that the serial line carries in the maximum duration, or
-to `MAX_BYTES` without a serial line. If packets of a scan are missing, its end may be missing too.
-Such a scan may become only slightly longer than the previous scan.
+to `MAX_BYTES` without a serial line. If packets of a scan are missing, its end may be missing as
+well. Such a scan may become only slightly longer than the previous scan.
 """
 
 from __future__ import annotations

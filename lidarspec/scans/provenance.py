@@ -18,8 +18,8 @@ class PointOrigin(NamedTuple):
 
     Attributes:
         frame: the type of the frame.
-        offset: the offset of its first byte in the input.
-        host_ns: its arrival time, ns since 1970; 0 if unknown.
+        offset: the offset of the frame in the input.
+        host_ns: the arrival time of the frame, ns since 1970; 0 if unknown.
         part: the index of the part of the frame that contains the point; 0 if frames have no parts.
         number: the index of the point in the part, or in the frame if it has no parts.
         data: the bytes of the frame. If the frame is encoded on the wire, these are the decoded

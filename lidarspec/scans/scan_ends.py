@@ -39,8 +39,8 @@ class ScanEnd(NamedTuple):
 
     Attributes:
         point: the index of the first point after the end.
-        packet: the row of the packet that shows the end, which may have no points; None if a point
-            shows the end.
+        packet: the row of the packet that shows the end; the packet may have no points. None if a
+            point shows the end.
         is_leap: whether the angle leaps at the end, by more than `MIN_TURNS_AWAY` and by more than
             twice the step at the previous end. If so, packets are missing there, or the value is
             not an angle.
@@ -291,8 +291,8 @@ def first_points(points: EvaluatedPoints) -> Indices:
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
     """Return the sums over all axes but the first `axis_count`.
 
-    An axis with zero stride is not summed: its first value is multiplied by its length, which is
-    faster.
+    An axis with zero stride has equal values. The first value is multiplied by the length of the
+    axis, which is faster than a sum.
     """
     times = 1
     while counts.ndim > axis_count:

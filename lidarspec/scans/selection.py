@@ -211,7 +211,8 @@ class TimeSlice:
     def ns(self, moment: Moment | None) -> int | None:
         """Return one of the limits as a time of the stream, ns.
 
-        Returns None if there is no limit, or if it counts from a first time that is still unknown.
+        Returns None if there is no limit, or if the limit counts from the first time of the stream,
+        and this time is not known yet.
         """
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
@@ -247,7 +248,7 @@ class PacketTimes:
         """Return the times of the next packets, (n,) ns.
 
         Raises:
-            UsageError: if their UTC or their arrival times are unknown.
+            UsageError: if the UTC or the arrival times of the packets are unknown.
         """
         if self._time == "host":
             if len(packets) and not packets.host_ns.any():
