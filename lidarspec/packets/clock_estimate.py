@@ -194,7 +194,8 @@ class DeviceClock:
         """Return the times of packets by the host's clock, (n,) ns.
 
         Each time is later than all earlier stamps. The conversion is updated once for each quarter
-        of a second, or, while the clock does not run evenly, with each packet, as in `stamp`.
+        of a second. While the clock does not run evenly, it is updated with each packet, as `stamp`
+        does.
 
         Args:
             device, host: as for `observe`.
@@ -209,7 +210,7 @@ class DeviceClock:
         return stamps
 
     def _is_regular(self, device: Times, host: Times) -> bool:
-        """Return whether packets are in order and close to the line, and it is reliable."""
+        """Return whether packets are in order, and the line is reliable and close to them."""
         if self._last_stamped is None or self._outliers or not self.is_settled or not len(device):
             return False
         if (np.diff(device, prepend=self._last_stamped.device) <= 0).any():

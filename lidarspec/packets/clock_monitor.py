@@ -257,7 +257,7 @@ class ClockMonitor:
         return events
 
     def _observe(self, device: Integers, host: Integers, readings: Integers) -> list[ClockJump]:
-        """Update the estimate with the packets of one piece, and return the clock's jumps."""
+        """Update the estimate with consecutive packets, and return the clock's jumps."""
         jumps = self._estimate.observe(device, host)
         if jumps:
             self._delays = self._delays[:0]

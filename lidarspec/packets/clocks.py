@@ -309,7 +309,9 @@ def part_times(
     which: NDArray[np.intp],
     times: Times,
 ) -> Times:
-    """Return the times of parts, (k,) ns: their own, or the times of their frames.
+    """Return the times of parts, (k,) ns.
+
+    Parts without a clock of their own get the times of their frames.
 
     Args:
         place: the axis and the kind of the parts.

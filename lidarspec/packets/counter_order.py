@@ -145,7 +145,9 @@ class CounterOrder:
         self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and the breaks before packets, (n,).
+        """Return the index of each packet in the stream, and the breaks before packets.
+
+        Both have the shape (n,). The index also counts lost packets.
 
         Args:
             batch: the packets. `batch.breaks` marks the packets with skipped bytes before them. The

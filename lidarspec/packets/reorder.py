@@ -164,6 +164,6 @@ class Reorder:
 
 
 def _shows_gaps(packets: Packets) -> bool:
-    """Return whether missing packets show as gaps in the index."""
+    """Return whether the index of packets has a gap where a packet is missing."""
     clock = packets.sensor.clock
     return not packets.is_clocked or (clock is not None and clock.pace is not None)

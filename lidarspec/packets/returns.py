@@ -29,7 +29,7 @@ MAX_PLACES_LATE = 64
 def read_groups(
     rule: PacketCounter, batch: Batch, index: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the group of each packet, its position there, and the group's size, (n,).
+    """Return each packet's group and position in it, and the size of the group, (n,).
 
     A group is identified by the index of its first packet.
 

@@ -339,9 +339,9 @@ class ImuStream:
         state: frames of other types, by name, see `PacketStream`.
 
     Attributes:
-        waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if
-            their times cannot be compared with the times of points, because only some of the
-            frame types have a clock.
+        waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if the
+            times of samples and points cannot be compared, because only some of the frame types
+            have a clock.
     """
 
     def __init__(
