@@ -39,7 +39,9 @@ Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordingFile:
-    """A new file. An existing file with the same path is kept until `settle`.
+    """A new file, to which complete records are appended.
+
+    An existing file with the same path is kept until `settle` replaces it.
 
     Args:
         path: the path of the file.

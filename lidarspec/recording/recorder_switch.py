@@ -52,7 +52,7 @@ class RecordingSwitch:
             self._change(on=self._recorder is None)
 
     def set(self, *, on: bool) -> None:
-        """Start or end a file. Does nothing if the recorder is already on or off."""
+        """Start or end a file. Does nothing if the recorder is already in this state."""
         with self._changing:
             if on == (self._recorder is None):
                 self._change(on=on)

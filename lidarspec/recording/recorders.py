@@ -208,7 +208,7 @@ class FrameRecorder(BackgroundWriter):
     def _cut(self, frames: list[Found]) -> None:
         """Write frames, and the bytes outside frames before them.
 
-        Bytes that may belong to a frame that is not complete yet are kept.
+        Bytes that may belong to an incomplete frame are kept for the next call.
         """
         for item in frames:
             self._skip(item.offset - self._base)
