@@ -121,8 +121,8 @@ def new(
 def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
     """Return the files with a draft of the frames of a capture.
 
-    Only the packets from one sender to one port are used. Of all such groups of packets, it is the
-    group with the most bytes.
+    Only the packets from one sender to one port are used. Of all such pairs, the pair with the most
+    bytes is used.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:

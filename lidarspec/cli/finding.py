@@ -513,7 +513,7 @@ def _iter_conclusions(
 
 
 def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return sensors that are not installed but may have sent the largest sample.
+    """Return sensors that are not installed but may have sent most of the bytes.
 
     Returns an empty list if an installed sensor fits.
     """

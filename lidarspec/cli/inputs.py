@@ -316,7 +316,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
 
 def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
-    """Return an error if the input has frames of a sensor with only wrong checksums.
+    """Return an error if the input has a sensor's frames with only wrong checksums.
 
     Returns None for any other input.
     """

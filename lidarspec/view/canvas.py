@@ -157,7 +157,7 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy a picture so that its upper left corner is in a cell.
+        """Copy another picture into this one; the cell gets its upper left corner.
 
         Parts outside this picture are omitted.
         """

@@ -28,7 +28,7 @@ LOOK_S = 0.04
 DEFAULT_STEP_S = 0.1
 #: maximum time between two scans of a file. A longer time is replaced by `DEFAULT_STEP_S`.
 MAX_STEP_S = 2.0
-#: how much recorded data one read of a played file reads, in recorded time.
+#: seconds of recorded time that one read of a played file covers.
 READ_AHEAD_S = 0.1
 #: size of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
@@ -45,8 +45,8 @@ class LiveScans:
             possible.
         speed: the speed of a played file, relative to the recorded speed.
         select: the scans to show; None for all.
-        ahead: how much recorded data one read of a played file reads, in seconds of recorded time;
-            None for the amount that is read fastest.
+        ahead: seconds of recorded time that one read of a played file covers; None for the amount
+            that is read fastest.
 
     Attributes:
         speed: the speed of a played file; it may be changed.
