@@ -384,7 +384,7 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Location | None:
-        """Return the location of the field with the longest path that ends `parts`."""
+        """Return the location of the field with the longest path that `parts` ends with."""
         fitting = [
             (len(chain), location)
             for chain, location in self._iter_fields
@@ -617,8 +617,8 @@ def reports(
     Args:
         name: the checked name, as the user typed it.
         examples: number of examples of each frame type for each property.
-        strategies: "frame.field" -> a hypothesis strategy or function for its raw value, for fields
-            without a valid value that can be derived.
+        strategies: "frame.field" -> a hypothesis strategy or function for its raw value. It is
+            needed for fields whose valid values cannot be derived from the spec.
         vectors: the file of golden vectors; by default the file of the target.
         tested: related models that are tested as well. Parts that they share with a sensor are not
             tested again.

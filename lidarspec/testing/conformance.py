@@ -37,7 +37,7 @@ def assert_conformance(
         sensor: an id, a `Sensor`, or a file that describes one.
         examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
-            `random.Random`, for fields without a valid value that can be derived.
+            `random.Random`. It is needed for fields whose valid values cannot be derived.
         vectors: a file of golden vectors; by default the file that `check` finds.
         tested: related models that are tested as well. Frames and functions that they share with
             the sensor are not tested again.
@@ -73,7 +73,7 @@ class SensorConformance:
         examples: number of examples of each frame type for each property; the default is 40, or
             LIDARSPEC_EXAMPLES.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
-            `random.Random`, for fields without a valid value that can be derived.
+            `random.Random`. It is needed for fields whose valid values cannot be derived.
         vectors: a file of golden vectors, relative to the file of the test; by default the file
             that `lidarspec check` finds.
     """

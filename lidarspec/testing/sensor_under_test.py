@@ -203,7 +203,10 @@ class SensorUnderTest:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that are not tested for a related model."""
+        """The frame types that are tested for this sensor.
+
+        Frame types that a related model in `tested` has as well are omitted.
+        """
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -211,7 +214,7 @@ class SensorUnderTest:
 
     @property
     def commands(self) -> list[str]:
-        """The commands that are not tested for a related model.
+        """The commands that are tested for this sensor.
 
         A command is omitted if a related model in `tested` has the same command with the same
         frames, links and answers.
@@ -257,13 +260,13 @@ class SensorUnderTest:
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
-        """Scale a number of rounds from the default number of examples to `examples`."""
+        """Scale `rounds` from the default number of examples to `examples`."""
         return max(rounds * self.examples // USUAL_EXAMPLES, least)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
         """Return the bytes of a valid frame with seeded content.
 
-        Values for which the author gives a strategy are drawn from it.
+        If the author gives a strategy for a value, the value is drawn from the strategy.
         """
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)

@@ -384,9 +384,9 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
     """Return the lowest and highest raw value of integer fields of a frame.
 
-    The frame need not have layouts. The values are found by changing one valid frame. Fields that
-    decide the following fields, such as counts, and fields that have only one valid value in that
-    frame are omitted.
+    The frame need not have layouts. The values are found by changing one valid frame. Two kinds of
+    fields are omitted: fields that determine which fields follow, such as counts, and fields that
+    have only one valid value in that frame.
     """
     if sensor.frames[frame].plausible is None:
         return {}

@@ -254,8 +254,8 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     """Check that each checksum is verified by a `Checksummed`.
 
-    A checksum is recognized by its name, or by a search in the vectors. If the docs of a field say
-    that it is not checked, it is accepted, unless the search finds its algorithm.
+    A checksum is recognized by its name, or by a search in the vectors. A field is accepted if its
+    docs say that it is not checked, unless the search finds its algorithm.
     """
     sealing = _sealing_fields(subject, name)
     free = [
@@ -312,7 +312,7 @@ def _find_matches(
     """Return the checksums that match frames and lie in the field at `path`.
 
     If a checksum of `lidarspec.spec` matches, checksums that need a new class are omitted, because
-    they match only as a consequence.
+    they match only as a consequence of this match.
     """
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
