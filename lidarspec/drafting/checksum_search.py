@@ -98,13 +98,13 @@ class WordSum(Checksum):
 
 @dataclass(frozen=True)
 class OffsetChecksum(Checksum):
-    """Another checksum combined with a constant.
+    """A checksum that combines the value of another checksum with a constant.
 
     The result is ``constant ^ value`` for XORs, ``constant - value`` if `negative` is set, and
     ``constant + value`` for other checksums.
 
     Attributes:
-        base: the other checksum.
+        base: the other checksum, which computes the value.
         constant: the constant.
         negative: whether the value is subtracted from the constant.
     """

@@ -103,7 +103,7 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a polynomial that have a degree and the constant term 1.
+    """Return a polynomial's divisors of the given degree with the constant term 1.
 
     CRC polynomials have this term.
 

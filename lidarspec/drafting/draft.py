@@ -122,7 +122,7 @@ class Draft:
 
     @property
     def head_size(self) -> int:
-        """The number of bytes before the part of varying length, or of the whole frame."""
+        """The number of bytes before the part of varying length; without it, all bytes."""
         if self.size is not None or self.length is None:
             return self.size or 0
         return max(self.length.rest - self.tail_size, self.length.end, self.common_bytes)
