@@ -459,7 +459,7 @@ class LiveInput(DeviceInput):
             self._deliver(link, decode_chunks(decoder, chunks))
 
     def _decode_senders(self, chunks: list[Chunk]) -> None:
-        """Decode the chunks of the data link that the sensor sent, not another sender."""
+        """Decode those chunks of the data link that the sensor sent; drop all others."""
         chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return

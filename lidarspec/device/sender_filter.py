@@ -227,7 +227,7 @@ class SenderFilter(SenderCheck):
     def _find_frame_types(self, sender: Sender, chunk: Chunk) -> set[str]:
         """Return the types of the frames that a datagram completes.
 
-        Only `MAX_SENDERS` senders are examined; the result is empty for others.
+        Only `MAX_SENDERS` senders are examined; for further senders, the result is empty.
         """
         if sender not in self._probes and len(self._probes) >= MAX_SENDERS:
             return set()
@@ -237,8 +237,8 @@ class SenderFilter(SenderCheck):
     def _find_port(self, name: str, sender: Sender) -> Sender:
         """Return the port that frames of a type come from.
 
-        If `sender` alternates with other ports, `sender` is returned, and the others are added to
-        `_other_senders`.
+        If `sender` alternates with other ports, `sender` is returned, and the other ports are added
+        to `_other_senders`.
         """
         concurrent_port = self._find_concurrent_port(name, sender)
         if concurrent_port is not None:
@@ -258,7 +258,8 @@ class SenderFilter(SenderCheck):
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
     """Return the type and the sender of each frame found in datagrams.
 
-    If one sender sent all datagrams, each type is listed once. Empty if a sender is unknown.
+    If one sender sent all datagrams, each type is listed once. The result is empty if a sender is
+    unknown.
 
     Args:
         chunks: the datagrams.

@@ -658,7 +658,7 @@ class Session:
 def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     """Return the options that a reply reports, by name.
 
-    Empty if the command declares no `learns`, or if the reply is not confirmed.
+    The result is empty if the command declares no `learns`, or if the reply is not confirmed.
 
     Raises:
         CommandError: if `learns` raises, or returns an invalid option.

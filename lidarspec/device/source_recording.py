@@ -55,7 +55,7 @@ def make_recorder(
         overwrite: whether the file may exist.
 
     Raises:
-        UnknownFormat, UsageError, SourceError: the same as `open_recorder`.
+        UnknownFormat, UsageError, SourceError: as `open_recorder` raises them.
     """
     if isinstance(opened, RecordingTransport):
         header = opened.header

@@ -47,7 +47,8 @@ class SourceAddress:
         """Return the parts of a live SOURCE.
 
         Args:
-            text: the SOURCE, "udp://:2368?src=10.0.0.5". If `scheme` is given, the scheme may be
+            text: the SOURCE, such as "udp://:2368?src=10.0.0.5". If `scheme` is given, the scheme
+                may be
                 omitted.
             scheme: a scheme that replaces the scheme of the text.
         """
@@ -168,7 +169,7 @@ def resolve_host(host: str, place: str) -> str:
 
 
 def find_own_address(host: str) -> str | None:
-    """Return the address of this computer that it uses to reach a host, else None."""
+    """Return the address with which this computer reaches a host; None if unknown."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

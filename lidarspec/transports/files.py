@@ -214,7 +214,7 @@ class FileTransport(Transport):
     def can_resume(self) -> bool:
         """Whether another transport can continue reading at the current offset.
 
-        This requires a seekable file, which is a capture or has raw bytes.
+        This requires a seekable file that is a capture or contains raw bytes.
         """
         return (
             type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport)

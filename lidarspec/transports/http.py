@@ -82,7 +82,7 @@ class HttpTransport(LiveTransport):
         self.closed = True
 
     def _send_request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
-        """Return the status, the body and the target of a redirection of the reply.
+        """Return a reply's status, body and redirection target.
 
         Raises:
             OSError, HTTPException: if the connection fails.

@@ -117,10 +117,11 @@ def find_users(port: str) -> tuple[PortUser, ...]:
 
 
 def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
-    """Return the other programs that have opened a UDP port; None if the port is free.
+    """Return the other programs that have opened a UDP port.
 
     Returns:
-        An empty tuple if the port is in use by a program of another user, which is not visible.
+        None if the port is free. An empty tuple if it is in use by a program of another user, which
+        is not visible.
     """
     inodes = set()
     for table in _UDP_TABLES:

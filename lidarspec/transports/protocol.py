@@ -264,7 +264,7 @@ class LiveTransport(Transport):
     def addressed(self) -> bool:
         """Whether `write` has a destination.
 
-        Only a datagram source has no destination, as long as the address of the sensor is unknown.
+        It has none only if the source sends datagrams and the address of the sensor is unknown.
         """
         return True
 

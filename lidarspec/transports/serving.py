@@ -80,7 +80,7 @@ class FairLock:
 
     @contextlib.contextmanager
     def hold(self, stop: threading.Event) -> Iterator[bool]:
-        """Hold the lock during the block; yield False if `cancel` was called instead.
+        """Hold the lock in the context; yield False if `cancel` was called instead.
 
         Args:
             stop: an event by which `cancel` identifies the waiting thread.
