@@ -397,7 +397,7 @@ class FrameClock:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
 
     def _write_dates(self, table: CompiledTable, readings: Times) -> None:
-        """Write the dates of readings, (n,) ns since 1970, into fields beside the clock.
+        """Write the dates of readings, (n,) ns since 1970, into fields outside the clock.
 
         Frames after a restart have no date, and keep their values.
         """
@@ -592,7 +592,7 @@ def _shift_raw(
 
 
 def _describe_form(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties that are equal in fields with times of the same clock."""
+    """Return the properties by which fields with times of the same clock are found."""
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 

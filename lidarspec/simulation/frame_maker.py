@@ -74,7 +74,7 @@ class FrameMaker:
             sensor: id of the sensor, for messages.
             root: the node of the parts.
             limit: maximum length of a frame, in bytes.
-            given: raw values of the fields of the frame that the parts depend on.
+            given: raw values of those fields of the frame on which the parts depend.
         """
         maker = cls.__new__(cls)
         maker._coder = None  # only whole frames have a wire form
