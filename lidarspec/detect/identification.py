@@ -79,8 +79,8 @@ class Distinction(NamedTuple):
     Attributes:
         candidates: the evidence for each candidate that may have sent the frames, by id; "" without
             evidence.
-        others: related models without an installed plugin that may have sent the frames: the
-            difference of each, by id. If `candidates` is empty, one of these models has sent the
+        others: the difference of each related model that has no installed plugin and may have sent
+            the frames, by id. If `candidates` is empty, one of these models has sent the
             frames.
     """
 
@@ -423,8 +423,8 @@ class Verdict:
         sample: the bytes.
         scores: all sensors that fit, best first.
         candidates: the sensors that remain possible after comparing related models.
-        others: related models without an installed plugin that are possible: the difference of
-            each, by id. If `candidates` is empty, one of these models has sent the bytes.
+        others: the difference of each related model that has no installed plugin and may have sent
+            the bytes, by id. If `candidates` is empty, one of these models has sent the bytes.
         fault: a description of the fault if frames match a sensor except for their checksums; else
             "".
     """
@@ -473,10 +473,10 @@ def _list_sensors_with_frames() -> list[Sensor]:
 
 
 def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Return a text if frames match a sensor, but all their checksums are invalid.
+    """Return a message about frames that match a sensor except for all checksums.
 
     Returns:
-        The text, with a checksum algorithm that fits; "" for any other bytes.
+        The message, which names a checksum algorithm that fits; "" for all other bytes.
     """
     unchecked = _score_each(
         _list_sensors_with_frames(),

@@ -393,14 +393,14 @@ def limits(low: float, high: float, between: str = "..") -> str:
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Return the range of a numeric command argument, or the type of any other."""
+    """Return the range of a numeric command argument, or another argument's type."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.describe(None)
 
 
 def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
-    """Return the names of a command argument's values, or `format_argument_type`."""
+    """Return the names of an argument's values, or else its `format_argument_type`."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(argument_slot(sensor, command, argument).info, kind)

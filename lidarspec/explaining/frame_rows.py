@@ -169,7 +169,7 @@ class FrameRows:
         return info
 
     def _find_fault(self, field: WireField, info: FieldInfo) -> str:
-        """Return a text that describes the fault of a field's value, "" for a valid value."""
+        """Return a text that describes the fault of a field's value; "" if it is valid."""
         if info.const is not None and field.raw != info.const:
             shown = format_hex(field.raw, info.bits)
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"

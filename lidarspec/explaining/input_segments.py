@@ -115,7 +115,10 @@ def iter_pieces(
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor with a frame type moved first, incoming and without `after`."""
+    """Return the sensor, changed so that a frame type is preferred.
+
+    The frame type is then the first, is incoming, and has no `after`.
+    """
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
