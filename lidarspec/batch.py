@@ -86,7 +86,7 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class FilePiece:
-    """Some scans of a file, and their output.
+    """A piece of a file: some of its scans, and the output to which they are written.
 
     Attributes:
         source: the path or URL of the file.
