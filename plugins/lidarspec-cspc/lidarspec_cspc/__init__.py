@@ -261,9 +261,10 @@ def correction(distance: Any) -> Any:
 def directions(f: Fields, zero: str) -> tuple[Any, Any]:
     """Return the angles of the samples in degrees, uncorrected and corrected.
 
-    Uncorrected angles are evenly spaced from FSA to LSA, relative to the zero of the data.
-    Corrected angles (manual 2.2.3) are clockwise from the zero of the data, or from the mark on the
-    housing if `zero` is "housing". If the sensor reports that it does not turn clockwise, the sent
+    Uncorrected angles are evenly spaced from FSA to LSA, relative to the zero direction of the
+    data. Corrected angles (manual 2.2.3) are clockwise from the zero direction of the data, or from
+    the mark on the housing if `zero` is "housing". If the sensor reports that it does not turn
+    clockwise, the sent
     angles are assumed to be counter-clockwise; the manual describes only clockwise rotation.
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)

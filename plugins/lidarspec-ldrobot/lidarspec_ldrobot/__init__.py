@@ -234,7 +234,8 @@ def make_lidar(
     Args:
         name: a key of `POINT_RATES_HZ`.
         turns: simulated revolutions per second.
-        correct_parallax: as for `points`. older_rate: points per second of older units.
+        correct_parallax: as for `points`.
+        older_rate: points per second of older units.
         frames: the frames other than the data.
         more: further arguments of `Sensor`.
     """

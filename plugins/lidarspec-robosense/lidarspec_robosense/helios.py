@@ -163,7 +163,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points_16p(f: Fields) -> Polar:
-    """Return the points of blocks with two firings; rings are in the order of a block."""
+    """Return the points of blocks with two firings; rings count the lasers of a block."""
     polar = points_of_groups(
         f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, laser_angles(f)
     )
@@ -188,7 +188,7 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def has_block_pairs(f: Fields) -> Any:
-    """Return whether pairs of blocks have the same azimuth, as with two returns."""
+    """Return whether pairs of blocks have one azimuth, as they do with two returns."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 

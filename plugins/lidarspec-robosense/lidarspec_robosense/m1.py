@@ -276,7 +276,7 @@ def sweep(i: int, temperature: int = 105, *, is_dual: bool = False) -> dict[str,
 
 
 def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
-    """Return the device information of a sensor with the factory's settings, or dual return."""
+    """Return the device information with factory settings, or with dual return."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     modes = {
         "return_mode": WAVE_MODES["dual" if is_dual else "strongest"],

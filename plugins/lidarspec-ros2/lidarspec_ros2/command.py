@@ -143,7 +143,7 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
 
 def _find_shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
-    """Return the shared memory for the parameters' sensor, before the node exists."""
+    """Return the shared memory for the parameters' sensor; the node need not exist."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from lidarspec.transports.open_url import live_address

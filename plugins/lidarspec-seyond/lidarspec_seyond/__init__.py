@@ -208,7 +208,8 @@ def points(f: Fields) -> Polar:
 def sweep(i: int, returns: int = 1) -> dict[str, Any]:
     """Return the simulated values of packet i.
 
-    Lines of 120 degrees, with four channels each, run from the top to the bottom of 25 degrees.
+    A line has four channels and is 120 degrees wide. The lines follow each other from top to
+    bottom, over 25 degrees.
     """
     count = (MAX_DATAGRAM_BYTES - HEADER_2_BYTES) // BLOCK_BYTES[returns]
     block_index = i % SIMULATED_PACKETS * count + np.arange(count)

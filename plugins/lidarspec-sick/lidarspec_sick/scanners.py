@@ -154,7 +154,7 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
     """Return the scanner with commands in CoLa A or B, and with a number of echoes.
 
     Scans in CoLa A and in CoLa B are read, with one echo or with `echoes` echoes. If `echoes` is 0,
-    it is the maximum of the scanner.
+    the maximum number of the scanner is used.
 
     Raises:
         UsageError: if the scanner has fewer echoes.

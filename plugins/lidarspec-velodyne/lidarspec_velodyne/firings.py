@@ -115,7 +115,7 @@ def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> A
 
 
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
-    """Return the sensor with another rule for the last block (see the module)."""
+    """Return the sensor with one of the rules for the last block (module docstring)."""
 
     def set_rule(function: Any) -> Any:
         return function and partial(function, last_block=last_block)

@@ -151,7 +151,7 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 
 
 def is_plausible_single(f: Fields) -> Any:
-    """Return whether a packet has single return, and three times all four banks."""
+    """Return whether a packet has single return, and each bank three times."""
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))

@@ -229,7 +229,7 @@ class Broadcast:
         self._has_request.set()
 
     def seek(self, to: float) -> None:
-        """Continue a file at a time in seconds from its first scan.
+        """Continue a file at the time `to`, in seconds from its first scan.
 
         Raises:
             UsageError: if the source does not support seeking.
@@ -407,7 +407,7 @@ class Broadcast:
         return clock.offset_s - samples[0].offset_s
 
     def _arrival(self, scan: Scan) -> float:
-        """Return the arrival time of a scan's last packet, s since 1970; for a file, now."""
+        """Return when a scan's last packet arrived, s since 1970; for a file, return now."""
         if self.is_live and len(scan):
             host_ns = scan.provenance(len(scan) - 1).host_ns
             if host_ns:

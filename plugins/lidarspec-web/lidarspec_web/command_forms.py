@@ -26,8 +26,8 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
     """Return the commands that stop the data and start it again.
 
-    The commands for opening are preferred. Returns None if there are no such commands without
-    arguments.
+    The commands for opening are preferred. Commands with arguments are ignored. Returns None if
+    there are no others.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]

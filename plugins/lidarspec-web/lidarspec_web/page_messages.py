@@ -210,7 +210,7 @@ class PageMessages:
         return piece.verdict(self.broadcast.device.sensor)
 
     def _position(self, at: int) -> float | None:
-        """Return the seconds from the first scan to an arrival time, ns since 1970."""
+        """Return the seconds from the first scan to the arrival time `at`."""
         began_ns = self.broadcast.began_ns
         if at <= 0 or not began_ns:
             return None

@@ -54,7 +54,7 @@ class RateLimit:
         self._due = 0.0
 
     def delay_s(self, now: float) -> float:
-        """Count a message at a time of `time.monotonic`, and return its delay in seconds."""
+        """Count a message that arrives at the time `now`, and return its delay in seconds."""
         self._due = max(self._due, now - self._burst_s) + self._period_s
         return max(self._due - now, 0.0)
 
