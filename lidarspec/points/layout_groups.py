@@ -50,7 +50,7 @@ class PlainValues:
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def read_raw(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
-        """Return the integers of a field as they were sent, (n, ...).
+        """Return the raw integers of a field, (n, ...).
 
         The integers are those of packets `first` to `stop - 1`. Returns None unless the node is an
         integer field without scale that every packet has.
@@ -118,7 +118,7 @@ class GroupPoints:
         """Return columns of packets `first` to `stop - 1`; a `stop` of None means all.
 
         Args:
-            maker: computes the columns.
+            maker: the object that computes the columns.
         """
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))

@@ -60,7 +60,7 @@ class Kernel(ColumnMaker):
 
     @functools.cached_property
     def is_compiled(self) -> bool:
-        """Whether the compiled code was loaded or on disk when this was first read."""
+        """Whether the code was loaded or on disk when this property was first read."""
         return self.is_ready or is_code_available(self._text.source)
 
     def compile(self) -> None:

@@ -167,7 +167,7 @@ class Expressions(KernelWriter):
 
         Args:
             kind: the dtype of the table in the kernel.
-            table: replaces the table of the node.
+            table: a table to use in place of the table of the node.
         """
         index = node.args[0]
         table = node.args[1] if table is None else table

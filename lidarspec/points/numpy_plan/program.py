@@ -68,8 +68,8 @@ class ProgramStep:
     """One call, `run(execution, output)`, and the registers that it reads.
 
     Attributes:
-        text: a description.
-        run: the call.
+        text: a description of the call.
+        run: the function to call.
         output: the register that it fills.
         reads: the registers that it reads.
     """
