@@ -49,8 +49,8 @@ class SearchState:
     """The state of the search that is kept between the pieces of a stream.
 
     Attributes:
-        after: the name of the last frame type that is named in an `after`; None before the first
-            such frame.
+        after: of all frame types that are named in any `after`, the name of the one that arrived
+            last; None before the first such frame.
         changed: the stream offset at which the active types last changed.
         run: the name of the weak type of the last accepted run.
         run_end: the stream offset of the end of this run.
@@ -428,7 +428,10 @@ class Candidates:
             self.checked[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return the number of candidates, counted from the first, that can be checked now."""
+        """Return the number of candidates, from the first on, that can be checked.
+
+        Later candidates have to wait, because their constants have not all arrived.
+        """
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)
         last = len(self.buffer) - self._framing.ends[kind]

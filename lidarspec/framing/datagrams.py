@@ -3,8 +3,8 @@
 As in a stream, the first active type in order that matches is used, and a type with `after` may be
 inactive. A frame must be as long as its datagram. Datagrams of one size and type are checked as the
 rows of an array (`lidarspec.framing.regular_rows`). Otherwise the datagrams are checked type by
-type, each type with the datagrams that no earlier type has accepted. A datagram for which a plugin
-raises an error is checked alone, so that the other datagrams are not lost.
+type, each type with the datagrams that no type before it has accepted. A datagram for which a
+plugin raises an error is checked alone, so that the other datagrams are not lost.
 
 The fragments of a message are joined before its frame type is found
 (`lidarspec.framing.datagram_assembly`).
@@ -125,7 +125,7 @@ class _DatagramBatch:
         return frames
 
     def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """Return the type and layout of each datagram, and the reasons of invalid datagrams.
+        """Return the type and layout of each datagram, and why a datagram is invalid.
 
         All datagrams are checked with the active types of `mode`. The reason is 0 for datagrams
         without the constants of any type, and `PLUGIN` for datagrams that must be checked alone.

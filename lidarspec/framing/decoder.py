@@ -338,7 +338,7 @@ class Decoder:
             final: whether no bytes follow.
 
         Returns:
-            The offset of the pending bytes.
+            The offset at which the pending bytes begin.
         """
         start = 0
         while start < len(buffer) and len(buffer) - start >= self._need:
@@ -410,7 +410,7 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count skipped bytes, and return their numbers without fillers.
+        """Count skipped bytes, and return the number of non-fillers at each place, (n,).
 
         Args:
             buffer: the bytes.

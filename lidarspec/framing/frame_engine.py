@@ -1,9 +1,9 @@
 """The codec of binary frames with layouts.
 
 `CompiledCodec` checks many candidates at once. The header of a candidate is read once, and its
-layout is kept for making columns. `get_codec` returns the codec of a frame type, which may also be
-the codec of frames with a wire form (`lidarspec.framing.text_frames`) or without layouts
-(`lidarspec.framing.plain_frames`).
+layout is kept for making columns. `get_codec` returns the codec of any frame type. Frames with a
+wire form (`lidarspec.framing.text_frames`) and frames without layouts
+(`lidarspec.framing.plain_frames`) have other codecs.
 """
 
 from __future__ import annotations
@@ -147,9 +147,9 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse candidates that are too long, for frames up to the end of a datagram.
+        """Refuse candidates that are too long.
 
-        A stream has no such frame type.
+        This is for frame types that extend to the end of the datagram. A stream has none of them.
         """
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:
@@ -221,7 +221,7 @@ class CompiledCodec(Codec):
             Three values: the status of each candidate; the size of each candidate in bytes, or the
             number of bytes needed to decide about it; and the bytes of complete candidates, (n,
             size), or None. The bytes are returned only if `gathered` is set, no complete candidate
-            follows an incomplete one, and there are not too many.
+            follows an incomplete one, and the bytes are not too many.
         """
         whole = offsets <= (len(buffer) if stops is None else stops) - layout.size
         count = int(np.count_nonzero(whole))

@@ -130,7 +130,10 @@ class CandidateChecker:
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
-        """Set the status of valid candidates with a wrong constant or length."""
+        """Set the status of candidates that have a wrong constant or a wrong length.
+
+        All candidates are valid so far.
+        """
         held = match_constants(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT

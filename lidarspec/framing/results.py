@@ -134,7 +134,7 @@ class Counters:
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """Return the first error of a sensor's plugin, with the number of packets.
+        """Return the first error of a plugin, with the number of packets that failed.
 
         Returns None if there was no error.
         """

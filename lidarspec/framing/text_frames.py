@@ -77,7 +77,7 @@ class TextCodec(Codec):
         """Check complete candidates; equal candidates are decoded once.
 
         Args:
-            frames: all candidates. Errors of the plugin are added to it.
+            frames: all candidates. Errors of the plugin are added to this object.
             which: the indices of the candidates to check.
             status: the status of all candidates, which is updated.
         """

@@ -66,7 +66,10 @@ class LayoutFamily:
 
 
 class LayoutFamilies:
-    """The families of the layouts of a frame type."""
+    """The families of the layouts of a frame type.
+
+    The layouts of a family differ only in the length of an array.
+    """
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
