@@ -392,11 +392,11 @@ class _Elements:
 
 @dataclass(frozen=True, eq=False)
 class _PartRows:
-    """Parts of one layout that were found in one round.
+    """Parts of one layout that one round of the search has found.
 
     Attributes:
         layout: the layout of the parts.
-        buffer: the bytes that contain them.
+        buffer: the bytes that contain the parts.
         offsets: the offsets of the parts in the buffer, (k,).
         frames: the indices of the frames that contain the parts, (k,).
     """

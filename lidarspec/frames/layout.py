@@ -76,8 +76,8 @@ def gather_rows(
     Nothing is copied if each row follows the previous one in the buffer.
 
     Args:
-        gathered: whether the result has to be C-contiguous. If not, nothing is copied for evenly
-            spaced offsets either.
+        gathered: whether the result has to be C-contiguous. If not, rows at evenly spaced offsets
+            are not copied either.
     """
     count = len(offsets)
     if not count or not size:

@@ -757,8 +757,8 @@ class _CandidateSet:
     Frames have at most `limit` bytes.
 
     Attributes:
-        refuted: indices of candidates that are incomplete or too long, and in which an earlier
-            constant is wrong.
+        refuted: the indices of candidates that are incomplete or too long, and have a wrong
+            constant.
     """
 
     def __init__(

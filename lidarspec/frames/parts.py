@@ -134,7 +134,7 @@ class PartRule:
 
 @dataclass(frozen=True, eq=False)
 class PartRound:
-    """Parts of one layout that were found in one round.
+    """Parts of one layout that one round of the search has found.
 
     Attributes:
         kind: the index of the kind of the parts.
@@ -155,7 +155,7 @@ class FoundParts:
     Attributes:
         status: `FOUND`, or the reason why not all parts were found, (n,).
         sizes: the total size of the parts that were found in each frame, in bytes, (n,).
-        rounds: the parts that were found in each round.
+        rounds: the parts that were found in each round of the search.
         errors: the errors of plugin expressions.
     """
 
@@ -270,7 +270,7 @@ class _PartWalk:
         return FoundParts(self._status, self._ends - self._starts, rounds, tuple(self._errors))
 
     def _select_unfinished(self, active: Offsets, number: int) -> Offsets:
-        """Return the frames that have another part.
+        """Return the frames that have a further part.
 
         Args:
             number: the number of parts that were found in each frame.

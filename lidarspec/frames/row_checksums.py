@@ -107,7 +107,7 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Return whether one call for each row is faster than NumPy for all rows."""
+    """Return whether computing row by row is faster than NumPy for all rows."""
     if not isinstance(algorithm, Crc):
         return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
@@ -442,7 +442,7 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return one word for each row that has the same register as the row, (n,).
+    """Return for each row one word with the same register as the row, (n,).
 
     The polynomial `poly` must have eight bits.
     """

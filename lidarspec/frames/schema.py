@@ -197,7 +197,7 @@ class Schema:
         }
 
     def within(self, path: str) -> tuple[str, str, str] | None:
-        """Split a path that leads into parts into axis, kind and remaining path.
+        """Split the path of a field in parts into axis, kind and remaining path.
 
         Returns None if the path does not lead into parts.
 

@@ -115,7 +115,7 @@ class _FieldFinder:
 
 
 def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
-    """Return the fields that follow from a header, and the offset after the last one."""
+    """Return the fields that a header determines, and the offset after the last one."""
     if isinstance(node.result, Layout):
         return tuple(node.result.leaves.values()), node.result.size
     if isinstance(node.leaf, Leaf):
