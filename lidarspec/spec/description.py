@@ -411,7 +411,7 @@ class Reported:
 
     @classmethod
     def of(cls, declared: str | Reported) -> Reported:
-        """Return an entry of `Sensor.info`, which may be declared as a path only."""
+        """Return an entry of `Sensor.info`; an entry that is only a path is converted."""
         if isinstance(declared, str):
             return cls(declared)
         return declared

@@ -469,7 +469,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
     Args:
         info: the field in the array.
-        path: the path of the new field.
+        path: the path of the element.
         indices: the index by axis. These axes are removed.
     """
     if not indices.keys() <= set(info.axes):

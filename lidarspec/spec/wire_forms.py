@@ -4,7 +4,7 @@ A wire form encodes and decodes one frame at a time. `find_end` finds the end of
 `decode` converts it to the bytes of the struct, and `encode` converts the bytes of the struct to
 the encoded frame. All other packages use the bytes of the struct, as for binary frames.
 
-Which fields a text has often depends on earlier fields, for example on counts. `decode` therefore
+The fields of a text often depend on earlier fields, for example on counts. `decode` therefore
 repeatedly requests the next runs of fields, given the bytes that it has decoded so far. A run is
 one text field, or consecutive numbers, whose digits NumPy converts together.
 """
@@ -352,7 +352,7 @@ def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
 
 @lru_cache(maxsize=64)
 def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
-    """Return the value of each character as a digit, and a mask of digits, (256,) each."""
+    """Return the value of each character as a digit, and a mask of digits, 256 each."""
     values = np.zeros(256, np.uint64)
     is_digit = np.zeros(256, np.bool_)
     for value, character in enumerate("0123456789ABCDEF"[:base]):

@@ -273,7 +273,10 @@ def part_adapter(con: Construct) -> tree.Adapter | None:
 
 
 def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None:
-    """Return a function that decodes arrays of bytes; None if their size may change."""
+    """Return a function that decodes arrays of bytes.
+
+    Returns None if decoding may change the size.
+    """
     xor = _find_xor(con)
     if xor is None or not isinstance(xor.subcon, construct.Bytes | type(construct.GreedyBytes)):
         return None
@@ -284,7 +287,10 @@ def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[
 
 
 def _find_xor(con: Construct) -> construct.ProcessXor | None:
-    """Return the ProcessXor of a part, with or without a size; None without one."""
+    """Return the ProcessXor of a part; None without one.
+
+    The ProcessXor may be in a FixedSized.
+    """
     while isinstance(con, construct.FixedSized):
         con = con.subcon
     return con if isinstance(con, construct.ProcessXor) else None

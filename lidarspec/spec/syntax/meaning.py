@@ -655,7 +655,7 @@ class _Builder:
         Returns None if an element is not a struct, is in another array, or cannot be compiled.
 
         Args:
-            con: the element.
+            con: the construct of an element.
             element: the node of the element.
             until: the predicate of construct's RepeatUntil, or None.
         """
@@ -1195,7 +1195,10 @@ def _is_text(con: Construct) -> bool:
 
 
 def _find_opaque_reason(con: Construct) -> str:
-    """Return the reason, in a part or inside it, why only construct can read the part."""
+    """Return the reason why only construct can read a part.
+
+    The reason may be a construct inside the part.
+    """
     below = con
     while author_class(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
         below = below.subcon

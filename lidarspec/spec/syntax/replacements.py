@@ -431,7 +431,7 @@ class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
 
 
 class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
-    """A Compressed that reports bytes that cannot be decompressed as an invalid value."""
+    """A Compressed that raises `MismatchError` for bytes that cannot be decompressed."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()

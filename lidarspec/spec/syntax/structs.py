@@ -330,7 +330,7 @@ def find_xor_key(con: construct.ProcessXor) -> bytes | None:
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
-    """Return a hidden field with a name and documentation derived from its member."""
+    """Return a hidden field; its name and documentation are derived from the member."""
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
 
 
