@@ -506,7 +506,7 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
     """Return the common name of an axis of two values.
 
-    A name is None if the axis of this value has no name.
+    A name is None if the axis has no name in that value.
 
     Raises:
         SpecError: if the names belong to different arrays, and neither was guessed.

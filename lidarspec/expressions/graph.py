@@ -626,7 +626,7 @@ class _ResultPart:
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _get_cached(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-        """Return the integer for one packet, (1,), from the cache if its fields were seen before.
+        """Return the integer for one packet, (1,), from the cache if it is there.
 
         Args:
             columns: the raw values of the fields, (1,) each.
