@@ -589,7 +589,7 @@ def _write_names(labels: Mapping[int, str], name: str) -> str:
 
 
 def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
-    """Return a C function that returns the first value with a true condition.
+    """Return a C function that returns the first value whose condition is true.
 
     The C function returns 0 if no condition is true.
 
