@@ -157,7 +157,7 @@ def _make_ply_header(rows: PointRows) -> bytes:
 
 
 def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.dtype[Any]:
-    """Return the type of a row without padding, with the types that a format supports."""
+    """Return the dtype of a row without padding; unsupported types are replaced."""
     codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
     return np.dtype([(name, "<" + supported.get(code, code)) for name, code in codes.items()])
 
