@@ -125,8 +125,8 @@ class PlanarScans:
 def _find_grid_start(begin: float, end: float, step: float) -> float:
     """Return the first angle of a grid over the whole turn, radians from -pi to pi.
 
-    The grid begins at the point that was measured first. If angles decrease with time, the grid
-    begins at the point that was measured last.
+    If angles increase with time, the grid begins at the point that was measured first. If they
+    decrease, it begins at the point that was measured last.
 
     Args:
         begin: the first measured angle, radians.

@@ -140,7 +140,7 @@ class OpenScan(NamedTuple):
         return self.lost > 0 or self.is_broken
 
     def add(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts of the scan with further packets, at least one."""
+        """Return the counts of the scan after adding packets, at least one."""
         since = self.since
         if not self.packets:
             since = packets.times.item(0)

@@ -1,4 +1,4 @@
-"""Limit the duration and size of a scan, so that a scan without an end does end.
+"""Limit the duration and the size of scans, in case the end of a scan is missing.
 
 The duration of a scan, by the times of the packets, is limited to twice the duration of the slowest
 revolution. If the number of points of a scan is constant, its size is limited to twice this number.

@@ -108,8 +108,8 @@ class Masking:
     def _hold_or_release(self, held: Packets) -> list[Packets]:
         """Release or hold packets, and return a list of the released packets.
 
-        After a leap, all packets from the last one before the leap on are held. Otherwise only the
-        last packet is held.
+        After a leap, the last packet before the leap and all later packets are held. Otherwise only
+        the last packet is held.
         """
         self._held = [held]
         if self._is_settled:

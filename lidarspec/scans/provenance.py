@@ -58,7 +58,7 @@ class Provenance:
 
     Args:
         runs: the points of the scan, in stream order.
-        indices: the selected points among them; None for all.
+        indices: the indices of the selected points in `runs`; None for all.
     """
 
     def __init__(

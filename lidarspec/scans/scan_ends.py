@@ -92,7 +92,7 @@ class EndFinder:
         self._passes.restart(at, sector.direction, angle)
 
     def find(self, packets: Packets, points: EvaluatedPoints) -> list[ScanEnd]:
-        """Return the ends in a batch of packets, in order."""
+        """Return the ends of scans in a batch of packets, in order."""
         rule = self._rule
         if self._passes is not None:
             return self._find_passes(self._passes, packets, points)

@@ -48,7 +48,8 @@ class ScanStream:
     Args:
         sensor: the sensor that sends the packets.
         mount: the mount of the sensor; the scans are then in the axes of its carrier.
-        imu: the buffer of its IMU samples. Add samples before the packets that arrived with them.
+        imu: the buffer of the sensor's IMU samples. Add samples before the packets that arrived
+            with them.
     """
 
     def __init__(
@@ -210,8 +211,8 @@ class ScanStream:
 
         Args:
             following: the start of the next scan; None if unknown.
-            whole: the attribute of the scan.
-            complete: the attribute of the scan.
+            whole: the value for `Scan.whole`.
+            complete: the value for `Scan.complete`.
         """
         runs = self._runs
         start = self._start
@@ -256,9 +257,9 @@ class ScanStream:
 def _read_starts(
     packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
-    """Return the start of the scan that begins at each of some points.
+    """Return the starts of the scans that begin at some points.
 
-    The item is None if the index is past the last point.
+    The start is None for an index after the last point.
 
     Args:
         indices: the indices of the first points of scans in `points`, ascending.
