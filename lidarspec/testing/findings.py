@@ -101,7 +101,7 @@ LS415 the same bytes give different results | results cannot be reproduced | use
 LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians; 0 is no return
 LS502 angles are in degrees | radians are expected, so directions are wrong | use np.deg2rad(...)
 LS503 a single point has no direction | a count of 1 divides by count - 1 | use spread(start, end, count, full=360.0)
-LS504 angles run backwards across the full circle | one packet a turn is spread over the whole circle
+LS504 angles run backwards across the full circle | once per turn, a packet is spread over the whole circle
       | use spread(..., full=360.0)
 LS505 an angle of exactly the full circle is not folded | sensors send 360.00 degrees for 0
       | use wrap(angle, 360.0), or reject it in `plausible`

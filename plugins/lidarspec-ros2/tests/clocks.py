@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 JITTERS: dict[str, Callable[[Random, int], Floats]] = {
     "uniform, 0 to 5 ms": lambda random, n: random.uniform(0, 5e-3, n),
     "exponential, mean 5 ms": lambda random, n: random.exponential(5e-3, n),
-    "half of a normal one, 5 ms": lambda random, n: np.abs(random.normal(0, 5e-3, n)),
-    "5 ms ± 5 ms, uniform": lambda random, n: random.uniform(0, 10e-3, n),
+    "half-normal, sigma 5 ms": lambda random, n: np.abs(random.normal(0, 5e-3, n)),
+    "uniform, 0 to 10 ms": lambda random, n: random.uniform(0, 10e-3, n),
 }
 #: seconds at which the clock is set, and starts again, and after which stamps are to be right.
 SET, AGAIN, END, SETTLING = 40.0, 80.0, 120.0, 10.0
@@ -112,7 +112,7 @@ def main(runs: int) -> None:
         f"{rate} scans{f', {rate * each} packets' * (each > 1)} a second, {drift} ppm"
         for rate, each, drift in CASES
     ]
-    print(f"| late by | {' | '.join(heads)} |\n|---|{'---:|' * len(CASES)}")
+    print(f"| delay of packets | {' | '.join(heads)} |\n|---|{'---:|' * len(CASES)}")
     for jitter in JITTERS:
         cells = []
         for rate, each, drift in CASES:
