@@ -248,7 +248,7 @@ def _add_points(
             "the points use default values, because the frame with the actual values is missing"
         )
     points = [ExplainedPoint.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
-    chain = packets.table.schema.chain
+    chain = packets.table.schema.deepest_axes
     parts = _find_parts_with_points(sensor, name, data)
     if not chain and not parts:
         return rows, (*notes, *(f"point {point}" for point in points[:MAX_LISTED_POINTS]))

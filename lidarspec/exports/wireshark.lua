@@ -472,7 +472,7 @@ local function likely(tvb, at, stop, last)
 end
 
 -- What is sound and asked for by nobody, neither a tree on the screen nor a filter, is not taken apart.
-local function show(frame, tvb, at, size, root, told, is_sound, doubts)
+local function show(frame, tvb, at, size, root, told, is_all_valid, doubts)
   local item = root:add(proto, tvb(at, size), string.format("%s, %s, %d bytes", sensor.title, frame.name, size))
   local shown = item:add(kind, tvb(at, size), frame.name):set_generated(true)
   local named = frame.name
@@ -480,7 +480,7 @@ local function show(frame, tvb, at, size, root, told, is_sound, doubts)
   if named ~= frame.name then
     shown:add_proto_expert_info(marks.unsure, named .. ": these bytes do not distinguish the types, or only Python code can")
   end
-  if is_sound and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, named) end
+  if is_all_valid and not root:referenced(Dissector.get(proto.name:lower())) then return table.insert(told, named) end
   local begun = walk(frame, tvb, at, at + size)
   local done, problem = pcall(begun.visit, begun, frame.root, item)
   if not done and type(problem) ~= "table" then error(problem, 0) end

@@ -214,7 +214,7 @@ class Column(NDArrayOperatorsMixin):
                 f"a column inside {len(own)} nested arrays cannot be moved to {axes}: name as many"
                 " arrays"
             )
-        names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
+        names = {schema.array_depths[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
         array = self.array
         for index, place in zip(own, places, strict=True):
@@ -243,7 +243,9 @@ class Column(NDArrayOperatorsMixin):
             names = list(schema.fields[self.source].axes)
         if not names:
             raise SpecError("`index` exists only for a field inside an array")
-        return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
+        return AlongAxis(
+            (names[-1],), np.arange(self.array.shape[1 + schema.array_depths[names[-1]]])
+        )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
         """Return 0, 1, 2 ... up to the largest value minus 1, (m,).
@@ -259,8 +261,8 @@ class Column(NDArrayOperatorsMixin):
         ]
         if len(counted) == 1:
             axis = counted[0]
-        elif schema.chain:
-            axis = schema.chain[-1]
+        elif schema.deepest_axes:
+            axis = schema.deepest_axes[-1]
         else:
             axis = None
         if axis is None:
@@ -284,7 +286,7 @@ class Column(NDArrayOperatorsMixin):
             row_numbers(add_axes(self.array, depth).squeeze(1 + place), len(table)), axis=0
         )
         axes = [*self.axes, *(None,) * (depth - len(self.axes))]
-        axes[place] = f"?{self.batch.table.schema.chain[place]}"
+        axes[place] = f"?{self.batch.table.schema.deepest_axes[place]}"
         return Column(np.moveaxis(rows, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
 
     def running(self) -> Column:
@@ -445,7 +447,7 @@ def align(
         return arrays, columns[0].axes, min([column.ready for column in columns])
     schema = batch.table.schema
     named = {
-        at: {schema.places[axis]: axis for axis in map(schema.axis, v.axes)}
+        at: {schema.array_depths[axis]: axis for axis in map(schema.axis, v.axes)}
         for at, v in enumerate(values)
         if isinstance(v, AlongAxis)
     }
@@ -558,7 +560,7 @@ def _reshape_to_axes(
         )
     for place in range(max(depth - array.ndim, 0), depth):
         if array.shape[place - depth] != 1 and axes[place] is None:
-            chain = table.schema.chain
+            chain = table.schema.deepest_axes
             if array.ndim > depth:
                 guess = ""
             else:
@@ -590,7 +592,7 @@ def _find_axis(
     texts = {info.path for info in table.schema.fields.values() if info.kind == "bytes"}
     whole = {
         (place, table.length(axis)): axis
-        for axis, place in table.schema.places.items()
+        for axis, place in table.schema.array_depths.items()
         if axis not in texts and place not in without
     }
     for known in (there, whole):
@@ -788,7 +790,7 @@ def field_column(
         array = array[which]
     axes = list[str | None]([None] * (array.ndim - 1))
     for name in info.axes:
-        place = table.schema.places[name]
+        place = table.schema.array_depths[name]
         axes[place] = _name_axis(name, array.shape[1 + place], table, known=which is None)
     return Column(array, tuple(axes), batch, source=info.path, frame=frame)
 
@@ -806,7 +808,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
         array = table.raw(info.path)
     else:
         array = physical(info, table)
-    places = [table.schema.places[axis] for axis in info.axes]
+    places = [table.schema.array_depths[axis] for axis in info.axes]
     if places and places[-1] >= len(places):  # an element of an array with nested arrays
         lengths = dict(zip(places, array.shape[1:], strict=True))
         array = array.reshape(

@@ -300,7 +300,7 @@ class CompiledTable:
             groups.append(LayoutRows(group.layout, indices[is_kept], group.rows[is_kept]))
         return CompiledTable(self.schema, groups)
 
-    def walks(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
+    def find_parts(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
         """Find the parts at a path in the frames of each group that has such parts.
 
         The result is cached, because the clock, the points and each kind of parts use it.
@@ -322,7 +322,7 @@ class CompiledTable:
         node = self.schema.parts[axis]
         wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
         part_rows = list[_PartRows]()
-        for group, buffer, walked in self.walks(axis):
+        for group, buffer, walked in self.find_parts(axis):
             rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
             part_rows += [
                 _PartRows(buffer, piece.layout, piece.offsets, group.where[piece.owners])

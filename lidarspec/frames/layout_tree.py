@@ -803,10 +803,10 @@ class _CandidateSet:
             self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]
         )
         if there is not None:
-            self.cut_off(node, np.delete(which, there))
+            self.add_refuted(node, np.delete(which, there))
         return there, values
 
-    def cut_off(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
+    def add_refuted(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
         """Add the candidates with a wrong constant before this node to `refuted`."""
         if node.constants:
             self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
@@ -915,7 +915,7 @@ class HeaderTree:
                 groups.append((node.result, which))
                 continue
             if places is not None and (len(which) == 1 or node.leaf is None):
-                places.cut_off(node, which)
+                places.add_refuted(node, which)
                 continue
             there, values = read(node, which)
             which = which if there is None else which[there]

@@ -156,7 +156,7 @@ class Schema:
         }
 
     @cached_property
-    def chain(self) -> tuple[str, ...]:
+    def deepest_axes(self) -> tuple[str, ...]:
         """The axes of the field that is inside the most arrays, outermost array first."""
         return max(
             (info.axes for info in self.fields.values() if info.kind != "bytes"),
@@ -217,7 +217,7 @@ class Schema:
         return None
 
     @cached_property
-    def places(self) -> Mapping[str, int]:
+    def array_depths(self) -> Mapping[str, int]:
         """The number of arrays that contain each array, by the path of the array."""
         return {
             axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)
@@ -229,8 +229,8 @@ class Schema:
         Raises:
             SpecError: if no array has the name, or several have it.
         """
-        found = [axis for axis in self.places if axis == name] or [
-            axis for axis in self.places if axis.rpartition(".")[2] == name
+        found = [axis for axis in self.array_depths if axis == name] or [
+            axis for axis in self.array_depths if axis.rpartition(".")[2] == name
         ]
         if len(found) != 1:
             if found:
@@ -238,7 +238,7 @@ class Schema:
             else:
                 reason = f"the frame has no array {name!r}"
             raise SpecError(
-                f"{reason}; expected one of {', '.join(found or self.places) or 'none'}",
+                f"{reason}; expected one of {', '.join(found or self.array_depths) or 'none'}",
                 rule="LS214",
             )
         return found[0]
@@ -262,7 +262,7 @@ class Schema:
 
     def depth(self) -> int:
         """Return the maximum number of arrays that contain one field."""
-        return len(self.chain)
+        return len(self.deepest_axes)
 
 
 def _apply_adapter(info: FieldInfo) -> FieldInfo:

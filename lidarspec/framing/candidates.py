@@ -422,7 +422,7 @@ class Candidates:
             if not number:
                 continue
             own = self._framing.survey(kind, self.buffer, offsets[:number])
-            if not own.is_sound:
+            if not own.is_all_valid:
                 is_right = own.status != CONSTANT
                 own = own if is_right.all() else own.select(is_right)
             self.checked[kind] = own
@@ -440,7 +440,7 @@ class Candidates:
 
 def select_live(candidates: Frames, *, final: bool) -> Frames:
     """Return the valid candidates and, unless `final`, the incomplete candidates."""
-    if candidates.is_sound:
+    if candidates.is_all_valid:
         return candidates
     is_live = candidates.status <= (VALID if final else SHORT)
     number = np.count_nonzero(is_live)

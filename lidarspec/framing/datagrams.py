@@ -50,7 +50,7 @@ def sort_datagrams(
         All datagrams as frames; datagrams that are not frames have the kind -1.
     """
     steady = find_regular_datagrams(framing, buffer, starts, sizes, mode)
-    if steady is not None and steady.is_sound:
+    if steady is not None and steady.is_all_valid:
         return PieceResult(steady, len(buffer))
     return _DatagramBatch(framing, buffer, to_array(starts), sizes, steady).sort(mode)
 
@@ -166,7 +166,7 @@ class _DatagramBatch:
                 which = left
             frames = self._survey(kind, own, lengths)
             fits = frames.sizes == lengths
-            if not frames.is_sound:
+            if not frames.is_all_valid:
                 fits &= frames.status == VALID
             elif len(own) == number and fits.all():
                 return frames, reasons

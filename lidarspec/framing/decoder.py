@@ -181,7 +181,7 @@ class Decoder:
         self.stats.bytes_in += len(view)
         parts: list[Frames] = []
         start = 0
-        lasting = isinstance(data, bytes)
+        is_immutable = isinstance(data, bytes)
         if self._pending:
             held = len(self._pending)
             head = b"".join((self._pending, view[: max(self._least, self._need)]))
@@ -191,7 +191,9 @@ class Decoder:
                 start = len(view)
         if start < len(view):
             rest = np.frombuffer(view[start:], np.uint8)
-            self._pending = rest[self._find_frames(rest, at, parts, lasting=lasting) :].tobytes()
+            self._pending = rest[
+                self._find_frames(rest, at, parts, is_immutable=is_immutable) :
+            ].tobytes()
         self.stats.pending = len(self._pending)
         return parts
 
@@ -328,13 +330,13 @@ class Decoder:
         at: int | None,
         parts: list[Frames],
         *,
-        lasting: bool = True,
+        is_immutable: bool = True,
         final: bool = False,
     ) -> int:
         """Find frames in bytes, piece by piece, and add them to `parts`.
 
         Args:
-            lasting: whether the bytes will not be changed later, so that they need not be copied.
+            is_immutable: whether the bytes are not changed later, and need not be copied.
             final: whether no bytes follow.
 
         Returns:
@@ -344,7 +346,7 @@ class Decoder:
         while start < len(buffer) and len(buffer) - start >= self._need:
             part = buffer[start : start + self._size]
             last = start + len(part) == len(buffer)
-            part = part if lasting else part.copy()
+            part = part if is_immutable else part.copy()
             piece = self._decode_piece(part, final=final and last)
             frames = self._count_piece(part, piece, at)
             parts += [frames] if len(frames) else []  # none at all would keep its bytes

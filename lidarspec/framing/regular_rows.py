@@ -54,7 +54,7 @@ def find_regular_frames(
         frames = check_rows(framing, kind, buffer, rows[:lead], 0)
         if frames is None:
             return None
-        if frames.is_sound:
+        if frames.is_all_valid:
             valid = lead
         else:
             valid = int((frames.status != 0).argmax())

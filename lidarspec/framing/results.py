@@ -312,7 +312,7 @@ class Frames:
         return size * len(self)
 
     @cached_property
-    def is_sound(self) -> bool:
+    def is_all_valid(self) -> bool:
         """Whether all candidates are valid frames."""
         return not np.count_nonzero(self.status)
 
@@ -398,7 +398,7 @@ class Frames:
     def _replace(self, **changes: Any) -> Frames:
         changed = object.__new__(Frames)
         vars(changed).update(vars(self), **changes)
-        for name in ("starts", "offsets", "is_sound"):
+        for name in ("starts", "offsets", "is_all_valid"):
             vars(changed).pop(name, None)
         return changed
 

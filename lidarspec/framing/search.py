@@ -107,7 +107,7 @@ class _FrameWalk:
         stops = np.zeros(len(frames), np.bool_)
         stops[-1:] = True
         if len(frames) > 1:
-            if not frames.is_sound:
+            if not frames.is_all_valid:
                 ends[frames.status == SHORT] = len(candidates.buffer) + 1
             if bool((frames.starts[1:] < ends[:-1]).any()):
                 self._after = frames.starts.searchsorted(ends)
@@ -257,7 +257,7 @@ def count_rejected(
         status = own.status
         if framing.is_weak(kind):  # a valid candidate that was not accepted is in no run
             status = np.where(status == VALID, IMPLAUSIBLE, status)
-        elif own.is_sound:
+        elif own.is_all_valid:
             continue
         refused = np.flatnonzero(status > (VALID if candidates.final else SHORT))
         if not len(refused):

@@ -228,7 +228,7 @@ class JointChecker:
         status = np.zeros(len(rows), np.uint8)
         checker.check_constants(status, rows)
         for seal in self.layouts[longest].seals:
-            right = _are_intact(seal, rows, sizes, sums)
+            right = _have_valid_checksums(seal, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
         for index, check in enumerate(checker.checks):
             if isinstance(check, LookupCondition):
@@ -273,7 +273,9 @@ def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
     return np.ascontiguousarray(gather_rows(buffer, offsets, size))
 
 
-def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
+def _have_valid_checksums(
+    seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None
+) -> NDArray[np.bool_]:
     """Return whether each candidate has the right checksum, (n,).
 
     The rows have the size of the longest layout. In each row, the bytes after the covered bytes,

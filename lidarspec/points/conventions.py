@@ -93,9 +93,9 @@ def coordinates(
     """
     level: Any = np.cos(elevation)
     sides = [np.cos(azimuth), np.sin(azimuth)]
-    if _is_row(azimuth) or _is_row(elevation):
+    if _is_row_lookup(azimuth) or _is_row_lookup(elevation):
         known = [_multiply(level, side) for side in sides]
-        level, sides = (1, known) if all(map(_is_row, known)) else (level, sides)
+        level, sides = (1, known) if all(map(_is_row_lookup, known)) else (level, sides)
     level = _multiply(distance, level)
     places = *(_multiply(level, side) for side in sides), distance * np.sin(elevation)
     x, y, z = (
@@ -134,7 +134,7 @@ def _multiply(first: Any, second: Any) -> Any:
     return first * second
 
 
-def _is_row(value: Any) -> bool:
+def _is_row_lookup(value: Any) -> bool:
     """Return whether a traced value is a lookup of rows in a table.
 
     Computations with such a value are done once, for the whole table.

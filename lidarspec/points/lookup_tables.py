@@ -119,8 +119,8 @@ def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any]
     return None
 
 
-def is_number(value: Any, leaves: Any) -> bool:
-    """Return whether an expression is finite whenever its fields are finite.
+def is_always_finite(value: Any, leaves: Any) -> bool:
+    """Return whether an expression is finite for all finite values of its fields.
 
     Returns False if this is not certain.
 
@@ -142,8 +142,8 @@ def is_number(value: Any, leaves: Any) -> bool:
         return (
             not isinstance(divisor, Node)
             and bool(np.all(divisor))
-            and is_number(value.args[0], leaves)
+            and is_always_finite(value.args[0], leaves)
         )
     return (value.function in CHEAP or value.function in (np.sin, np.cos)) and all(
-        is_number(arg, leaves) for arg in value.args
+        is_always_finite(arg, leaves) for arg in value.args
     )

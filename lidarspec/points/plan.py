@@ -53,7 +53,7 @@ from lidarspec.points.conventions import (
     returned_range,
     shown_range,
 )
-from lidarspec.points.lookup_tables import is_number
+from lidarspec.points.lookup_tables import is_always_finite
 from lidarspec.points.reference_evaluator import list_extra_types, list_parts
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.spec.vocabulary import AlongAxis, row_numbers
@@ -234,7 +234,7 @@ class Plan:
 
     def _may_be_nan(self, value: Any) -> bool:
         return isinstance(value, TracedColumn) and (
-            bool(self._list_floats(value)) or not is_number(value.node, self.layout.leaves)
+            bool(self._list_floats(value)) or not is_always_finite(value.node, self.layout.leaves)
         )
 
     @cached_property
@@ -358,7 +358,7 @@ class Plan:
                 self._is_finite(option) if isinstance(option, Node) else bool(np.isfinite(option))
                 for option in options[1:]
             )
-        return is_number(node, self.layout.leaves)
+        return is_always_finite(node, self.layout.leaves)
 
 
 #: The lookup tables of each `points` function, shared by its plans. The key of a table includes the

@@ -97,7 +97,7 @@ class PacketCounts:
             self.is_broken[rows],
         )
 
-    def share(self, row: int) -> None:
+    def share_with_next_scan(self, row: int) -> None:
         """Count a packet, or the frame that it is part of, in the next scan as well.
 
         Packets missing before it are not counted again.

@@ -136,7 +136,7 @@ class ScanCutter:
         self._scan = OpenScan(has_start)
         if is_gap_shared:
             self._scan = self._scan.add_gap(counts.part(row, row + 1))
-        counts.share(row)
+        counts.share_with_next_scan(row)
         return ScanCut(end.point, is_whole, is_whole and not scan.has_gap)
 
     def _add(
@@ -177,7 +177,7 @@ class ScanCutter:
             elif not is_overdue:
                 self._usual_packets *= 2  # in case the number was wrong
             self._scan = OpenScan()
-            counts.share(start)
+            counts.share_with_next_scan(start)
         return np.array(cuts, np.intp)
 
     def _step_ns(self, counts: PacketCounts, row: int) -> int:

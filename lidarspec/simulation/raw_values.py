@@ -47,7 +47,7 @@ class PartRows(CompiledTable):
         left = iter(seal_frames(self))
         axis, kind = self.place
         destinations = list[tuple[int, int, NDArray[np.uint8]]]()
-        for group, buffer, walked in self.frames.walks(axis):
+        for group, buffer, walked in self.frames.find_parts(axis):
             kinds = [kind.node.name for kind in group.layout.regions[axis].kinds]
             for piece in (
                 piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind

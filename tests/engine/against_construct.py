@@ -188,7 +188,7 @@ def clouds_agree(
         if (
             not is_small
             or not info.axes
-            or info.axes != table.chain
+            or info.axes != table.deepest_axes
             or any(path.startswith(f"{other}.") for other in table.fields)
         ):
             continue

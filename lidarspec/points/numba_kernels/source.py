@@ -34,7 +34,7 @@ from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.lookup_tables import (
     find_window,
-    is_number,
+    is_always_finite,
     list_possible_values,
     tabulate_values,
 )
@@ -612,7 +612,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     else:
         directions = [*plan.directions, *(plan.parts[name] for name in ("ox", "oy", "oz"))]
     places = {}
-    if not all(is_number(value, plan.layout.leaves) for value in directions):
+    if not all(is_always_finite(value, plan.layout.leaves) for value in directions):
         # a nan in one coordinate makes all of them nan
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:

@@ -517,7 +517,7 @@ class _Builder:
         self.scopes[info.path] = scope
         made = tree.Struct(place.name, info.path, tuple(members), info.docs)
         for index, sizing in self._measured.pop(scope):
-            part = _find_below(made, sizing.of[sizing.out :])
+            part = _find_below(made, sizing.of[sizing.levels_up :])
             self.sizes[index] = tree.total(
                 (
                     _sum_member_sizes(members, sizing.since, part.name)
@@ -547,7 +547,7 @@ class _Builder:
         """
         scope = place.scope
         self.rebuilding = True
-        for _ in range(con.out):
+        for _ in range(con.levels_up):
             scope = None if scope is None else scope.parent
         if scope not in self._measured:
             raise SpecError(

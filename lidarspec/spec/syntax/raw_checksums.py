@@ -50,15 +50,15 @@ class FunctionChecksum(Checksum):
 
 
 @dataclass(frozen=True)
-class _Names:
+class _NameRecorder:
     """An object that records the names of the members that an expression reads."""
 
     names: tuple[str, ...] = ()
 
-    def __getitem__(self, name: str) -> _Names:
-        return _Names((*self.names, name))
+    def __getitem__(self, name: str) -> _NameRecorder:
+        return _NameRecorder((*self.names, name))
 
-    def __getattr__(self, name: str) -> _Names:
+    def __getattr__(self, name: str) -> _NameRecorder:
         if name.startswith("__"):
             raise AttributeError(name)
         return self[name]
@@ -111,11 +111,11 @@ def _find_covered_part(
     if not isinstance(checksum, construct.Checksum):
         return None
     try:
-        asked = checksum.bytesfunc(_Names())
+        asked = checksum.bytesfunc(_NameRecorder())
         bits = 8 * int(checksum.checksumfield.sizeof())
     except Exception:  # a function of a plugin may raise anything
         return None
-    if not isinstance(asked, _Names) or bits > MAX_CHECKSUM_BITS:
+    if not isinstance(asked, _NameRecorder) or bits > MAX_CHECKSUM_BITS:
         return None
     if asked.names[-1:] == ("data",) and _is_raw_copy(members, asked.names[:-1]):
         return asked.names[:-1], False

@@ -513,13 +513,13 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         self.flagbuildnone = True
 
     @property
-    def out(self) -> int:
+    def levels_up(self) -> int:
         """The number of struct levels between this field and the struct with the part."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
         """Return the size of the part in a parsed or built struct."""
-        *parents, name = self.of[self.out :] or ("",)
+        *parents, name = self.of[self.levels_up :] or ("",)
         try:
             marks = (get_member(obj, ".".join(parents)) if parents else obj)["_marks"]
             if name:
@@ -550,7 +550,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
         There is no such struct if a bit block is probed.
         """
-        for _ in range(self.out):
+        for _ in range(self.levels_up):
             context = context.get("_", {})
         context.get("_sizings", []).append((self, *entry))
 
