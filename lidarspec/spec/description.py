@@ -16,6 +16,7 @@ from typing import Any, Literal, TypeVar
 
 from construct import Construct
 
+import lidarspec.spec.fields  # noqa: F401  (prepare needs Checksummed, which is defined there)
 from lidarspec.errors import SpecError, UnknownFrame, did_you_mean
 from lidarspec.spec.arguments import (
     OWN_ADDRESS,
