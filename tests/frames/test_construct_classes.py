@@ -232,6 +232,15 @@ COMPILED: dict[str, Case] = {
         "b" / Int8ub,
         frames="4d020102030405 4d0006",
     ),
+    "Rebuild of the length of an array": case(
+        "n" / Rebuild(Int8ub, len_(this.v)), "v" / Array(this.n, TWO), frames="0201020304 00"
+    ),
+    "Rebuild of the length of bytes": case(
+        "n" / Rebuild(Int16ub, lambda scope: len(scope.d)),
+        "x" / Int8ub,
+        "d" / Bytes(this.n),
+        frames="000209abcd 000000",
+    ),
     "FocusedSeq behind its length": case(
         "a" / Prefixed(Int8ub, FocusedSeq("v", Const(b"K"), "v" / Int16ub)), frames="034b0102"
     ),

@@ -12,7 +12,7 @@ import functools
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import construct
@@ -152,6 +152,9 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         members = _name_padding(con.subcons)
         if not in_bits:
             members = [member for child in members for member in _expand_macro(child)]
+            members = [
+                _mark_count(member, members[number:]) for number, member in enumerate(members, 1)
+            ]
         members, checksums = extract_seals(members)
         prepared = (prepare(child, limit, in_bits=in_bits) for child in members)
         return seal(MarkedStruct(*prepared), checksums)
@@ -400,6 +403,24 @@ def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Constru
 COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
 
 
+def _mark_count(member: Construct, later: Sequence[Construct]) -> Construct:
+    """Return a Rebuild of the length of a later array, or of later bytes, as a `CountField`.
+
+    Any other member is returned unchanged.
+
+    Args:
+        later: the members of the struct after this one.
+    """
+    content = _strip_name(member)
+    if not member.name or not isinstance(content, construct.Rebuild):
+        return member
+    for part in later:
+        if part.name and _is_count(content, member.name, _strip_name(part), part.name):
+            count = CountField(content.subcon, part.name)
+            return construct.Renamed(count, newname=member.name, newdocs=member.docs)
+    return member
+
+
 def _is_fixed(con: Construct) -> bool:
     """Return whether a part of fixed size depends only on its own bytes."""
     return is_independent(con, _DESCRIBED_KINDS) and fixed_size(con) > 0
@@ -412,18 +433,29 @@ def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: 
         parts: the parts of the FocusedSeq, by name.
         focus: the name of the array.
     """
-    if not isinstance(array, Array) or not callable(array.count):
+    if not isinstance(array, Array):
         return None
-    for name, part in parts.items():
-        # The functions of a plugin may raise anything.
-        with contextlib.suppress(Exception):
-            if isinstance(part, construct.Rebuild) and all(
-                part.func(Container({focus: [0] * length})) == length
-                and array.count(Container({name: length})) == length
-                for length in COUNT_TRIALS
-            ):
-                return name
-    return None
+    return next((name for name, part in parts.items() if _is_count(part, name, array, focus)), None)
+
+
+def _is_count(part: Construct, name: str, array: Construct, array_name: str) -> bool:
+    """Return whether a part of a struct is a Rebuild of the length of an array or of bytes."""
+    if isinstance(array, Array):
+        count = array.count
+    elif isinstance(array, Bytes):
+        count = array.length
+    else:
+        return False
+    if not isinstance(part, construct.Rebuild) or not callable(count):
+        return False
+    # The functions of a plugin may raise anything.
+    with contextlib.suppress(Exception):
+        return all(
+            part.func(Container({array_name: [0] * length})) == length
+            and count(Container({name: length})) == length
+            for length in COUNT_TRIALS
+        )
+    return False
 
 
 def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct], tuple[str, str]]:
