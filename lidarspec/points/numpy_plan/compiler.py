@@ -1,10 +1,10 @@
 """Compile the expressions of a plan to the steps of a program.
 
-Each step is one NumPy call for a chunk of packets. An expression of a single field of at most two
-bytes becomes a lookup table (`points.lookup_tables`). An expression is *full* if each point has its
-own value. The reference evaluator evaluates an expression with one value for each packet or block
-for the whole batch, and the program broadcasts the values. All other expressions become the NumPy
-calls that the plugin wrote.
+Each step is one NumPy call for a chunk of packets. An expression is *full* if each point has its
+own value. An expression that is not full has one value for each packet or block; the reference
+evaluator evaluates it for the whole batch, and the program broadcasts the values. An expression of
+a single field of at most two bytes becomes a lookup table (`points.lookup_tables`). All other
+expressions become the NumPy calls that the plugin wrote.
 
 Columns that need not be exact may be computed in float32 and in another order. Products, offsets,
 cosines and sines are float32. In a sum, the terms that are not full are added first, and the result
@@ -148,9 +148,9 @@ class Compiler:
         return self.program.call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
-        """Compile the cosine or sine of a sum of angles, of which none is full.
+        """Compile the cosine or sine of a sum of angles that several points share.
 
-        An angle is full if each point has its own value.
+        Each angle has one value for each packet or block, or is a constant.
 
         By the angle addition theorem, no trigonometric function is computed for each point.
         """
@@ -304,7 +304,7 @@ class Compiler:
         return self.program.step(f"{leaf.info.path}: bits", kind, run)
 
     def _load(self, leaf: Leaf, dtype: np.dtype[Any], offset: int, kind: str) -> int:
-        """Load some bytes of every element of a field."""
+        """Load the bytes at an offset in every element of a field."""
         shape = leaf.shape[: len(leaf.strides)]
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
