@@ -198,7 +198,7 @@ class _Encoder:
         return to_raw(info, value)
 
     def _find_implied(self, info: FieldInfo) -> Any:
-        """Return the value of a field for which none is given; None if one is required."""
+        """Return the value of a field that the caller omits; None if the field is required."""
         if info.const is not None:
             return info.const
         if info.rebuilt is not None and not info.held:

@@ -127,7 +127,7 @@ ValueRequest = Callable[[Leaf | MeasuredSize, "HeaderWalk"], int]
 
 @dataclass
 class HeaderWalk:
-    """A walk through a tree for given values of header fields, with its results."""
+    """A walk through a tree, and its results, for given values of header fields."""
 
     values: Mapping[str, int]
     limit: int
@@ -838,7 +838,8 @@ def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryvi
 class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
-    The layouts of parts also depend on fields of the outer frame, whose values are `given`.
+    The layouts of parts also depend on fields of the outer frame. The argument `given` has the
+    values of these fields.
 
     Attributes:
         root: the frame type or kind of parts.

@@ -96,7 +96,7 @@ class PartKind:
 
     @cached_property
     def is_checked(self) -> bool:
-        """Whether parts of this kind have checksums or conditions, or contain such parts."""
+        """Whether parts of this kind, or the parts in them, have checksums or conditions."""
         return any(
             isinstance(node, tree.Sealed | tree.Check)
             or any(info.allowed for info in tree.infos(node))
