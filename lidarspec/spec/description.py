@@ -96,9 +96,9 @@ class Simulation:
             `Template` as texts, by the name in braces, such as "{handle}". "{data_port}" is the
             port at which the simulated sensor serves its data. By default, a command is answered
             with its `reply`. Only for a sensor, not for a frame type.
-        directions: a function of the frame number i that returns the azimuths and elevations of its
-            points, radians, as two arrays that broadcast to the points of a frame. Needed for
-            `Cartesian` points.
+        directions: a function of the frame number i that returns the azimuths and elevations of the
+            points of the frame, radians, as two arrays that broadcast to the points of a frame.
+            Needed for `Cartesian` points.
         effects: by command, a function that returns the sweep to use after the command. The
             arguments of the function are the sweep so far and the number of the next frame. The new
             sweep counts frames from 0. Only for a sensor, not for a frame type.

@@ -377,7 +377,7 @@ class Checksummed(layer.SealedStruct):
         return self._find_field(name).parse(bytes(8 * layer.bit_width(self._find_field(name))))  # type: ignore[no-any-return]
 
     def _find_span(self, obj: Any, name: str) -> tuple[int, int]:
-        """Return the byte range of a field, given its dotted name, in the parsed stream.
+        """Return the byte range of a field in the parsed stream, given its dotted name.
 
         The range of a bit field includes all bytes that contain its bits.
         """
