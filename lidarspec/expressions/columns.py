@@ -579,8 +579,8 @@ def _find_axis(
     """Return the index in `axes` of the axis that the first axis of a plain array belongs to.
 
     The axis is found by its length. First, the length is compared with the axes of the columns that
-    are combined with the array, which `axes` and `lengths` describe. After them, it is compared
-    with all arrays of the frame.
+    are combined with the array, which `axes` and `lengths` describe. Then it is compared with all
+    arrays of the frame.
 
     Args:
         without: positions in `axes` that are not considered.
@@ -669,8 +669,8 @@ def align_points(
 def _find_extent(table: Table, axis: str, length: int) -> int:
     """Return the length to use for values along an array.
 
-    It is `length`. If an array that contains this array is empty in some frame, it is at most the
-    maximum length of this array in the frames.
+    It is `length`, unless an array that contains this array is empty in some frame. In this case,
+    it is at most the maximum length of this array in the frames.
     """
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
