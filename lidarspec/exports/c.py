@@ -7,8 +7,8 @@ It does not depend on struct packing. `header` joins:
 * a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
   argument, so that all frame types share it,
 * for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions that read a
-  whole frame. The latter return the length and the validity of the frame, and the stored and the
-  computed checksums.
+  whole frame. These functions return the length and the validity of the frame, and the stored and
+  the computed checksums.
 
 `frame_length` checks that a byte exists before it reads the byte.
 """
