@@ -204,7 +204,7 @@ class PassDetector:
         self._angle = angle
 
     def push(self, angles: Floats) -> NDArray[np.intp]:
-        """Return the rows at which the angle passes the angle of this detector.
+        """Return the rows at which the angle of this detector is passed.
 
         Args:
             angles: the angles of the next rows, (k,).
