@@ -1,4 +1,4 @@
-"""The same sensors' frames with every field at a fixed offset.
+"""Frames of sensors with variable layouts, declared with every field at a fixed offset.
 
 They have no variable parts, counts or conditions, and can parse only the frames of one workload.
 """

@@ -1,4 +1,4 @@
-"""Conversions of captures to each format, compared with code of a user.
+"""Conversions of captures to each format, compared with code that a user would write.
 
 Each conversion runs in a separate process, so that its memory can be measured.
 """

@@ -1,8 +1,8 @@
 """Pages that compare a manual with lidarspec, item by item.
 
-The items are in `manual.toml` beside the tests of a plugin. Each names the place in lidarspec, the
-proof, and a test. `reference_pages.py` writes the pages; tests hold the items against the manual's
-tables, the fields of the sensor, and the tests.
+The items are in `manual.toml` beside the tests of a plugin. Each item names the place in lidarspec,
+the proof, and a test. `reference_pages.py` writes the pages. Tests compare the items with the
+manual's tables, the fields of the sensor, and the named tests.
 """
 
 from __future__ import annotations

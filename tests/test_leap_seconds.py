@@ -1,4 +1,4 @@
-"""The offsets of TAI and GPS time from UTC, from the tables of a computer."""
+"""Tests of the offsets of TAI and GPS time from UTC, read from the tables of a computer."""
 
 from __future__ import annotations
 

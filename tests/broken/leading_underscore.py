@@ -1,4 +1,4 @@
-"""A field name with a leading underscore, which == ignores."""
+"""A field name with a leading underscore: `==` of two Containers ignores the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Return the sensor that `new --from-capture` writes."""
+"""Tests of the sensor that `new --from-capture` writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Return the compiled module of a sensor."""
+"""Compile the Kaitai spec of a sensor, and import the resulting Python module."""
 
 from __future__ import annotations
 

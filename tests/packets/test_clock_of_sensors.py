@@ -1,8 +1,8 @@
 """Tests that the clocks of the largest families are measured well, and their faults named.
 
-Real frames of each sensor pass in virtual time: their clock runs 50 ppm fast, and they arrive 0 to
-5 ms late. All sensors send 240 packets a second, the rate of the slowest, so that runs are short;
-the STL-27L, whose clock counts milliseconds, sends as many as it does.
+Real frames of each sensor arrive in virtual time, 0 to 5 ms late; the clock of the sensor runs
+50 ppm fast. To keep runs short, all sensors send 240 packets a second, the rate of the slowest
+sensor. Only the STL-27L sends at its own rate, because its clock counts milliseconds.
 """
 
 from __future__ import annotations

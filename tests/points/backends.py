@@ -1,7 +1,7 @@
 """Parameters for tests that compute points in several ways.
 
-Compiling a kernel takes seconds of processor time, so the quick tier compiles only those of
-`test_numba_kernels`; every other test asks for kernels in `make test-all`.
+Compiling a kernel takes seconds of processor time, so in the quick tier only `test_numba_kernels`
+compiles kernels. All other tests use kernels only in `make test-all`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Commands with texts, addresses, bytes and array elements.
 
 Replies repeat a sequence number, and one reply contains a table that the device keeps. The sensors
-of `make_handle_sensor` are asked for a handle over HTTP, and send their data where they are told to
-(UDP), or at a port that they report (TCP).
+of `make_handle_sensor` return a handle over HTTP. They send their data to the address in a request
+(UDP), or from a port that a reply reports (TCP).
 """
 
 from __future__ import annotations

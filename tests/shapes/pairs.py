@@ -1,4 +1,4 @@
-"""Two returns of the same firings in two consecutive packets, if the mode says so."""
+"""Two returns of the same firings in two consecutive packets, in the dual-return mode."""
 
 from __future__ import annotations
 

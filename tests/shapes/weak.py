@@ -1,7 +1,7 @@
 """A weak frame of five bytes: a start bit, its inverse and a check bit.
 
-Three frames in a row are required. Its info frame has a checksum, is declared first, and would also
-match as a weak frame: it ends a row.
+At least three weak frames must follow one another. The info frame has a checksum and is declared
+first. Its bytes would also match as a weak frame, but it ends a run of weak frames.
 """
 
 from __future__ import annotations

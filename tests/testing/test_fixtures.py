@@ -1,4 +1,4 @@
-"""The simulated sensor on a real port: virtual time, faults and jumps of the clock."""
+"""Tests of a simulated sensor on a real port: virtual time, faults, steps of the clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Tests of USB serial adapters without a driver. The lists of macOS and Windows are made here."""
+"""Tests that name the missing drivers of USB serial adapters, from lists of devices.
+
+The lists are those of Linux, macOS and Windows, and are written by the tests.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Broken plugins, one mistake a module; see `tests/plugins/test_plugins.py`."""
+"""Broken plugins with one mistake in each module; see `tests/plugins/test_plugins.py`."""
