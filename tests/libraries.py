@@ -19,9 +19,9 @@ def needs(*packages: str) -> pytest.MarkDecorator:
 
 
 class Library:
-    """A module that is imported when one of its public names is first asked for.
+    """A module that is imported when one of its public names is first used.
 
-    pytest asks every object of a test module for names such as `__wrapped__`: these import nothing.
+    pytest reads names such as `__wrapped__` of every object in a test module; these import nothing.
     """
 
     def __init__(self, name: str) -> None:

@@ -23,10 +23,7 @@ SLACK = 5.0
 
 
 class Port:
-    """A serial port: a pseudo-terminal behind a name.
-
-    The name is removed when the port is unplugged.
-    """
+    """A serial port: a pseudo-terminal with a name, which is removed on unplugging."""
 
     def __init__(self, name: Path) -> None:
         self.name, self._master, self._slave = name, -1, -1
@@ -80,7 +77,7 @@ def port(folder: Path) -> Iterator[Port]:
 
 @contextlib.contextmanager
 def working(function: Callable[[threading.Event], None]) -> Iterator[threading.Event]:
-    """Run a function in a thread; it gets the event that requests its end."""
+    """Run a function in a thread; the function receives an event that stops it."""
     stop = threading.Event()
     thread = threading.Thread(target=function, args=(stop,))
     thread.start()
@@ -98,8 +95,9 @@ def send_paced(
     stop: threading.Event,
     tick: float = 0.002,
 ) -> int:
-    """Send frames at a rate, again and again until asked to stop, in bunches every `tick` seconds;
-    the number sent.
+    """Send frames at a rate, repeatedly, until `stop` is set; return their number.
+
+    The frames are sent in groups every `tick` seconds.
     """
     began, sent = time.monotonic(), 0
     while not stop.is_set():

@@ -40,8 +40,9 @@ MAX_FILES = 3
 
 
 def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
-    """Return a line for each missing thing: how many tests were skipped, in which files (the first
-    of many), and how to get it.
+    """Return a line for each missing tool, package or capture.
+
+    A line has the number of skipped tests, their files, and the way to install what is missing.
 
     Args:
         skipped: (node id, reason) of each test that was skipped.
@@ -60,7 +61,7 @@ def describe_missing(skipped: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _list_files(names: list[str]) -> str:
-    """Return names of files in words, the first few of many."""
+    """Return the names of the first few files, and the number of the others."""
     if len(names) <= MAX_FILES:
         return ", ".join(names)
     return f"{', '.join(names[:MAX_FILES])} and {len(names) - MAX_FILES} more files"

@@ -46,7 +46,7 @@ def babbling() -> Iterator[str]:
 
 
 def _babble(server: socket.socket, stop: threading.Event) -> None:
-    """Send to whoever comes, one after the other, until he hangs up."""
+    """Send bytes to each client, one client after another, until it disconnects."""
     while not stop.is_set():
         with contextlib.suppress(OSError):
             line, _ = server.accept()

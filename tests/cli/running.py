@@ -33,7 +33,7 @@ APART: dict[str, Any] = (
 def process(
     *words: object, given: bytes = b"", cwd: Path | None = None
 ) -> subprocess.CompletedProcess[bytes]:
-    """``python -m lidarspec`` with these words; no failure may show a traceback."""
+    """Run ``python -m lidarspec`` with these words; fail if it shows a traceback."""
     command = [sys.executable, "-m", "lidarspec", *map(str, words)]
     done = subprocess.run(
         command, input=given, capture_output=True, cwd=cwd, check=False, timeout=120

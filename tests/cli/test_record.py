@@ -62,7 +62,7 @@ def datagrams(tmp_path: Path) -> Path:
 
 
 class Running:
-    """A verb at work in a process of its own."""
+    """A verb that runs in a separate process."""
 
     def __init__(self, *words: object, folder: Path) -> None:
         command = [sys.executable, "-m", "lidarspec", *map(str, words)]
@@ -81,7 +81,7 @@ class Running:
                 self._lines.notify_all()
 
     def hears(self, pattern: str) -> re.Match[str]:
-        """Wait for a line with this text; return it."""
+        """Wait for a line that matches the pattern; return the match."""
         with self._lines:
             assert self._lines.wait_for(lambda: re.search(pattern, self._said), 60), self._said
             found = re.search(pattern, self._said)

@@ -28,7 +28,7 @@ STL = "ldrobot-stl27l"
 
 
 def begun(*words: object) -> tuple[subprocess.Popen[str], str]:
-    """``lidarspec sim`` in a process of its own, and the first line that it prints."""
+    """Start ``lidarspec sim`` in a process; return it and its first line of output."""
     command = [sys.executable, "-m", "lidarspec", "sim", *map(str, words)]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert running.stdout is not None

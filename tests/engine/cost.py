@@ -39,7 +39,10 @@ def calls_per_byte(sensor: Sensor, data: bytes) -> float:
 
 
 def kept_per_byte(sensor: Sensor, data: bytes) -> float:
-    """Return the number of bytes per byte that the frames of a stream take beside its own bytes."""
+    """Return the memory that the frames of a stream take, as bytes per byte of input.
+
+    The bytes of the stream itself do not count.
+    """
     _find_frames(sensor, data)  # imports and layouts are made once
     gc.freeze()  # collections skip the objects that exist already
     tracemalloc.start()

@@ -31,8 +31,9 @@ def interpreted_reason(frame: Frame) -> str:
 
 
 def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVERSATIONS) -> None:
-    """Fail unless a conversation, and `count` with damaged frames in them, give the same on both
-    engines.
+    """Fail unless both engines read conversations in the same way.
+
+    There is one undamaged conversation, and `count` conversations with damaged frames.
     """
     subject = SensorUnderTest(sensor)
     source = subject.source("agree")
@@ -47,10 +48,10 @@ def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVER
 
 
 def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) -> None:
-    """Fail unless frames with values at the edges of their fields' ranges give the same on both
-    engines.
+    """Fail unless both engines read frames with extreme values in the same way.
 
-    Long frames are left out, since construct takes its time for each field.
+    The values of fields are at the limits of their ranges. Long frames are left out, because
+    construct needs time for each field.
     """
     subject = SensorUnderTest(sensor)
     for name in sensor.incoming:

@@ -89,8 +89,9 @@ def every_recoverable_frame_is_recovered(subject: SensorUnderTest, length: int =
 
 
 def _part(subject: SensorUnderTest, length: int, purpose: str) -> bytes:
-    """Return part of a conversation, from a random offset: one round of a sensor with many frame
-    types is long.
+    """Return part of a conversation, from a random offset.
+
+    A whole round is too long if a sensor has many frame types.
     """
     data = clean(subject, length=length)
     start = subject.source(purpose).randrange(max(len(data) - length, 1))
@@ -98,9 +99,7 @@ def _part(subject: SensorUnderTest, length: int, purpose: str) -> bytes:
 
 
 def a_claimed_length_costs_no_frame(subject: SensorUnderTest, length: int = LENGTH) -> None:
-    """Check that neither the head of a frame nor a frame with a bad end costs one of the frames
-    behind it.
-    """
+    """Check that no valid frame is lost after a truncated or damaged frame."""
     whole = subject.stream(rounds=1)[:length]
     heads = 50 if length >= LENGTH else 12
     for frame in dict(subject.conversation(rounds=1)).values():
@@ -116,7 +115,7 @@ def a_claimed_length_costs_no_frame(subject: SensorUnderTest, length: int = LENG
 
 
 def a_header_may_start_at_every_byte(subject: SensorUnderTest, length: int = LENGTH) -> None:
-    """Check that stray bytes and repeated first bytes between frames cost none of them."""
+    """Check that stray bytes and repeated first bytes before a frame lose no frame."""
     frames = subject.conversation(rounds=3 if length >= LENGTH else 1)
     first = frames[0][1][:1]
     for stray in (b"\xfe", b"\xff", b"\x00", *(first * number for number in range(1, 5))):
@@ -153,8 +152,9 @@ def noise_is_cut_by_the_rule(subject: SensorUnderTest, length: int = LENGTH) -> 
 def announcements_may_change_with_every_frame(
     subject: SensorUnderTest, length: int = LENGTH
 ) -> None:
-    """Check announcements in any order, frames behind their own and behind others', whole, cut off
-    and damaged.
+    """Check frames after their own announcement and after other announcements.
+
+    Announcements and frames come in any order. Some frames are truncated or damaged.
     """
     sensor = subject.sensor
     source = subject.source("changes")
@@ -184,8 +184,9 @@ def the_longest_frame_is_a_frame(subject: SensorUnderTest, length: int = LENGTH)
 
 
 def idle_gives_up_pending_bytes(subject: SensorUnderTest, length: int = LENGTH) -> None:
-    """Check that pending bytes are given up when the line falls silent, and never joined to later
-    ones.
+    """Check that pending bytes are released when the input falls silent.
+
+    They are never joined to later bytes.
     """
     frames = subject.conversation(rounds=2)
     whole = b"".join(data for _, data in frames)
@@ -201,7 +202,7 @@ def idle_gives_up_pending_bytes(subject: SensorUnderTest, length: int = LENGTH) 
 
 
 def decoders_are_independent(subject: SensorUnderTest, length: int = LENGTH) -> None:
-    """Check that two decoders fed in turn give what each gives alone."""
+    """Check that two decoders that are fed in turn give the same as each alone."""
     inputs = [damage(clean(subject, seed=seed, length=length // 2), 1e-3, seed) for seed in (3, 4)]
     alone = []
     for data in inputs:

@@ -19,7 +19,7 @@ SOUND = sound.sensor()
 
 
 class Parser:
-    """Bytes in, frames out; frames are looked for byte by byte."""
+    """A parser that searches for frames byte by byte."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor, self.stats, self.backend = sensor, Counters(), "auto"
@@ -105,7 +105,7 @@ class Parser:
 
 
 class PartialHeaderDropped(Parser):
-    """A partial header at the end of a chunk is dropped."""
+    """Mistake: a partial header at the end of a chunk is dropped."""
 
     def feed(self, data: bytes, at: int | None = None) -> list[Found]:
         found = super().feed(data, at)
@@ -116,14 +116,14 @@ class PartialHeaderDropped(Parser):
 
 
 class ClaimedLengthSkipped(Parser):
-    """The length that a frame claims is skipped where its checksum is wrong."""
+    """Mistake: if the checksum of a frame is wrong, its whole length is skipped."""
 
     def step(self, spot: int, size: int) -> int:
         return max(size, 1)
 
 
 class MismatchingByteLost(Parser):
-    """The byte that does not match a header is not looked at again."""
+    """Mistake: a byte that does not match a header is not tried as a first byte."""
 
     def step(self, spot: int, size: int) -> int:
         return 2 if self.buffer[spot] == 0xAA and self.buffer[spot + 1 : spot + 2] != b"\x55" else 1
@@ -137,7 +137,7 @@ class LongestRefused(Parser):
 
 
 class BufferOfTheClass(Parser):
-    """All decoders share one buffer."""
+    """Mistake: all decoders share one buffer."""
 
     held = bytearray()
 
@@ -199,7 +199,7 @@ class BufferCopied(Parser):
 
 
 class Own(Sensor):
-    """A sensor that is read by a parser of its own."""
+    """A sensor that is read by the parser of this class, not by the engine."""
 
     parser: type[Any] = Parser
 

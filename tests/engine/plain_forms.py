@@ -120,7 +120,7 @@ def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] |
 
 
 class _Reader:
-    """Goes through a struct and the characters of a frame side by side."""
+    """Reads the fields of a struct from the characters of a frame, one by one."""
 
     def __init__(self, left: bytes, form: Any) -> None:
         self.left, self.row, self._form = left, bytearray(), form
@@ -223,8 +223,9 @@ class _Reader:
 
 
 class _SixBitReader(_Reader):
-    """Numbers of as many characters as the field has bytes, of which each is six bits; anything
-    else is text.
+    """Reads numbers in characters of six bits; all other fields are text.
+
+    A number has as many characters as its field has bytes.
     """
 
     def _text(self, size: int) -> None:

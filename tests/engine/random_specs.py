@@ -55,8 +55,9 @@ SCALES = (
 
 @dataclass
 class Known:
-    """A field that expressions may ask for: its path from the struct that it is in, and whether its
-    values have names.
+    """A field that expressions may use.
+
+    It has the path from its struct, and whether its values have names.
     """
 
     path: str
@@ -144,7 +145,7 @@ class Drawn:
         return text
 
     def part(self, depth: int) -> str:
-        """Anything that nothing depends on."""
+        """Return a part that no other part depends on."""
         kinds = [self.word, self.word, self.floating, self.string]
         if depth < 3:
             kinds += [self.array, self.array, self.condition, self.switch]

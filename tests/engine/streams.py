@@ -62,8 +62,9 @@ def damage(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
 
 
 def worst(sensor: Sensor, length: int) -> bytes:
-    """Headers that claim the longest frame, and two random bytes: candidates without end, as long
-    as they can be.
+    """Return the most expensive candidates: headers with the maximum length.
+
+    Each header is followed by two random bytes, so no candidate is complete.
     """
     source = random.Random(sensor.id)
     longest = max((sensor.example(sensor.main_frames[0], seed=seed) for seed in range(40)), key=len)
@@ -76,10 +77,10 @@ NOISE_BYTES = (0, 2, 6)
 
 
 def hostile_streams(subject: SensorUnderTest, length: int) -> Iterator[tuple[str, bytes]]:
-    """Generate streams of about this length that cost a decoder much for each byte, each with a
-    description.
+    """Yield streams that are expensive to decode, each with a description.
 
-    Those of one frame type begin with the frame after which the type is looked for.
+    They have about `length` bytes. A stream of one frame type with `after` begins with the frame
+    that activates the type.
     """
     sensor = subject.sensor
     source = random.Random(sensor.id)
@@ -121,8 +122,9 @@ def _repeat(make: Callable[[], bytes], length: int) -> bytes:
 
 
 def _header(sensor: Sensor, name: str, source: random.Random) -> bytes:
-    """Return the bytes up to the last constant at the start of a frame type, random where they are
-    no constants.
+    """Return the first bytes of a frame, up to the last constant at its start.
+
+    All other bytes are random.
     """
     prefix = get_codec(sensor.frames[name]).prefix
     header = bytearray(source.randbytes(max(prefix, default=-1) + 1))

@@ -51,8 +51,9 @@ MAX_CUTS = 20
 
 
 def fault_paths_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[str]]:
-    """Return the paths of faults within arrays in a frame cut short: with an index, and without
-    one.
+    """Return the paths of faults in arrays, for a truncated frame.
+
+    The first list has the paths with an index, the second those without.
     """
     indexed, unindexed = list[str](), list[str]()
     schema = get_codec(sensor.frames[name]).schema

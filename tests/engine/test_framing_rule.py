@@ -73,7 +73,10 @@ MUTANTS = {
 
 @functools.cache
 def subject_of(name: str) -> SensorUnderTest:
-    """Return the subject of a shape: one for all rules, since it keeps its examples."""
+    """Return the subject of a shape.
+
+    All rules use the same subject, because it caches examples.
+    """
     return SensorUnderTest(SHAPES[name])
 
 

@@ -45,8 +45,9 @@ def feed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None
 
 
 def pending_bound(sensor: Sensor) -> int:
-    """Return the bytes below which the pending ones stay: the longest frame, times the run of a
-    weak one.
+    """Return the limit for pending bytes.
+
+    It is the size of the longest frame, times `confirm` for a weak frame.
     """
     return max(frame.max_length * frame.confirm for frame in sensor.incoming.values())
 
@@ -101,8 +102,9 @@ def test_garbage_needs_no_memory(name: str, times: int) -> None:
 
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_frame_is_returned_within_one_maximum_length(name: str) -> None:
-    """Feed pieces of two percent of the longest frame, and see how many bytes after its own last
-    one each frame is out.
+    """Count the bytes after a frame that are fed before the frame is returned.
+
+    Each piece has two percent of the size of the longest frame.
     """
     sensor = load_sensor(name)
     data = b"".join(part for _, part in SensorUnderTest(sensor).conversation(rounds=1))

@@ -153,8 +153,9 @@ class TestFiles:
 
 
 class TestClocks:
-    """P16: over a hundred turns without an error, late packets included; no duration by the wall
-    clock.
+    """Tests of P16: clocks are unwrapped over a hundred turns, also with late packets.
+
+    No duration is measured by the wall clock.
     """
 
     @pytest.mark.parametrize("turn", [30, 3600])

@@ -121,7 +121,7 @@ def test_many_more_structs_parse_as_by_construct(block: int) -> None:
 
 
 def test_most_random_specs_are_compiled_and_have_frames() -> None:
-    """Else the tests above would try little."""
+    """Without this, the tests above might test little."""
     structs = [
         struct
         for struct in (make_struct(spec(number)) for number in range(65))

@@ -491,7 +491,10 @@ def test_numbers_are_shown_with_the_steps_of_their_scale() -> None:
 def test_a_value_has_the_decimals_that_its_steps_need(
     scale: float, offset: float, shown: str
 ) -> None:
-    """One raw step more shows another number, and what is shown is built as it was read."""
+    """Two neighbouring raw values are shown as different texts.
+
+    `build` converts the shown text to the same raw value.
+    """
     shape = SHAPES["shape-numbers"]
     frame = Frame(
         Struct("magic" / Const(b"\xf0\x0d"), "x" / Scaled(Int16ul, scale, "u", offset)),

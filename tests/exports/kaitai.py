@@ -58,7 +58,7 @@ def _has_packages() -> bool:
 
 
 def module(sensor: Sensor, folder: Path) -> ModuleType:
-    """The compiled module of a sensor."""
+    """Return the compiled module of a sensor."""
     name = identifier(make_prefix(sensor))
     spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     assert spec is not None

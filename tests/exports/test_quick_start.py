@@ -81,7 +81,7 @@ def test_each_notes_file_belongs_to_a_sensor() -> None:
 
 @pytest.mark.parametrize("file", NOTES, ids=lambda file: file.stem)
 def test_the_commands_in_notes_exist(file: Path) -> None:
-    """Sensor, command, arguments and options of each command line; nothing is sent."""
+    """Check the sensor, command, arguments and options of each line; send nothing."""
     for line in re.findall(r"^\$ lidarspec (.*)", file.read_text(encoding="utf-8"), re.MULTILINE):
         words = shlex.split(line)
         if "-s" not in words:

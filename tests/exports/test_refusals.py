@@ -20,7 +20,7 @@ from tests.shapes.calibration import BARE
 
 
 class Own(Checksum):
-    """A plugin's own."""
+    """A checksum algorithm of a plugin."""
 
     width = 8
 

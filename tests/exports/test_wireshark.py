@@ -122,9 +122,13 @@ def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = 
 
 
 def _answer(sensor: Sensor, name: str, data: bytes) -> str:
-    """What a dissector takes bytes for: the answer that has the very bytes of a command; of frames
-    that only `plausible` tells apart, which is Python, the first that what was announced leaves;
-    else the frame's own name."""
+    """Return the frame type that a dissector reports for some bytes.
+
+    If the bytes are a command, this is the reply with the same bytes, if there is one. A dissector
+    does not evaluate `plausible`. So if several frame types match, this is the first of them, in
+    the order of the dissector, of those that the last announcement permits. Otherwise it is the
+    frame's own type.
+    """
     if name not in sensor.incoming:
         return next((other for other in sensor.incoming if _reads(sensor, other, data)), name)
     in_turn = sorted(

@@ -28,7 +28,7 @@ TYPES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: 
 
 
 def messages(path: Path) -> list[tuple[str, int, Any]]:
-    """Topic, time and message of everything in a log, by rosbags."""
+    """Return topic, time and content of every message in a log, read by rosbags."""
     with reading.AnyReader([path]) as log:
         return [
             (link.topic, at, log.deserialize(raw, link.msgtype)) for link, at, raw in log.messages()
@@ -36,7 +36,7 @@ def messages(path: Path) -> list[tuple[str, int, Any]]:
 
 
 def points(message: Any) -> np.ndarray:
-    """Return the points of a PointCloud2, (height, width), by its own description."""
+    """Return the points of a PointCloud2, (height, width), by the fields it declares."""
     fields = {
         "names": [field.name for field in message.fields],
         "formats": [TYPES[field.datatype] for field in message.fields],

@@ -20,7 +20,7 @@ pye57 = Library("pye57")
 
 
 def field(file: Any, number: int, name: str, dtype: Any) -> np.ndarray:
-    """A field that pye57 has no name for."""
+    """Return a field that pye57 does not name."""
     points = file.get_header(number).points
     values = np.empty(points.childCount(), dtype)
     buffers = pye57.libe57.VectorSourceDestBuffer()

@@ -25,7 +25,7 @@ TYPED_READERS = [case for case in READERS if case.values[0] not in ("a.bin", "a.
 
 
 def extras() -> list[Scan]:
-    """Lazy scans with columns of a sensor's own."""
+    """Return lazy scans with further columns."""
     sensor = SHAPES["shape-extras"]
     return list(sensor.scans(simulate(sensor, 60)))
 

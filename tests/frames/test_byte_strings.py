@@ -133,7 +133,7 @@ HELD = {
 
 
 def frames() -> list[bytes]:
-    """Counts with numbers after them, and with terminated texts."""
+    """Return frames with counts, followed by numbers or by terminated texts."""
     return [
         *COUNTED,
         b"\x01ab\0",
@@ -300,7 +300,7 @@ def test_the_reason_why_a_frame_is_not_compiled_is_true(part: Any, reason: str) 
 def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_bytes(
     backend: str,
 ) -> None:
-    """Else ten bytes of noise would cost a loop over four thousand million elements."""
+    """Without this limit, ten bytes of noise cause four thousand million iterations."""
     empty = Array(this.n, Struct("x" / If(this._.k > 2, Int8ub)))
     # More elements than bytes, and they are bits.
     bits = BitStruct("low" / Array(24, BitsInteger(1)))
@@ -315,8 +315,9 @@ def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_byt
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
-    """Else arrays within arrays would multiply: two bytes would cost a loop over eight million
-    elements.
+    """The limit applies to all nested arrays together.
+
+    Otherwise two bytes could cause a loop over eight million elements.
     """
     ours = sensor(
         Struct(
@@ -346,7 +347,7 @@ def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str
 
 
 def twice(found: Any) -> int:
-    """A function that branches, so that construct alone computes it."""
+    """Return twice the number; the branch makes construct compute it."""
     return found.n * 2 if found.n else 0
 
 

@@ -110,8 +110,9 @@ def test_named_values_choose_as_in_construct(name: str) -> None:
 
 
 def test_headers_that_mean_the_same_have_one_layout() -> None:
-    """Some billion lengths are too long alike, and some billion keys are no key: garbage has a new
-    one in each header.
+    """Headers with lengths that are too long share one layout, and so do unknown keys.
+
+    Noise has a new length and key in each header, which would otherwise need a new layout.
     """
     body = Switch(
         this.key,
@@ -194,7 +195,7 @@ def test_a_constant_is_one_of_the_names() -> None:
 
 
 def test_one_field_has_one_unit() -> None:
-    """Else the column would have that of the branch that stands first."""
+    """Otherwise the column would have the unit of the first branch."""
     fine, coarse = Scaled(Int16ub, 0.001, "m"), Scaled(Int16ub, 0.002, "m")
     for other in (
         coarse,

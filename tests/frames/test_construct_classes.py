@@ -111,7 +111,7 @@ def split_dots(text: str, context: Any) -> list[int]:
 
 
 class Celsius(construct.Adapter):  # type: ignore[misc]
-    """An adapter of an author's own."""
+    """An adapter that an author declares."""
 
     def _decode(self, obj: Any, context: Any, path: str) -> Any:
         return obj - 40
@@ -127,9 +127,10 @@ TWO = Struct("x" / Int8ub, "y" / Int8ub)
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A struct behind a constant of two bytes, and what stands behind it in some frames.
+    """A struct that begins with a constant of two bytes, and its bytes in some frames.
 
-    `reason` is part of why construct reads the frames; "" if they are compiled.
+    The constant is not part of `members` and `frames`. `reason` is part of the reason why construct
+    reads the frames; "" if they are compiled.
     """
 
     members: tuple[Construct, ...]
@@ -552,7 +553,7 @@ def of_links(made: Sensor, *links: Any) -> Sensor:
 
 
 def bare(value: Any) -> Any:
-    """Return construct's value as dicts, lists and values, with lazy ones read."""
+    """Return construct's value as dicts, lists and values; read lazy values."""
     if isinstance(value, construct.lib.containers.Container | construct.core.LazyContainer):
         return {name: bare(value[name]) for name in value if not name.startswith("_")}
     if callable(value):
@@ -599,7 +600,7 @@ def test_frames_are_found_in_datagrams_and_streams(name: str) -> None:
 
 
 def assert_padded(found: Any, wanted: Any, path: str) -> None:
-    """Fail unless a value of a column is that of construct, padded with zeros where it has none."""
+    """Fail unless a column has the value of construct, padded with zeros."""
     if isinstance(wanted, list) and isinstance(found, np.ndarray):
         for index, part in enumerate(wanted):
             assert_padded(found[index], part, path)

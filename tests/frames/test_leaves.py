@@ -22,8 +22,9 @@ PACKED = Frame(
 
 
 def layouts() -> list[tuple[str, Layout]]:
-    """A layout of each frame type of the shapes that a header alone decides, and of one with an
-    array within a bit block.
+    """Return a layout of each suitable frame type of the shapes.
+
+    The header alone determines the layout. One more layout has an array in a bit block.
     """
     packed = get_codec(PACKED)
     assert isinstance(packed, CompiledCodec)
@@ -38,7 +39,7 @@ def layouts() -> list[tuple[str, Layout]]:
 
 
 def numbers_of(leaf: Leaf, source: np.random.Generator) -> np.ndarray:
-    """Random raw values that an integer field can hold, (ROWS, *shape)."""
+    """Return random raw values that fit an integer field, (ROWS, *shape)."""
     bits = min(leaf.info.bits, 62)
     is_signed = leaf.info.dtype is not None and leaf.info.dtype.kind == "i"
     lowest = -(1 << bits - 1) if is_signed else 0

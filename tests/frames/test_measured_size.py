@@ -25,7 +25,7 @@ def make_sensor(text: Any) -> Sensor:
 @pytest.mark.parametrize("term", [b"\0", b"\r\n"])
 @pytest.mark.parametrize("length", [0, 1, 31, 32, 33, 63, 64, 65, 287, 288, 289, 5000])
 def test_the_end_is_found_in_texts_of_any_length(term: bytes, length: int) -> None:
-    """Lengths at which a step of the search ends, in several frames at once."""
+    """The search advances in steps; these lengths end at the border of a step."""
     ours = make_sensor(NullTerminated(GreedyBytes, term=term))
     lengths = [length - length % len(term), 0, 2]
     frames = [b"x" * length + term + b"\7" for length in lengths]

@@ -54,7 +54,7 @@ def compiled_frames(sensor: Sensor) -> list[str]:
 
 
 def same(one: Any, other: Any) -> None:
-    """Equal values of equal types in equal order, NaNs by their bits."""
+    """Fail unless values, types and order are equal; compare NaNs by their bits."""
     assert type(one) is type(other)
     if isinstance(one, dict):
         assert list(one) == list(other)
@@ -71,7 +71,7 @@ def same(one: Any, other: Any) -> None:
 
 
 def unpack_by_layout(frame: Frame, data: bytes) -> Any:
-    """What the layout of a frame gives, None where it is left to construct."""
+    """Return the frame that its layout reads; None if construct has to read it."""
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
     layout = layouts.layout(data)

@@ -322,7 +322,7 @@ def test_both_engines_count_unknown_parts_equally() -> None:
 
 
 def test_garbage_between_long_chains_is_walked_in_linear_time() -> None:
-    """A chain that claims a thousand parts at every byte costs the frames behind it nothing."""
+    """Each byte of the garbage begins a chain of parts; the frame after it is found."""
     link = Struct("next" / Int8ub, "x" / Bytes(3))
     struct = Checksummed(
         Struct(

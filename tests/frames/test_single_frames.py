@@ -12,7 +12,7 @@ from lidarspec.spec.checksums import single
 
 
 class Own(Checksum):
-    """A stranger's algorithm, of which nothing is known, not even a hash."""
+    """An algorithm of another author, without any attribute, and without a hash."""
 
     width = 8
     __hash__ = None  # type: ignore[assignment]

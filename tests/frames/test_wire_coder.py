@@ -112,7 +112,7 @@ LINE = sensor(
 
 
 def line(content: bytes) -> bytes:
-    """Return a sentence with the XOR of its content, worked out here."""
+    """Return a sentence with its checksum, the XOR of the content."""
     check = 0
     for byte in content:
         check ^= byte
@@ -290,9 +290,7 @@ def test_escapes_are_minimal_and_read_everywhere() -> None:
 
 
 def test_a_text_after_free_text_identifies_candidates() -> None:
-    """What only begins with the same mark is not looked at any further, and so not counted as a
-    frame of a wrong length.
-    """
+    """Bytes that share only the first mark are no candidates, and are not counted."""
     made = sensor(
         Struct("kind" / Bytes(3), "none" / Bytes(0), "name" / Const(b"scan"), "value" / Int8ub),
         Tokens(start=b"\x02"),

@@ -34,8 +34,9 @@ EXAMPLES = 10
 
 @functools.cache
 def make_damaged_frames(name: str) -> NDArray[np.uint8]:
-    """Return frames of one length, (n, size), with a byte changed in every fifth, at places all
-    over the frame.
+    """Return frames of one length, (n, size), with one byte changed in every fifth.
+
+    The changed bytes are spread over the frame.
     """
     sensor = load_sensor(name)
     frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(EXAMPLES)]

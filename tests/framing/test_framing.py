@@ -120,7 +120,10 @@ def test_a_new_header_is_gone_through_once(monkeypatch: pytest.MonkeyPatch) -> N
 
 @each_stream
 def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
-    """Between two calls of `idle` the rule holds, and nothing that was given up comes back."""
+    """Between two calls of `idle` the framing rule holds.
+
+    Bytes that `idle` has released are not used again.
+    """
     if any(frame.confirm > 1 or frame.after for frame in sensor.frames.values()):
         pytest.skip("what this sensor sends depends on what came before")
     data = conversation(sensor, seed=2, length=600)
@@ -358,7 +361,7 @@ def test_completion_offers_public_names_alone() -> None:
 
 
 def test_a_frame_that_begins_with_a_free_byte_may_be_cut_anywhere() -> None:
-    """The sync bytes come second: where only the free byte has arrived, a frame may begin."""
+    """The sync bytes are second, so any last byte of a chunk may begin a frame."""
     struct = Struct(
         "free" / Int8ub, "magic" / Const(b"\x55\xaa"), "value" / Int16ub, "sum" / Int8ub
     )

@@ -37,12 +37,12 @@ MAX_CALLS = 20
 
 
 def plausible(f: Fields) -> Any:
-    """The first distance, and every quality."""
+    """Check the first distance, and the quality of every sample."""
     return (f.first < 60_000) & (f.samples.quality < 255) & (f.samples.distance != 7)
 
 
 def with_frame(struct: Any, samples: int = MAX_SAMPLES) -> Sensor:
-    """Return a sensor with one type of frames, of so many samples at most."""
+    """Return a sensor with one frame type, which has at most `samples` samples."""
     frame = Frame(struct, max_length=10 + 3 * samples, plausible=plausible)
     return dataclasses.replace(
         COUNT,
@@ -81,7 +81,7 @@ SENSORS = {
 
 
 def false_headers(sensor: Sensor, length: int, seed: int = 0) -> bytes:
-    """Return headers, random lengths, some whole frames and some that are damaged."""
+    """Return headers, random lengths, whole frames and damaged frames."""
     source = random.Random(seed)
     frames = [sensor.example("data", seed=number) for number in range(40)]
     found = bytearray()
@@ -132,7 +132,7 @@ def test_the_frames_are_those_of_brute_force(name: str) -> None:
 
 
 def test_checksums_are_computed_for_all_lengths_at_once() -> None:
-    """As `detect` does, which takes each checksum that stands in a frame for the right one."""
+    """The checksum in each frame is regarded as correct, as in `detect`."""
     sensor = SENSORS["behind"]
     data = false_headers(sensor, 6000)
     found = []

@@ -85,7 +85,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """1 where anything was found, else 0."""
+    """Run the fuzzing; return 1 if there are findings, else 0."""
     given = arguments()
     if given.again:
         given.again = given.again.absolute()

@@ -118,8 +118,10 @@ def keep(folder: Path, found: Finding) -> Path:
 
 
 def run_mutations(job: Job, number: int) -> None:
-    """Read so many inputs: mutations of the examples, and of those of a sample that reached new
-    lines.
+    """Read a number of inputs, which are mutations.
+
+    They are mutations of the examples, and of inputs that reached new lines. Only a sample of the
+    inputs is checked for new lines.
     """
     source = random.Random(f"{job.seed} {job.target.name}")
     lines: set[Any] = set()
@@ -143,7 +145,7 @@ def run_mutations(job: Job, number: int) -> None:
 
 @contextlib.contextmanager
 def _trace(lines: set[Any]) -> Iterator[None]:
-    """Add the lines of lidarspec and its plugins that run within."""
+    """Add the lines of lidarspec and its plugins that run in this context."""
 
     def local(frame: FrameType, event: str, _: object) -> Callable[..., Any]:
         lines.add((frame.f_code, frame.f_lineno))
@@ -161,7 +163,7 @@ def _trace(lines: set[Any]) -> Iterator[None]:
 
 
 def run_guided(job: Job, number: int) -> None:
-    """Read so many inputs that atheris chooses by what they reach; it ends the process.
+    """Read a number of inputs that atheris chooses by coverage; then end the process.
 
     lidarspec has to be imported within `atheris.instrument_imports`.
     """

@@ -197,7 +197,10 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
 
 
 def _frame(sensor: Sensor, name: str) -> Target:
-    """Frames of one type, parsed as such, as any, and explained."""
+    """Return the target that parses and explains frames of one type.
+
+    A frame is parsed as this type, and as any type.
+    """
     subject = SensorUnderTest(sensor)
 
     def run(data: bytes) -> None:
@@ -244,8 +247,9 @@ def _frame(sensor: Sensor, name: str) -> Target:
 
 
 def _stream(sensor: Sensor) -> Target:
-    """A stream in pieces of any size, or datagrams, through the decoder and on to scans: nothing of
-    it raises.
+    """Return the target that decodes a stream in pieces, or datagrams, to scans.
+
+    No exception is documented.
     """
     subject = SensorUnderTest(sensor)
 
@@ -284,7 +288,7 @@ def _stream(sensor: Sensor) -> Target:
 
 
 def _datagrams(data: bytes) -> list[bytes]:
-    """Datagrams, each after its length in two bytes."""
+    """Return the datagrams in some bytes; two bytes before each are its length."""
     found = []
     while data:
         size = int.from_bytes(data[:2], "little")
@@ -298,7 +302,10 @@ LINKS = (0, 1, 12, 101, 108, 113, 228, 229, 276, 9, 105, 147, 999)
 
 
 def _capture() -> Target:
-    """Captures of every link type and both formats, by all three readers."""
+    """Return the target that reads captures with all three readers.
+
+    The captures have every link type and both formats.
+    """
 
     def run(data: bytes) -> None:
         for reader in (CaptureReader, StreamReader):
@@ -359,8 +366,9 @@ def _captures() -> list[bytes]:
 
 
 def _file(folder: Path) -> Target:
-    """Files of every kind as a source: packets and scans of a sensor, found by what is in them
-    where nobody says it.
+    """Return the target that reads files of every kind to packets and scans.
+
+    If no sensor is given, it is detected.
     """
 
     def run(data: bytes) -> None:
@@ -423,8 +431,9 @@ def _log(folder: Path, kind: str) -> Target:
 
 
 def _manifest(folder: Path) -> Target:
-    """The manifest of a folder of results that another run has left, for the file that it is of and
-    with the result beside it.
+    """Return the target that reads the manifest of an earlier run.
+
+    The result of that run is beside the manifest.
     """
     results = folder / "results"
     source = folder / "drive.bin"
@@ -477,7 +486,10 @@ def write_recording(sensor: str, frames: Iterable[bytes]) -> bytes:
 
 
 def _recording(folder: Path) -> Target:
-    """Recordings, read and salvaged; the checksums of half of them are right."""
+    """Return the target that reads and salvages recordings.
+
+    The checksums of half of them are correct.
+    """
     path = folder / "some.lsr"
 
     def run(data: bytes) -> None:
@@ -488,9 +500,7 @@ def _recording(folder: Path) -> Target:
                     str(record)
 
     def mended(data: bytes) -> bytes:
-        """With the checksum of each record set right, where its lengths lead to the end of the
-        data.
-        """
+        """Return the records with correct checksums, as far as their lengths lead."""
         found, place = bytearray(data), len(MAGIC)
         while place + 21 <= len(found):
             end = (
@@ -686,7 +696,7 @@ def _vectors(folder: Path) -> Target:
 
 
 def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
-    """The files of a unit's own angles and times that a sensor takes."""
+    """Return the target that reads calibration files of a sensor."""
     path = folder / "angles.csv"
 
     def run(data: bytes) -> None:
@@ -744,7 +754,7 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
 
 
 def _metadata(rows: int) -> bytes:
-    """What a unit of so many rows would say of itself, as its web server has it."""
+    """Return the metadata that the web server of a unit with these rows would send."""
     numbers, still = (
         [float(row) for row in range(rows)],
         [float(spot % 5 == 0) for spot in range(16)],

@@ -48,8 +48,9 @@ def known(
 
 
 def read_neighbours(target: Target, number: int) -> None:
-    """Read the examples of a target and mutations of them; an exception that is not documented
-    fails.
+    """Read the examples of a target, and mutations of them.
+
+    An undocumented exception fails.
     """
     source = random.Random(f"{target.name} few")
     examples = target.examples()

@@ -24,7 +24,7 @@ _OURS = (str(Path(lidarspec.__file__).parent), "lidarspec_")
 
 
 class TooLong(BaseException):
-    """An input took longer than it may; no `except Exception` on the way holds it up."""
+    """An input took too long; no `except Exception` of the reader catches this."""
 
 
 @dataclass(frozen=True)

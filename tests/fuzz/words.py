@@ -126,7 +126,7 @@ SOURCES = ("stl.bin", "stl.hex", "vlp.pcap", "stl.lsr", "empty.bin", "noise.bin"
 
 
 def spoken() -> list[bytes]:
-    """Bytes to begin with: every verb, with a few choices after it."""
+    """Return the first inputs: the bytes of every verb, with a few options."""
     return [
         bytes([verb, *range(start, start + 12)])
         for verb in range(len(ENDING))
@@ -219,8 +219,9 @@ def _list_known(name: str) -> tuple[str, ...]:
 
 
 def run_command(folder: Path, data: bytes) -> None:
-    """Run a command line; it ends with one of the documented codes, and nothing that it prints
-    calls itself a bug.
+    """Run a command line.
+
+    It must end with a documented exit code, and must not print that the error is a bug.
 
     Args:
         folder: the working directory, in which the files that it names are made.
@@ -238,7 +239,7 @@ def run_command(folder: Path, data: bytes) -> None:
 
 
 def _fill_folder(folder: Path) -> None:
-    """Make the files that command lines name, where they are not there as they were."""
+    """Write the files that command lines name, if they are missing or changed."""
     for name, content in _contents().items():
         if not (folder / name).is_file() or (folder / name).stat().st_size != len(content):
             (folder / name).write_bytes(content)

@@ -93,8 +93,9 @@ def test_batches_do_not_matter(name: str, loss: float) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_sequences_against_the_true_numbers(seed: int) -> None:
-    """Numbers 1 to 200 over many turns, with losses and late packets: the index runs like the true
-    count.
+    """The counter wraps many times; the index must follow the true packet numbers.
+
+    Packets are lost and late.
     """
     draw = random.Random(seed)
     sensor = SHAPES["shape-datagrams"]
@@ -133,7 +134,7 @@ def test_late_and_doubled_packets_make_the_same_scans() -> None:
 
 
 def test_a_period_that_depends_on_the_frame_is_looked_up_again_when_it_changes() -> None:
-    """The counter of this sensor ends at 630 or 1260, by a field."""
+    """The last value of the counter is 630 or 1260, depending on a field."""
     sensor = ls.sensor("robosense-m1")
     single = list(simulate(sensor, 1300))
     frame = sensor.build("data", {**sensor.parse(single[0]), "wave_mode": 0})

@@ -76,7 +76,7 @@ def test_a_declared_pace_finds_that_every_second_packet_is_missing() -> None:
 
 
 def test_a_clock_too_coarse_for_single_packets_claims_no_more_than_is_sure() -> None:
-    """A millisecond is two packets of an STL-27L."""
+    """The clock counts milliseconds, and an STL-27L sends two packets in this time."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = simulate(sensor, 3000)
     assert list_losses(decode(sensor, frames)) == (0, 0, 0)

@@ -28,7 +28,10 @@ LAST_BIT = 2e-6
 
 
 def disturb(frames: Sequence[bytes], seed: str) -> list[bytes]:
-    """Return the frames with one in ten doubled, and each up to three places from where it was."""
+    """Return the frames with some doubled, and all moved by up to three places.
+
+    One frame in ten is doubled.
+    """
     draw = random.Random(seed)
     doubled = [frame for frame in frames for _ in range(2 if draw.random() < 0.1 else 1)]
     order = sorted(range(len(doubled)), key=lambda index: index + draw.uniform(0, 3))
@@ -79,9 +82,9 @@ def test_doubled_and_displaced_packets_make_the_same_scans(name: str, first: int
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_sensor_that_sends_datagrams_keeps_the_promise(module: str) -> None:
-    """Of models that share all frames one is tested.
+    """Of the models that share all frames, one is tested.
 
-    Packets without a counter and a clock have no order, so that none is late or a duplicate.
+    Packets without a counter and a clock have no order, so no packet is late or a duplicate.
     """
     for sensor in distinct_sensors_in(module):
         if not sensor.datagrams:

@@ -26,7 +26,7 @@ LEAP_SECONDS = LeapSeconds((0, 1_483_228_800), (36, 37), 1_800_000_000, "/zonein
 
 @pytest.fixture(autouse=True)
 def leap_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The leap seconds until 2026, whatever this computer has."""
+    """Use the leap seconds until 2026, whatever table this computer has."""
     monkeypatch.setattr(utc_times, "read_leap_seconds", lambda: LEAP_SECONDS)
 
 
@@ -154,7 +154,10 @@ def test_packets_are_converted_with_their_status() -> None:
 
 @pytest.mark.parametrize("epoch", ["utc", "tai", "gps", "boot", "hour", ""])
 def test_many_packets_get_the_utc_that_each_alone_gets(epoch: str) -> None:
-    """The clock is 50 ppm fast; it loses its date, and gets it again. Some packets are late."""
+    """The clock is 50 ppm fast, loses its date, and receives it again.
+
+    Some packets are late.
+    """
     seconds = np.arange(0, 60, 0.01)
     random = np.random.default_rng(1)
     drifted_ns = np.rint(seconds * (1 + 50e-6) * 1e9).astype(np.int64)

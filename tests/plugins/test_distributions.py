@@ -120,7 +120,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def seen(site: Path) -> dict[str, Any]:
-    """Output of a program that runs with these plugins installed."""
+    """Return the output of a program that runs with these plugins installed."""
     code = (
         f"FRAME = {FRAME!r}\n{LOOK}{WORK}\n"
         "print(json.dumps([plugins, good, sorted(sensors), report]))"

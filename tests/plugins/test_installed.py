@@ -41,7 +41,7 @@ def by_metadata(group: str) -> list[tuple[str, str, str, str]]:
 def distribution(
     place: Path, name: str, version: str, entries: str, kind: str = "dist-info"
 ) -> None:
-    """A distribution as an installer leaves it behind."""
+    """Write the metadata of a distribution as an installer does."""
     folder = place / f"{name}-{version}.{kind}"
     folder.mkdir(parents=True)
     (folder / "entry_points.txt").write_text(entries, encoding="utf-8")
@@ -115,7 +115,7 @@ def test_an_entry_point_loads_as_its_reference_does(value: str) -> None:
 
 
 class Module(SimpleNamespace):
-    """A module that notes which of its sensors it was asked for by name."""
+    """A module that records which of its sensors were requested by name."""
 
     def __getattr__(self, name: str) -> Sensor:
         known = self.__dict__.get("by_name", {})
@@ -128,7 +128,7 @@ class Module(SimpleNamespace):
 
 @pytest.fixture
 def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
-    """Modules that can be loaded by name; each notes that it was asked for its sensors."""
+    """Return modules that can be loaded by name; each records requests for sensors."""
     found: dict[str, SimpleNamespace] = {}
 
     def made(name: str, *ids: str, aliases: tuple[str, ...] = (), **hooks: Any) -> SimpleNamespace:
@@ -163,8 +163,9 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, SimpleNamespace]:
 
 
 def registry(*entries: str, offered: str = "") -> Registry:
-    """A registry of modules given as "name = value", and of sensors given by their ids, in the
-    order in which they would be found.
+    """Return a registry of modules and of sensors, in the order of discovery.
+
+    Each module is given as "name = value".
 
     Args:
         offered: "id = module" for each sensor, separated by blanks around a comma.
@@ -324,8 +325,9 @@ def test_hooks_apply_to_sensors_of_entry_points(
 
 
 def make_registry(*claims: str, owners: dict[str, str] | None = None) -> Registry:
-    """A registry of sensors that distributions offer, each given as "distribution: name = module,
-    ..."; an alias as "name = module:id".
+    """Return a registry of sensors that distributions claim.
+
+    Each claim is "distribution: name = module, ..."; an alias is given as "name = module:id".
     """
     offered = []
     for claim in claims:

@@ -40,7 +40,7 @@ def test_sensor_of_a_foreign_distribution_is_found_and_decodes(
 
 @pytest.mark.slow
 class TestStranger(SensorConformance):
-    """The stranger's sensor straight from its file."""
+    """Tests of the sensor of another author, loaded from its file."""
 
     sensor = STRANGER
     examples = 4

@@ -16,7 +16,7 @@ LEFT_OUT = {
 
 
 def test_no_vector_is_left_unused() -> None:
-    """Tests name a vector, or what its name has behind the family's."""
+    """A test uses a vector if it contains the name, with or without the family."""
     files = Path(__file__).parents[2].glob("plugins/*/tests/*.py")
     texts = "".join(file.read_text(encoding="utf-8") for file in files)
     names = [

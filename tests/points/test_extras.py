@@ -47,7 +47,7 @@ KINDS = {
 
 
 def packets(number: int = 40, backend: str = "numpy") -> Packets:
-    """Packets with anything in them."""
+    """Return packets with random values."""
     return reader(SENSOR, backend).decode(
         [SENSOR.example("data", seed=seed) for seed in range(number)]
     )
@@ -222,8 +222,9 @@ PIXEL = ByteSwapped(
 
 
 def words() -> Sensor:
-    """A sensor whose pixels share words, in directions that are looked up; two fields beside them
-    stand in none.
+    """Return a sensor whose pixels share words, with directions from tables.
+
+    Two further fields are not in these words.
     """
     columns = Array(4, Struct("number" / Int16ul, "pixels" / Array(8, PIXEL)))
     struct = Struct(

@@ -35,7 +35,7 @@ def bits(column: NDArray[Any]) -> NDArray[Any]:
 
 
 def frames_of(sensor: Sensor, points: list[Any]) -> list[bytes]:
-    """Whole frames of these points, dicts of raw values."""
+    """Return whole frames of these points, which are dicts of raw values."""
     rows = [points[start : start + POINTS] for start in range(0, len(points) - POINTS + 1, POINTS)]
     return [
         sensor.build("data", number=index, time=index, count=POINTS, points=row)
@@ -44,7 +44,7 @@ def frames_of(sensor: Sensor, points: list[Any]) -> list[bytes]:
 
 
 def values_of(name: str) -> list[Any]:
-    """Raw values at the edges of a coordinate."""
+    """Return raw values at the limits of a coordinate."""
     if name == "shape-floats":
         return ODD
     least = -(2 ** (31 if name == "shape-millimetres" else 15))
@@ -52,7 +52,7 @@ def values_of(name: str) -> list[Any]:
 
 
 def move_points(f: Any) -> Cartesian:
-    """As an extrinsic calibration moves them, and by a row of numbers."""
+    """Return points moved by an extrinsic calibration and by a row of numbers."""
     x, y, z = f.points.x, f.points.y, f.points.z
     return Cartesian(
         0.8 * x - 0.6 * y + 0.1,
@@ -105,7 +105,7 @@ def test_a_point_is_drawn_at_its_coordinates(backend: str) -> None:
 def test_coordinates_may_lie_in_a_plane_and_be_turned(
     columns: tuple[int, int, int], backend: str
 ) -> None:
-    """With the vendor's axes, too: x right, y ahead."""
+    """They are also rotated to the vendor's axes: x right, y forward."""
     shape = SHAPES["shape-centimetres"]
 
     def points(f: Any) -> Cartesian:

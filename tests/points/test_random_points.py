@@ -107,7 +107,7 @@ class Maker:
         return value
 
     def points(self) -> Callable[[Fields], Polar]:
-        """A whole function."""
+        """Return a whole `points` function."""
         distance, level = self._parts.full[0], self._source.randrange(4)
         azimuth, row, tilt = self.angle(), self._row(), self.angle()
         origin = (0.0, 0.0, 0.1) if self._source.random() < 0.3 else (0.0, 0.0, 0.0)

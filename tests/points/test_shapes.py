@@ -138,9 +138,9 @@ def test_a_length_may_follow_from_a_constant() -> None:
 
 
 def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
-    """No declaration relates one length to the other here.
+    """Two lengths must fit each other, which no declaration states.
 
-    Random lengths would never fit both.
+    Random lengths would never fit.
     """
     shape = SHAPES["shape-sized"]
     children = [
@@ -212,7 +212,7 @@ def test_checksums_are_at_their_declared_positions() -> None:
     "name", ["shape-middle", "shape-nibbles", "shape-nested", "shape-twice", "shape-sized"]
 )
 def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
-    """As an author tries it first."""
+    """An author tries the struct first, without a sensor."""
     sensor = SHAPES[name]
     struct, frame = sensor.frames["data"].struct, sensor.example("data")
     parsed = struct.parse(frame)

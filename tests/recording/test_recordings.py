@@ -78,7 +78,7 @@ def as_records(chunks: list[Chunk], *, datagram: bool = True) -> list[Record]:
 
 
 def test_the_format_of_version_1_stays(path: Path) -> None:
-    """A recording of today is read by every later version; computed by hand from the table."""
+    """Every later version must read this recording, computed by hand from the table."""
     header = bytes.fromhex("b54c531e 00 00 00 0200 0000000000000080") + b"{}"
     datagram = (
         bytes.fromhex("b54c531e 01 01 11 0200 15cd853dfe9c9717")  # a datagram, 17 bytes of address
@@ -376,7 +376,7 @@ def file_size_limit(size: int) -> Iterator[None]:
 
 
 def fill(path: Path) -> None:
-    """Record more data than there is room for.
+    """Record more data than the disk can hold.
 
     The capture continues, one error is raised, and the file stays whole.
     """

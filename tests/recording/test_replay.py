@@ -68,7 +68,10 @@ def datagrams(tmp_path: Path) -> Path:
 def playing(
     path: Path, target: Outlet, *, speed: float | None, began: list[float] | None = None
 ) -> Iterator[list[BaseException]]:
-    """A replay in a thread of its own; what went wrong there, and by `began` when it began."""
+    """Replay in a thread; yield the list of its errors.
+
+    The time at which the replay began is added to `began`.
+    """
     failed: list[BaseException] = []
 
     def run() -> None:
@@ -209,7 +212,7 @@ def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
 
 
 class Clock:
-    """A clock that a sleeper oversleeps on, by more than the time between two chunks."""
+    """A clock with which each sleep ends later than the next chunk is due."""
 
     def __init__(self) -> None:
         self.time = 5 * SECOND

@@ -17,7 +17,7 @@ START, STEP, NUMBER = 10**18, 10**7, 4000
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """40 s in pieces of 300 bytes, which begin like a record."""
+    """Return a recording of 40 s, whose pieces of 300 bytes begin like a record."""
     path = tmp_path_factory.mktemp("recording") / "drive.lsr"
     with Recorder(path, datagrams=True) as target:
         for number in range(NUMBER):

@@ -48,7 +48,7 @@ TEXT = [pytest.param(name, marks=pytest.mark.slow) for name in ("hokuyo-utm30lx"
 
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", *TEXT])
 def test_each_beam_is_as_late_as_its_points(name: str) -> None:
-    """Within three beams, and two steps of a clock that counts in ms."""
+    """The tolerance is three beams, and two steps of a clock that counts milliseconds."""
     scans = simulate_scans(name)
     found = planar(PlanarScans(), scans)
     assert len(found) > 2

@@ -40,7 +40,7 @@ def is_visible(degrees: Any, sector: Sector) -> Any:
 def blocks_of(
     sector: Sector | None, *, whole_packets: bool, turns: int = TURNS
 ) -> list[np.ndarray]:
-    """Return the numbers of the blocks in each packet of a sensor that sends a sector alone.
+    """Return the numbers of the blocks in each packet of a masked sensor.
 
     Args:
         whole_packets: packets have the blocks that they would have without a mask; else those of
@@ -66,8 +66,9 @@ def pace(f: Fields) -> float:
 def rotating(
     packets: Sequence[np.ndarray], *, counted: bool = False, clockwise: bool = False
 ) -> Sensor:
-    """Return a sensor that sends such packets, ordered by a clock or by a counter of the packets
-    sent.
+    """Return a sensor that sends these packets, ordered by a clock or by a counter.
+
+    The counter counts the packets that were sent.
     """
 
     def sweep(i: int) -> dict[str, Any]:
@@ -91,12 +92,12 @@ def rotating(
 
 
 def degrees_of(scan: Scan) -> np.ndarray:
-    """Return the angles of a scan's points as they go on over a turn, degrees."""
+    """Return the angles of a scan's points without wraps, degrees."""
     return np.rad2deg(np.unwrap(scan.points.azimuth.astype(np.float64)))
 
 
 def assert_one_scan_a_turn(scans: Sequence[Scan], sector: Sector) -> None:
-    """Check that all scans but the first and the last are the whole visible sector, once."""
+    """Check that each scan, except the first and last, is the visible sector, once."""
     inner = scans[1:-1]
     assert len(inner) >= TURNS - 2
     assert all(scan.complete for scan in inner)

@@ -39,15 +39,16 @@ CASES = (
 
 
 def waiting_points(f: Fields) -> Polar:
-    """Those of the segments, each of which waits for the segment behind it, in whatever frame that
-    is.
+    """Return the points of segments; each segment waits for the next one.
+
+    The next segment may be in another frame.
     """
     cloud = segments.points(f)
     return replace(cloud, range=cloud.range + 0 * following(f.start))
 
 
 def waiting() -> Sensor:
-    """A sensor with parts whose points wait."""
+    """Return a sensor with parts, each of which waits for the next part."""
     data = replace(segments.SENSOR.frames["data"], points={"segments": waiting_points})
     return with_frames(segments.SENSOR, {"data": data})
 
@@ -58,7 +59,10 @@ def frames_of(sensor: Sensor) -> list[bytes]:
 
 
 def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[Scan], list[int]]:
-    """The scans of frames that come so many at a time, and where each frame begins in the input."""
+    """Return the scans of frames, and the offset of each frame in the input.
+
+    `together` frames arrive at a time.
+    """
     decoder = sensor.decoder()
     packets, stream, scans = (
         PacketStream(sensor, sensor.data_frame, decoder.stats),

@@ -241,7 +241,7 @@ def test_packets_of_a_sensor_in_shared_buffers_give_the_same_points(
 
 
 def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> None:
-    """Fail unless packets in one buffer and packets apart from each other have the same points."""
+    """Fail unless packets in one buffer and in separate buffers give equal points."""
     frames = [sensor.example(sensor.data_frame, seed=seed) for seed in range(5)]
     size = Counter(map(len, frames)).most_common(1)[0][0]
     rows = np.stack([np.frombuffer(frame, np.uint8) for frame in frames if len(frame) == size])

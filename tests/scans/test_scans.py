@@ -38,7 +38,7 @@ PACKET_NS = 1_327_104
 
 
 class Reading:
-    """A sensor's frames read in pieces, and the scans that they complete."""
+    """A decoder and the scans of its frames, read piece by piece."""
 
     def __init__(self, name: str) -> None:
         self.sensor = ls.sensor(name)
@@ -252,8 +252,9 @@ def segments() -> list[bytes]:
     [(0, True, True), (3, True, False), (10, True, False), (11, False, False)],
 )
 def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
-    """A turn is 20 frames, with 30 parts: it is whole where at least as many frames are there as
-    are missing.
+    """A turn has 20 frames of 30 parts each.
+
+    It is whole if at least as many frames were received as are missing.
     """
     frames = [frame for place, frame in enumerate(segments()) if not 24 <= place < 24 + lost]
     assert SHAPES["shape-segments"].decode(frames).stats.lost == lost
@@ -362,8 +363,9 @@ def test_pieces_do_not_change_losses(name: str) -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 200])
 def test_scans_end_where_an_angle_jumps_and_not_where_it_passes_0(size: int) -> None:
-    """Each face of the shape's mirror is a scan of 20 rows, whichever packets they stand in; the
-    second sweeps across 0.
+    """Each face of the mirror gives a scan of 20 rows, in one or several packets.
+
+    The sector of the second face contains 0.
     """
     sensor = SHAPES["shape-mirror"]
     scans = scans_of_pieces("shape-mirror", simulate(sensor, 200), size)
@@ -394,7 +396,7 @@ def test_a_laserscan_has_the_requested_beams_and_direction(name: str, falls: boo
 
 
 def test_a_scan_says_when_the_packet_of_its_first_point_arrived() -> None:
-    """However the frames come in pieces, and none where nobody knows it."""
+    """The time does not depend on the pieces; it is 0 if it is unknown."""
     reading = Reading("velodyne-vlp16")
     frames = simulate(reading.sensor, 400)
     arrivals = 10**18 + np.arange(len(frames)) * PACKET_NS
