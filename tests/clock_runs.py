@@ -75,7 +75,7 @@ def make_run(
 
 
 def watch(packets: Packets, began_s: float, step_s: float = 0.1) -> Watched:
-    """Return what a monitor finds in packets that arrive piece by piece.
+    """Return the results of a monitor for packets that arrive in pieces.
 
     Args:
         began_s: the host's time at the start, seconds since 1970.

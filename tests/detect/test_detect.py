@@ -89,7 +89,7 @@ FEW = (
 
 @pytest.fixture
 def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let detection know few sensors: each of them costs time."""
+    """Let detection load only few sensors, because each of them takes time."""
     few = {name: ls.sensor(name) for name in sorted(FEW)}
     for module in (identification, listen):
         monkeypatch.setattr(module, "sensors", lambda: few)
@@ -97,7 +97,7 @@ def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Listen until enough has come, however slow the machine is."""
+    """Listen until enough data has arrived, however slow the machine is."""
     monkeypatch.setitem(identification.identify_senders.__kwdefaults__, "seconds", TIMEOUT_S)
 
 

@@ -357,9 +357,9 @@ def test_commands_over_a_link_of_their_own(server: socket.socket, named: str) ->
 
 @contextlib.contextmanager
 def silent_at_first(number: int, seconds: float, heard: list[str]) -> Iterator[None]:
-    """Simulate a device that replies to orders and sends its first datagram late.
+    """Simulate a device that replies to orders, and sends its first datagram late.
 
-    The datagrams go to a port.
+    The datagrams are sent to a port of this computer.
     """
 
     def work(stop: threading.Event) -> None:

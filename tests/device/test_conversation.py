@@ -115,7 +115,7 @@ ANGLES = [0.5, 1.0, 1.5, 2.0]
 
 
 def teaching(**more: Any) -> Sensor:
-    """Return the shape with a request for its table on opening."""
+    """Return the shape with a command on opening that requests its table."""
     return dataclasses.replace(make_linked_sensor(Udp(free_port())), on_open=("get_table",), **more)
 
 
@@ -275,11 +275,11 @@ def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> Non
 
 
 class Loop(Link):
-    """A link of a plugin's own."""
+    """A link that a plugin declares."""
 
 
 class Looped(LiveTransport):
-    """A link whose other end acknowledges every message."""
+    """The open link; its other end acknowledges every message."""
 
     def __init__(self) -> None:
         self.label, self._left = "loop", queue.SimpleQueue[bytes]()
@@ -293,7 +293,7 @@ class Looped(LiveTransport):
         self._left.put(SENSOR.build("ack", head=SENSOR.parse(data, "order").head, result=0))
 
     def reopen(self) -> None:
-        """It does not go away."""
+        """Do nothing, because this link does not disappear."""
 
     def close(self) -> None:
         self.closed = True

@@ -38,7 +38,7 @@ _FENCE = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page. The title is "" if it has none."""
+    """A fenced block of a page; its title is "" if it has none."""
 
     language: str
     title: str

@@ -37,8 +37,9 @@ def make_sealed_frames(
     skip: int = 0,
     vary: int = 1,
 ) -> list[bytes]:
-    """Frames of random content with a header, and a checksum at the end over all but the first
-    `skip` bytes.
+    """Return frames with a header, random content, and a checksum at the end.
+
+    The checksum covers all but the first `skip` bytes.
     """
     source = random.Random(number * length)
     bodies = [HEAD + source.randbytes(length + source.randrange(vary)) for _ in range(number)]

@@ -54,7 +54,7 @@ def rising(found: Draft) -> dict[str, tuple[int, str, int]]:
 
 
 def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
-    """The sensor that `new --from-capture` writes."""
+    """Return the sensor that `new --from-capture` writes."""
     ran("new", "acme-x9", "--into", tmp_path, "--from-capture", source, *more)
     return ls.sensor(
         tmp_path
@@ -201,8 +201,9 @@ def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> None:
-    """With everything that a draft can have: blocks, a count, a class for the checksum, angles, a
-    counter.
+    """The draft has everything that a draft can have.
+
+    These are blocks, a count, a class for the checksum, angles and a counter.
     """
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
@@ -244,7 +245,7 @@ def make_frames(
     order: str = "little",
     vary: int = 0,
 ) -> bytes:
-    """Frames with a counter and random content behind a header, sealed at the end."""
+    """Return frames with a header, a counter, random content and a checksum."""
     source = random.Random(number)
     counts = [source.randrange(vary + 1) for _ in range(number)]
     frames = [
@@ -310,8 +311,9 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_wrapping_index_does_not_make_a_longer_frame(tmp_path: Path) -> None:
-    """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the
-    format of old vacuum cleaners.
+    """Ninety packets a turn begin with one constant byte, as in old vacuum cleaners.
+
+    The scene does not change.
     """
     rows = [
         np.array([1500 + 40 * (i % 90) + j for j in range(8)], "<u2").tobytes() for i in range(900)
@@ -329,8 +331,9 @@ def test_a_wrapping_index_does_not_make_a_longer_frame(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: Path) -> None:
-    """A header of fields, then samples of three bytes, and a big-endian sum; now and then a frame
-    of eleven bytes.
+    """Frames have a header of fields, samples of three bytes, and a big-endian sum.
+
+    Sometimes a frame of eleven bytes is between them.
     """
     source = random.Random(7)
 
@@ -424,7 +427,7 @@ def test_names_are_refused_before_a_capture_is_read() -> None:
 
 
 def test_points_may_depend_on_no_field() -> None:
-    """As those of a draft without an angle do."""
+    """A draft without an angle has such points."""
     shape = SHAPES["shape-count"]
     batch = shape.decode(shape.example("data") * 3).batch()
     arrays, axes, ready = align((np.zeros(1), 0.0), batch)

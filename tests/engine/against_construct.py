@@ -62,7 +62,10 @@ def parse_by_construct(struct: Construct, data: bytes, *, max_length: int = 200)
 
 
 def plain(value: Any) -> Any:
-    """Return a parsed value as dicts, lists, numbers and bytes; codes of construct as ours."""
+    """Return a parsed value as dicts, lists, numbers and bytes.
+
+    Values of construct's Enum become those of our own class.
+    """
     if isinstance(value, dict):
         return {name: plain(part) for name, part in value.items() if not name.startswith("_")}
     if isinstance(value, list):

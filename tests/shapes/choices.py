@@ -70,8 +70,9 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Eighteen packets a turn; what only some values may be is left out, and the first of them
-    stands there.
+    """Return the values of packet i, eighteen packets a turn.
+
+    Fields with restricted values are left out; the simulation uses the first allowed value.
     """
     return {"angle": i * 20.0 % 360, "samples.flags.quality": 40}
 

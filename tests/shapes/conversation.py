@@ -97,7 +97,7 @@ def points(
 
 
 def configure(sensor: Sensor, *, table: str | Path | Learned) -> Sensor:
-    """The sensor with the angles of a unit, degrees with spaces between them."""
+    """Return the sensor with the angles of a unit: degrees, separated by spaces."""
     try:
         angles = tuple(map(float, Learned.content(table).split()))
     except ValueError as error:
@@ -112,7 +112,7 @@ def sweep(i: int) -> dict[str, float]:
 
 
 def order(code: int) -> dict[str, object]:
-    """The values of an order of its own code, in which nothing else is said."""
+    """Return the values of an order with this code and no arguments."""
     return {
         "head.number": Count(16, 7),
         "head.code": code,

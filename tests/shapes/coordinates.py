@@ -29,7 +29,7 @@ POINTS, RATE = 12, 100
 
 
 def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
-    """A sensor whose points have coordinates of one kind."""
+    """Return a sensor whose points have coordinates of one kind."""
     point = Struct(*(axis / coordinate for axis in "xyz"), "reflectivity" / Int8ul, "tag" / Int8ul)
     data = Checksummed(
         Struct(
@@ -75,7 +75,7 @@ def points(f: Fields) -> Cartesian:
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """A flower ahead, another part of it in each packet."""
+    """Return directions in the form of a flower, another part of it in each packet."""
     turns = (np.arange(POINTS) + i * POINTS) * 0.0377
     return 0.6 * np.sin(turns * 2.6) * np.cos(turns), 0.4 * np.sin(turns * 2.6) * np.sin(turns)
 

@@ -71,8 +71,10 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """The signal is that of a block; the confidence falls with the noise, and there is none from
-    noise 7 on.
+    """Return points with further columns.
+
+    The signal is that of the block. The confidence falls with the noise, and is missing from noise
+    7 on.
     """
     channels = f.blocks.channels
     return Polar(

@@ -70,7 +70,7 @@ def points(f: Fields) -> Polar:
 
 
 def beside(f: Fields) -> Imu:
-    """The board of this one is turned over: its x is forward, its y to the right, its z down."""
+    """Return samples of a board that is upside down: x forward, y right, z down."""
     s, radians = f.samples, np.pi / 180
     return Imu(
         (s.gyro_x * radians, s.gyro_y * -radians, s.gyro_z * -radians),

@@ -30,13 +30,19 @@ FRAME = Struct(
 
 
 def points(f: Fields) -> Polar:
-    """Two pixels side by side; the mirror turns the beam by twice its own angle."""
+    """Return two pixels side by side.
+
+    The mirror deflects the beam by twice its own angle.
+    """
     behind = np.minimum(*(np.mod(f.rows.angle - face, 360) for face in FACES))
     return Polar(range=f.rows.distances, azimuth=np.deg2rad(2 * behind + np.array([-0.2, 0.2])))
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i, of a face after the other; a packet may be of both."""
+    """Return the values of packet i; the faces follow one another.
+
+    A packet may contain rows of both faces.
+    """
     row = i * ROWS + np.arange(ROWS)
     begins = np.array(FACES)[row // PER_FACE % len(FACES)]
     return {"counter": i % 256, "rows.angle": np.round((begins + row % PER_FACE * STEP) % 360, 2)}

@@ -61,5 +61,5 @@ SENSOR = replace(
 
 @hookimpl
 def lidarspec_sensors() -> list[Sensor]:
-    """Return it, so that the command line takes this file as a sensor."""
+    """Return the sensor, so that the command line can load it from this file."""
     return [SENSOR]

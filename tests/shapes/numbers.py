@@ -49,7 +49,7 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """A range that is not a number stays one; a direction of that kind makes the point invalid."""
+    """Return points; a range of nan stays nan, and a direction of nan is invalid."""
     return Polar(
         range=f.samples.range, azimuth=f.azimuth, elevation=np.deg2rad(f.samples.elevation)
     )

@@ -56,7 +56,7 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Polar:
-    """Distances are in steps of 1 mm, or of 4 mm where the header says so."""
+    """Return points; the header selects distances in steps of 1 mm or of 4 mm."""
     trim = np.nan_to_num(f.extension.trim)
     azimuth = np.deg2rad(f.angle + trim + 0.0 * f.distances)
     return Polar(range=f.distances * np.where(f.options.coarse == 1, 0.004, 0.001), azimuth=azimuth)

@@ -98,5 +98,5 @@ SENSOR = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> list[Sensor]:
-    """Return it, so that the command line takes this file as a sensor."""
+    """Return the sensor, so that the command line can load it from this file."""
     return [SENSOR]

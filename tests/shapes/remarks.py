@@ -40,7 +40,7 @@ def points(f: Fields) -> Polar:
 
 
 def plausible_remark(f: Fields) -> Any:
-    """Letters, then zeros."""
+    """Return whether a remark consists of letters, then zeros."""
     return (f.text == 0) | ((f.text >= 0x41) & (f.text <= 0x5A))
 
 

@@ -74,7 +74,7 @@ def tag(i: int, number: int) -> dict[str, Any]:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Four frames a turn; one has two lists of points and something in between."""
+    """Return four frames a turn; one has two lists of points with another tag between."""
     tags = (
         [tag(i, 6)]
         if i % TURN
@@ -100,5 +100,5 @@ SENSOR = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> list[Sensor]:
-    """Return it, so that the command line takes this file as a sensor."""
+    """Return the sensor, so that the command line can load it from this file."""
     return [SENSOR]

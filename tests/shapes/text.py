@@ -15,7 +15,7 @@ from lidarspec.spec import Fields, Frame, OnWrap, Polar, Scaled, Serial
 
 
 class Decimal(Adapter):  # type: ignore[misc]
-    """A decimal number as it is printed: no sign, no leading zeros."""
+    """A decimal number as text, without a sign and leading zeros."""
 
     def _decode(self, obj: bytes, context: Any, path: str) -> int:
         if not obj.isdigit() or str(int(obj)).encode() != obj:
@@ -27,7 +27,7 @@ class Decimal(Adapter):  # type: ignore[misc]
 
 
 def number(end: bytes) -> Decimal:
-    """A decimal number up to a terminator."""
+    """Return a field with a decimal number up to a terminator."""
     return Decimal(NullTerminated(GreedyBytes, term=end))
 
 

@@ -374,7 +374,7 @@ def test_an_exception_of_the_serving_thread_is_raised_at_the_end() -> None:
 
 @pytest.fixture
 def above_1023() -> Iterator[None]:
-    """Whatever is opened gets a descriptor that `select` does not know."""
+    """Occupy all descriptors below 1024: `select` supports no later ones."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limits[1] < 2048:
@@ -412,7 +412,7 @@ def test_keys_come_over_any_descriptor() -> None:
 
 @posix
 def test_many_simulators_take_turns_and_end() -> None:
-    """Of as many in one process as it can hardly keep up with, each sends, and all end."""
+    """One process runs almost more simulators than it can; all send, and all end."""
     ports = [Served(SimulatedDevice(stl()), make_simulated_outlet(stl(), "pty")) for _ in range(12)]
     until(lambda: all(port.device.sent["data"] for port in ports))
 

@@ -48,8 +48,10 @@ def take_coordinates(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
 
 
 def half_step(sensor: Sensor, frame: str) -> float:
-    """Half a step of the coarsest range field; of coordinates, which are rounded one by one, as far
-    as that can be from a corner.
+    """Return the largest error of a point that rounding its range can cause, m.
+
+    It is half a step of the coarsest range field. If `points` returns coordinates, which are
+    rounded one by one, it is half the diagonal of a cube with edges of one step.
     """
     if frame in STEPS:
         return STEPS[frame]
@@ -82,9 +84,7 @@ def run_device(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes],
 def _find_hits(
     sensor: Sensor, frame: str, cloud: ls.PointCloud, room: Room, numbers: range
 ) -> NDArray[np.bool_]:
-    """Which beams meet something that is neither too near nor too far for the sensor, by the width
-    of a hand.
-    """
+    """Return which beams hit something in the sensor's range, with a margin of 0.1 m."""
     low, high = sensor.range_limits or (0.0, np.inf)
     azimuth, elevation = cloud.azimuth.astype(float), cloud.elevation.astype(float)
     # A point without a return has no coordinates.
@@ -272,7 +272,7 @@ def test_sensors_that_cannot_be_simulated_give_a_reason() -> None:
 
 @pytest.mark.parametrize(("stretch", "shift"), [(1, 0.1), (1, -0.02), (1.01, 0.05), (0.98, 0)])
 def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: float) -> None:
-    """As a site's calibration makes them, in a hook."""
+    """A hook corrects ranges like this, with the calibration of a site."""
 
     def corrected(f: Any) -> Polar:
         polar = count.points(f)
@@ -311,14 +311,14 @@ def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
 
 
 def turn_points(f: Any) -> Cartesian:
-    """Two returns of each beam, in steps of the header, turned and shifted."""
+    """Return two returns of each beam, rotated and moved; the header has their step."""
     first, second = f.beams.first, f.beams.second
     x, y, z = (stack(getattr(first, axis), getattr(second, axis)) * f.step for axis in "xyz")
     return Cartesian(0.8 * x - 0.6 * y + 0.1, 0.6 * x + 0.8 * y, 0.05 - z, intensity=f.beams.light)
 
 
 def turned_sensor(directions: Any) -> Sensor:
-    """As many beams as the header says."""
+    """Return a sensor with a variable number of beams, which the header gives."""
     point = Struct(*(axis / Int16sl for axis in "xyz"))
     beam = Struct("first" / point, "second" / point, "light" / Int8ub)
     sensor = against_construct.sensor(

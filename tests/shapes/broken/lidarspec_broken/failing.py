@@ -46,7 +46,7 @@ def fails(f: Fields) -> Any:
 
 
 def plain(name: str, **changes: Any) -> Sensor:
-    """A sensor with one frame of eight bytes and no checksum."""
+    """Return a sensor with one frame of eight bytes and no checksum."""
     sensor = Sensor(
         name,
         vendor="Broken",
