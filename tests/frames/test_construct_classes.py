@@ -514,6 +514,12 @@ PLAIN: dict[str, Case] = {
     "Transformed by a function": case(
         "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
     ),
+    "VarInt as a count": case(
+        "n" / VarInt, "d" / Bytes(this.n), frames="026162 00", reason="not a number of fixed size"
+    ),
+    "VarInt as a length": case(
+        "a" / Prefixed(VarInt, Bytes(2)), frames="026162", reason="cannot be a length"
+    ),
     "LazyBound of itself": case("a" / NODE, frames="00 020100", reason="contains itself"),
     "RepeatUntil": case(
         "a" / RepeatUntil(obj_ == 0, Int8ub), "b" / Int8ub, frames="01020003 0003", reason="Parts"

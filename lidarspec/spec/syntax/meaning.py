@@ -901,7 +901,11 @@ def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
     ref = tree.Ref(info.path, info)
     if info.adapter is None:
         return ref
-    unknown = tree.Untraced(f"{info.path}: a Python function makes the value of {info.path}", "?")
+    if info.kind == "bytes":
+        reason = f"it uses {info.path}, which is not a number of fixed size"
+    else:
+        reason = f"it uses {info.path}, whose value a Python function computes"
+    unknown = tree.Untraced(f"{info.path}: {reason}", "?")
     try:
         value = info.adapter.decode(tree.Symbol(ref))
     except Exception:  # a function of a plugin may raise anything for a symbol
@@ -1060,6 +1064,9 @@ def _find_below(node: tree.Node, names: Iterable[str]) -> tree.Node:
     return node
 
 
+_VARIABLE_REASON = (
+    "a {} cannot be a length, a count, a constant or an Enum: use an integer of fixed size"
+)
 _TRANSFORMED_REASON = (
     "{} transforms bytes: declare the bytes on the wire and transform them in `points` (f.x ^"
     " 0x55), or use a WireForm"
@@ -1095,14 +1102,8 @@ _OPAQUE_REASONS = {
     "Tell": "Tell is used in Parts: use SizeOf for the length of a part",
     "Index": "Index is not on the wire: in `points` the index of an element is f.x.index",
     "LazyBound": "a part that contains itself has no fixed offset: use Parts for a sequence",
-    "VarInt": (
-        "the fields after a VarInt have no fixed offset: use a WireForm for numbers of variable"
-        " size"
-    ),
-    "ZigZag": (
-        "the fields after a ZigZag have no fixed offset: use a WireForm for numbers of variable"
-        " size"
-    ),
+    "VarInt": _VARIABLE_REASON.format("VarInt"),
+    "ZigZag": _VARIABLE_REASON.format("ZigZag"),
     "FocusedSeq": (
         "a PrefixedArray or FocusedSeq must be a named member of a Struct, and its parts other than"
         " the value must have a fixed size and use no fields, except for the count of an array:"
