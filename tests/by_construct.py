@@ -36,9 +36,10 @@ def _with_part(node: tree.Node) -> tree.Node:
 
 @functools.cache
 def by_construct(sensor: Sensor) -> Sensor:
-    """Return a sensor with frames that construct parses; frames with a wire form stay as they are.
+    """Return a sensor with frames that construct parses.
 
-    Points are then computed by the plain evaluation, without plans.
+    Frames with a wire form are not changed. Points are then computed by the reference evaluator,
+    without plans.
     """
     frames = {name: construct_frame(frame) for name, frame in sensor.frames.items()}
     return dataclasses.replace(sensor, frames=frames)

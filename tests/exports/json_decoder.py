@@ -32,7 +32,7 @@ OPERATIONS = {
 
 
 class Decoder:
-    """One frame: its bytes, how far they are read, and the values so far by path."""
+    """Decodes one frame; it has the bytes, the current offset, and values by path."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at, self.known = data, 0, {}

@@ -30,15 +30,16 @@ TOLD = 1.0
 
 @dataclass
 class Job:
-    """What was done for a target.
+    """The inputs that were read for a target, and their results.
 
     Attributes:
-        target, folder: it, and where its corpus, findings and report are.
-        seed: of everything that is drawn.
-        inputs: how many were read.
-        lines: how many of the code were seen, among the traced inputs.
-        seconds: how long it took.
-        findings: one for each place.
+        target: the target.
+        folder: the folder of its corpus, findings and report.
+        seed: the seed of all random choices.
+        inputs: the number of inputs that were read.
+        lines: the number of lines of code that traced inputs reached.
+        seconds: the duration.
+        findings: one finding for each line of code that raised, by this line.
     """
 
     target: Target

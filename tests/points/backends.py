@@ -14,7 +14,7 @@ NO_NUMBA = "the fused back end needs Numba: pip install 'lidarspec[jit]'"
 COMPILED = pytest.mark.skipif(find_spec("numba") is None, reason=NO_NUMBA)
 KERNELS = pytest.param("jit", marks=[COMPILED, pytest.mark.slow])
 
-#: plans and kernels, which are compared with the plain evaluation.
+#: plans and kernels, which are compared with the reference evaluator.
 BACKENDS = pytest.mark.parametrize("backend", ["numpy", KERNELS])
-#: those, and the plain evaluation itself.
+#: those, and the reference evaluator itself.
 EVERY_BACKEND = pytest.mark.parametrize("backend", ["construct", "numpy", KERNELS])

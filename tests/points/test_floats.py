@@ -1,6 +1,6 @@
 """Tests of coordinates and floating-point fields with any value.
 
-Plans and kernels give the results of the plain evaluation.
+Plans and kernels give the results of the reference evaluator.
 """
 
 from __future__ import annotations

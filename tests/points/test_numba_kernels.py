@@ -1,4 +1,4 @@
-"""Tests that the fused back end gives the points of the plain evaluation.
+"""Tests that the fused back end gives the points of the reference evaluator.
 
 Masks are equal, coordinates within six units in the last place.
 """

@@ -1,4 +1,4 @@
-"""Tests that the plan gives the points of the plain evaluation.
+"""Tests that the plan gives the points of the reference evaluator.
 
 Masks are equal, coordinates within four units in the last place.
 """
@@ -79,7 +79,7 @@ def test_every_installed_sensor_has_a_plan(module: str) -> None:
 
 
 def assert_sensors_have_a_plan(sensors: list[Sensor]) -> None:
-    """Fail unless each sensor has a plan, with the points of the plain evaluation."""
+    """Fail unless each sensor has a plan, with the points of the reference evaluator."""
     for installed in sensors:
         packets = packets_of(installed, 5)
         if packets.points().valid.any():  # headers of random counts may leave none
@@ -88,7 +88,10 @@ def assert_sensors_have_a_plan(sensors: list[Sensor]) -> None:
 
 
 def assert_planned_points_are_the_plain_ones(packets: Packets) -> None:
-    """Fail unless plan and plain evaluation agree on points, counts and values carried over."""
+    """Fail unless the plan and the reference evaluator agree.
+
+    Points, counts, and the values that are carried over to the next packets are compared.
+    """
     if len(packets):
         assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
         one, other = (
@@ -180,7 +183,7 @@ def test_a_zero_or_negative_factor_gives_no_points() -> None:
     ],
 )
 def test_arrays_with_equal_layouts_are_distinguished(text: str) -> None:
-    """Blocks of elements had the offset of any field of this form, and ran past the frame."""
+    """Once, one of two arrays was read at the offset of the other, beyond the frame."""
     struct = make_struct(text)
     frames = [sensor(struct).example("data", seed=seed) for seed in range(5)]
     assert clouds_agree(struct, frames, backends=("numpy",)) or "z" in text
@@ -228,9 +231,7 @@ def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:
 
 @BACKENDS
 def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str) -> None:
-    """Tables are kept for a points function, and one of these sensors measures in other units than
-    the first.
-    """
+    """Lookup tables are cached by `points` function; these sensors have other units."""
     for unit in (0.001, 0.002):
         sample = Struct("distance" / Scaled(Int16ul, unit, "m"), "quality" / Int8ul)
         made = sound.sensor(sound.frame(sound.make_frame(samples=Array(this.count, sample))))

@@ -23,8 +23,13 @@ Expression = Callable[[Fields], Any]
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
-    """What the functions for one sensor are made of: values of a packet or block, those of each
-    point, and points in a row.
+    """The values from which `points` functions for one sensor are drawn.
+
+    Attributes:
+        sensor_id: the id of the sensor.
+        low: values with one entry per packet or block.
+        full: values with one entry per point.
+        row: the number of points in the innermost array.
     """
 
     sensor_id: str
@@ -71,7 +76,7 @@ class Maker:
         )
 
     def term(self) -> Expression:
-        """One part of an angle in degrees."""
+        """Return a term of an angle in degrees."""
         low, full = self._source.choice(self._parts.low), self._source.choice(self._parts.full)
         row, number = self._row(), self._source.uniform(-400, 400)
         kinds: list[Expression] = [
@@ -93,7 +98,7 @@ class Maker:
         return self._source.choice(kinds)
 
     def angle(self) -> Expression:
-        """A sum of terms, in radians."""
+        """Return a sum of terms, in radians."""
         terms, outer = (
             [self.term() for _ in range(self._source.randint(1, 4))],
             self._source.randrange(4),
@@ -135,7 +140,7 @@ class Maker:
 
 
 def packets_of(name: str, seed: int, backend: str) -> Packets:
-    """Packets as simulated and at random, of a sensor whose `points` function is drawn."""
+    """Return simulated and random packets, with a drawn `points` function."""
     parts, source = PARTS[name], random.Random(seed)
     known = lidarspec.sensor(parts.sensor_id)
     sensor = dataclasses.replace(known, points=Maker(parts, seed).points())
