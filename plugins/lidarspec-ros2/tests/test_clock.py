@@ -20,10 +20,11 @@ from lidarspec_ros2.clock import MessageStamps
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 
 SECOND = 1_000_000_000
-LATE_ONLY = [name for name in JITTERS if "±" not in name]
+#: all but the widest jitter, with which stamps are not within a millisecond.
+SMALL_JITTERS = [name for name in JITTERS if name != "uniform, 0 to 10 ms"]
 
 
-@pytest.mark.parametrize("jitter", LATE_ONLY)
+@pytest.mark.parametrize("jitter", SMALL_JITTERS)
 @pytest.mark.parametrize(
     ("drift_ppm", "step"),
     [(50, 1.5), (-50, -1.5), (50, 3600), (-1000, -3600), (10_000, 0.02), (-10_000, 0.2)],
@@ -44,7 +45,7 @@ def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(
         assert run.clock.drift_ppm == pytest.approx(drift_ppm, abs=100)
 
 
-@pytest.mark.parametrize("jitter", LATE_ONLY)
+@pytest.mark.parametrize("jitter", SMALL_JITTERS)
 def test_packets_improve_stamps_over_scans(jitter: str) -> None:
     alone, with_packets = (simulate_stamps(1, jitter, each=each) for each in (1, 40))
     errors = [np.abs(run.errors[run.is_settled]).mean() for run in (alone, with_packets)]
@@ -152,7 +153,7 @@ def test_stamps_continue_after_a_pause(pause: int) -> None:
 
 @given(
     st.booleans(),
-    st.sampled_from(LATE_ONLY),
+    st.sampled_from(SMALL_JITTERS),
     st.integers(0, 2**32),
     st.floats(-200, 200),
     st.floats(0.05, 100),
