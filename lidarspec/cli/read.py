@@ -305,7 +305,7 @@ class StatsPrinter:
         sys.stdout.flush()
 
     def summary(self, reading: MeterReading, clock: ClockReport) -> None:
-        """Print the values of the whole input."""
+        """Print the totals and the rates of the whole input."""
         if self.as_json:
             self._emit(
                 {

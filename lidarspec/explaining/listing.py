@@ -202,7 +202,7 @@ def list_differences(differences: list[FieldDifference], sizes: tuple[int, int])
     bits = sum(mask.bit_count() for difference in differences for mask in difference.masks)
     fields = len(differences)
     differing = (
-        f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
+        f"{length}; {bits} different bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)}"
     )
     yield (TextSpan(differing if fields else f"{length}; the frames are identical", "note"),)
 

@@ -194,9 +194,12 @@ class Framing:
 
 
 def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Return the offsets at which at most two constants match, ascending.
+    """Return the offsets at which the constants match, in ascending order.
 
     A constant beyond the end of the buffer counts as matching.
+
+    Args:
+        constants: one or two constants.
     """
     match: NDArray[np.bool_] | None = None
     for position, mask, value in constants:

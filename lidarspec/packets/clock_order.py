@@ -156,7 +156,9 @@ class ClockOrder:
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Append consecutive packets to the newest ones, and return their first index.
+        """Store consecutive packets as the newest packets.
+
+        Returns the index of the first of them in the packets received so far.
 
         Args:
             start: the row of the first packet.

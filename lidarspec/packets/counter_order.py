@@ -232,7 +232,7 @@ class CounterOrder:
         """Return the value after which the counter wraps: an int, or one per packet, (n,)."""
         last = self._rule.last
         if callable(last):
-            (values,) = header_function(last, batch.table.schema, _integers)(batch)
+            (values,) = header_function(last, batch.table.schema, _to_integers)(batch)
             if (values == values[0]).all():
                 return values.item(0)
             return values
@@ -454,7 +454,7 @@ def _is_consistent(ahead: int, by_clock: float) -> bool:
     return is_near and (ahead > 0) == (by_clock > 0.5)
 
 
-def _integers(values: Any, count: int) -> NDArray[np.int64]:
+def _to_integers(values: Any, count: int) -> NDArray[np.int64]:
     integers = np.asarray(values, np.float64).reshape(-1).astype(np.int64)
     if len(integers) == 1:
         return integers

@@ -485,8 +485,10 @@ class PointPlacement(Measurement):
         """Return the coordinates for several sets of field values.
 
         In the first set, all fields are 0. In each other set, one field has a probe value and all
-        others are 0. Each array has
-        the shape (3, n, ...). The table is restored afterwards.
+        others are 0. The values are written into `table`, which is restored at the end.
+
+        Returns:
+            The x, y and z of the points for each set, (3, n, ...).
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:

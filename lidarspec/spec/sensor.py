@@ -347,8 +347,8 @@ def _check_reported(sensor: SensorDescription, name: str) -> None:
         if opening in sensor.commands
     ):
         raise SpecError(
-            "only the data link may have the port `reported`, and a command in `on_open`, sent"
-            " over another link, must provide the port",
+            "only the data link may have port=`reported`. A command in `on_open` that is sent over"
+            " another link must then provide the port by its reply",
             path=f"links.{name}",
             sensor=sensor.id,
         )

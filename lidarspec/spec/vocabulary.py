@@ -301,13 +301,13 @@ def take(table: Array, index: Array) -> Array:
     """Return the entries of a table at `index`; nan if an index is out of range.
 
     Args:
-        table: (m,), a number for each index; or (m, k), a row for each index. A row has a number
-            for each of the k elements of the next inner array.
+        table: (m,), a number for each index; or (m, k), a row for each index. A row has k numbers,
+            one for each element of the innermost array.
         index: the indices.
 
     Returns:
-        float64, the shape of `index`. For a table of rows, the next inner axis has the length k:
-        the result for an index of shape (n, 16, 1) has the shape (n, 16, k).
+        float64, the shape of `index`. For a table of rows, the last axis of `index` has the length
+        1, and that of the result the length k: an index (n, 16, 1) gives a result (n, 16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
@@ -354,8 +354,8 @@ def _refuse_whole_turns(turn: Array, full: float) -> None:
             f" from its start by a multiple of a revolution ({full:g})"
         )
         raise SpecError(
-            f"{reason}; full= must be one revolution in the unit of the angles; for the index of"
-            " a sample use steps(count)",
+            f"{reason}. Pass one revolution in the unit of the angles as full=; use steps(count)"
+            " for the indices of the samples in a packet",
             rule="LS215",
         )
 

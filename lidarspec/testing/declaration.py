@@ -560,8 +560,8 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
             others = ", ".join(info.path for info in own if info is not None)
             yield (
                 "LS218",
-                f"the intensity of points is calculated from {others}, and no column uses this"
-                " field",
+                f"this field looks like an intensity, but no column of points uses it; the column"
+                f" intensity is calculated from {others}",
                 f"{name}.{path}",
             )
             return

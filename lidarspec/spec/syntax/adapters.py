@@ -199,7 +199,8 @@ def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
 def number_adapter(con: Construct) -> tree.Adapter:
     """Return the functions that decode and encode a number of variable size.
 
-    A number that construct encodes in other bytes, or that needs more than 64 bits, is invalid.
+    A number is invalid if it needs more than 64 bits, or if construct encodes it to bytes that
+    differ from the decoded bytes.
     """
     limits = np.iinfo(np.int64)
 

@@ -378,7 +378,7 @@ class RawPart(Construct):  # type: ignore[misc]
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, dict) or not {"value", "data"} & obj.keys():
-            raise MismatchError(path, 0, "a mapping with its value", repr(obj), "value")
+            raise MismatchError(path, 0, "a mapping with the key 'value'", repr(obj), "value")
         start = stream.tell()
         value = obj.get("value")
         if "value" in obj:

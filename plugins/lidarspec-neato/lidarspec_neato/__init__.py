@@ -151,7 +151,14 @@ XV11_DIRECTIONS = {"neato-xv11": 1, "xiaomi-lds01rr": 1, "xiaomi-lds02rr": -1}
 
 
 def describe_differences(own: str) -> dict[str, str]:
-    """Return how models with the packets of an XV-11 differ from one of them, by id."""
+    """Return how each other model with packets of an XV-11 differs from this one.
+
+    Args:
+        own: the id of this model.
+
+    Returns:
+        A text for each other model, by its id.
+    """
     texts = {}
     for other, direction in XV11_DIRECTIONS.items():
         if other == own:

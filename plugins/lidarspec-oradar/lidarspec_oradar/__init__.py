@@ -120,7 +120,7 @@ def sweep(i: int) -> dict[str, float]:
     }
 
 
-IDENTICAL = "the frames are identical, but its commands begin with 54"
+IDENTICAL = "it sends the same frames as an MS200, but its commands begin with 0x54"
 MS200 = Sensor(
     "oradar-ms200",
     vendor="ORADAR",
