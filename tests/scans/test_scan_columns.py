@@ -283,9 +283,9 @@ def test_an_invalid_number_of_sectors_is_refused(number: Any) -> None:
 def test_scans_with_gaps_are_incomplete_or_not_whole(
     backend: str,
 ) -> None:
+    frames = simulate(ls.sensor("cspc-m1c1-mini"), 1500)
     judged = reader(ls.sensor("cspc-m1c1-mini"), backend)
     sensor = judged.sensor
-    frames = simulate(sensor, 1500)
     noise = random.Random(5)
 
     def scans_with(share: float, pieces: int) -> list[Scan]:
