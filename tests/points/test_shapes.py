@@ -86,7 +86,9 @@ def test_a_spread_that_folds_everything_onto_one_value_says_so() -> None:
         points=lambda f: replace(shape.points(f), time=spread(0, f.count - 1, f.count, full=1.0)),
     )
     packets = folded.decode(b"".join(shape.example("data", seed=seed) for seed in range(3)))
-    with pytest.raises(PluginError, match=r"multiple of a revolution \(1\); full=.*steps\(count\)"):
+    with pytest.raises(
+        PluginError, match=r"multiple of a revolution \(1\)\. Pass .*steps\(count\)"
+    ):
         packets.points()
 
 
