@@ -330,10 +330,11 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
 def test_lost_halves_of_dual_returns_are_a_figure(browser: Any, tmp_path: Path) -> None:
     sensor = ls.sensor("robosense-m1")
     packet = sensor.parse(sensor.example("data"))
-    numbers = [number for number in range(1, 1261) if number % 100]  # 12 second halves are lost
+    numbers = [number for number in range(1, 1261) if number % 100]
     path = tmp_path / "dual.hex"
     frames = [
-        # five seconds, so that the page gets figures while the file is played
+        # The file lasts five seconds, so that the page gets figures while it is played. Its packets
+        # are far apart, so most of the halves count as lost.
         sensor.build(
             "data",
             packet,

@@ -179,7 +179,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
         )
     if own.number and other.number:
         return "info.model"
-    return "the packets are identical; the label names the model; the baud rate may differ"
+    return "the packets are identical, but the label and possibly the baud rate differ"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
