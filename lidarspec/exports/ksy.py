@@ -386,6 +386,8 @@ def _find_terminator(path: str, ending: tree.Ending) -> int:
     Raises:
         ExportError: if the end is not a single byte after the content.
     """
+    if ending.is_content:
+        raise ExportError(f"{path}: the export to Kaitai has no numbers of variable size")
     if len(ending.terminator) != 1:
         raise ExportError(f"{path}: Kaitai supports only one byte as the terminator of bytes")
     return ending.terminator[0]

@@ -199,7 +199,9 @@ def _bytes_type(info: FieldInfo) -> str:
         return "bytes"
     if info.adapter.form.startswith("text"):
         return "str"
-    return {"i": "int", "f": "float", "u": "bytes"}.get(info.adapter.dtype.kind, "Any")
+    if info.adapter.dtype.name == "uint8":
+        return "bytes"
+    return {"i": "int", "u": "int", "f": "float"}.get(info.adapter.dtype.kind, "Any")
 
 
 def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:

@@ -144,7 +144,8 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
         )
     if isinstance(declared.kind, Choice):
         low, high = slot.info.limits
-        if slot.info.scaled or not low <= declared.kind.low <= declared.kind.high <= high:
+        is_integer = slot.info.kind == "int" and not slot.info.scaled
+        if not is_integer or not low <= declared.kind.low <= declared.kind.high <= high:
             raise SpecError(
                 f"Choice cannot set {declared.path!r}: it requires an integer without a scale, that"
                 " holds each of its numbers",

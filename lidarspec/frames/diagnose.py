@@ -21,6 +21,7 @@ from lidarspec.frames.layout_tree import (
     UnknownPartError,
     UnknownSelectorError,
 )
+from lidarspec.frames.measured_size import TextSize
 from lidarspec.frames.wire_fields import ExaminedFrame, WireField
 from lidarspec.spec.tree import format_hex, format_values
 
@@ -259,6 +260,11 @@ def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault
     if part is not None and part.failure is not None:
         return _find_end_fault(part, cut_off)
     failure = examined.failure
+    if isinstance(failure, UnknownSelectorError) and isinstance(failure.leaf, TextSize):
+        end = examined.start + len(examined.data)
+        path = failure.leaf.info.path.removesuffix(".size")
+        path = f"{examined.prefix}.{path}".strip(".")
+        return Fault(CUT_OFF, path, end, None, end, end, is_bounded=examined.is_bounded)
     if failure is None or isinstance(failure, UnknownSelectorError):
         return _describe_shortage(examined, cut_off)
     if isinstance(failure, TooLongError | UnknownPartError):

@@ -129,24 +129,27 @@ class _Encoder:
         return row.tobytes()
 
     def _measure_texts(self) -> None:
-        """Find the sizes of the given texts that a mark ends.
+        """Find the sizes of the texts that a mark ends.
 
         Raises:
-            UsageError: if a text contains its own mark.
+            UsageError: for a value that is not a text, or that contains its own mark.
         """
         for path, ending in self._schema.endings.items():
             info = self._schema.fields[path]
+            shown = self._make_shown_path(path)
             value = get_member(self._given, path, None)
-            if value is not None and info.adapter is not None:
-                shown = self._make_shown_path(path)
+            if value is None:
+                value = self._find_implied(info)
+            if value is None:
+                continue  # the header decides whether the frame has the text
+            if info.adapter is not None:
                 value = self._encode_adapted(info.adapter, shown, value, 0)
             if not isinstance(value, bytes | bytearray | memoryview):
-                continue  # the header decides whether the frame has the text
+                raise self._make_value_error(shown, "bytes", value)
             data = bytes(value)
             if ending.find(data + ending.terminator) != len(data):
-                raise self._make_value_error(
-                    self._make_shown_path(path), f"bytes without {ending.mark.hex(' ')}", value
-                )
+                expected = f"bytes without {ending.mark.hex(' ')}"
+                raise self._make_value_error(shown, expected, value)
             self._totals[ending.size.path] = len(data)
 
     def _layout(self) -> Layout:
@@ -362,7 +365,9 @@ class _Encoder:
         try:
             return adapter.encode(value, size)
         except Exception as error:  # the author's function may raise anything
-            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            # The first line of an error of construct is the path.
+            last_line = str(error).rpartition("\n")[2]
+            reason = f"{type(error).__name__}: {last_line}"
             raise UsageError(
                 f"{self._place}: {shown}: {value!r:.60} cannot be encoded: {reason}"
             ) from None
@@ -460,11 +465,14 @@ class _Encoder:
     def _make_missing_field_error(self, path: str) -> UsageError:
         """Return the error for a missing field that the layout depends on."""
         for axis, counting in self._schema.counting_fields.items():
+            if counting != path:
+                continue
             array = get_member(self._given, axis, None)
-            if array is not None and counting == path:
-                return self._make_value_error(
-                    self._make_shown_path(axis), "a list of its elements", array
-                )
+            if array is None:
+                return self._make_missing_error(axis)
+            return self._make_value_error(
+                self._make_shown_path(axis), "a list of its elements", array
+            )
         return self._make_missing_error(path)
 
     def _make_missing_error(self, path: str) -> MissingField:

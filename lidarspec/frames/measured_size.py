@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, view_span
 from lidarspec.spec import tree
+from lidarspec.spec.wire_forms import find_next_offsets
 
 Offsets = NDArray[np.intp]
 
@@ -25,10 +26,9 @@ CUT_OFF = 1
 #: The status of a frame if the content has an invalid length.
 LENGTH = 2
 
-#: The number of bytes of each frame that are searched in the first step, in units of the size of
-#: the mark. Most texts are shorter. Each further step searches `WINDOW_GROWTH` times as many bytes.
+#: The number of bytes that are searched in each frame by itself, in units of the size of the mark.
+#: Most texts are shorter.
 FIRST_WINDOW_MARKS = 32
-WINDOW_GROWTH = 8
 #: The maximum number of bytes that are searched in one step, of all frames together.
 MAX_WINDOW_BYTES = 1 << 16
 
@@ -105,7 +105,7 @@ class TextSize(MeasuredSize):
         return there, values[there]
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        if len(frame) < max(self.start, 1):
+        if len(frame) < self.start:
             return None
         size = self.ending.find(bytes(frame[self.start : self.limit]))
         if size >= 0:
@@ -123,7 +123,7 @@ class TextSize(MeasuredSize):
         step = len(self.ending.mark)
         if not step:
             return np.asarray(np.maximum(ends - starts, -1), np.int64)
-        most = MAX_WINDOW_BYTES // (step * FIRST_WINDOW_MARKS)
+        most = max(MAX_WINDOW_BYTES // (step * FIRST_WINDOW_MARKS), 1)
         blocks = [slice(first, first + most) for first in range(0, len(starts), most)]
         found = [self._find_few(buffer, starts[block], ends[block]) for block in blocks]
         return np.concatenate([np.empty(0, np.int64), *found])
@@ -131,26 +131,45 @@ class TextSize(MeasuredSize):
     def _find_few(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the same as `_find` for a few frames, searched in steps of growing size."""
+        """Return the result of `_find` for a few frames.
+
+        Most texts end within the first window of each frame. For all other frames, the bytes that
+        they share are searched once.
+        """
         step = len(self.ending.mark)
+        reach = np.arange(FIRST_WINDOW_MARKS * step)
+        offsets = starts[:, None] + reach
+        units = buffer[np.minimum(offsets, len(buffer) - 1)].reshape(len(starts), -1, step)
+        last = offsets.reshape(units.shape)[:, :, -1]
+        is_mark = self._match(units) & (last < ends[:, None])
+        has_mark = is_mark.any(axis=1)
+        content = is_mark.argmax(axis=1) + self.ending.is_content
+        sizes = np.where(has_mark, step * content, -1)
+        open_ended = np.flatnonzero(~has_mark & (starts + len(reach) + step <= ends))
+        for phase in np.unique(starts[open_ended] % step).tolist():
+            own = open_ended[starts[open_ended] % step == phase]
+            sizes[own] = self._find_shared(buffer, starts[own], ends[own])
+        return sizes
+
+    def _find_shared(
+        self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
+    ) -> NDArray[np.int64]:
+        """Return the result of `_find` for frames whose texts have the same marks.
+
+        Their starts differ by multiples of the size of the mark.
+        """
+        step = len(self.ending.mark)
+        begin = int(starts.min())
+        count = (int(ends.max()) - begin) // step
+        units = buffer[begin : begin + count * step].reshape(count, step)
+        marks = begin + step * np.flatnonzero(self._match(units))
+        found = find_next_offsets(marks, starts, len(buffer))
+        sizes = found - starts + step * self.ending.is_content
+        return np.where(found + step <= ends, sizes, -1)
+
+    def _match(self, units: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Return whether units of the size of the mark, (..., size), are the mark, (...)."""
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)
-        sizes = np.full(len(starts), -1, np.int64)
-        active = np.flatnonzero(starts + step <= ends)
-        position = 0
-        marks = FIRST_WINDOW_MARKS
-        while len(active):
-            reach = np.arange(marks * step)
-            offsets = (starts[active] + position)[:, None] + reach
-            units = buffer[np.minimum(offsets, len(buffer) - 1)].reshape(-1, marks, step)
-            last = offsets.reshape(units.shape)[:, :, -1]
-            is_mark = ((units & mask) == mark).all(axis=2) & (last < ends[active][:, None])
-            has_mark = is_mark.any(axis=1)
-            content = is_mark.argmax(axis=1) + self.ending.is_content
-            sizes[active[has_mark]] = position + step * content[has_mark]
-            position += len(reach)
-            active = active[~has_mark]
-            active = active[starts[active] + position + step <= ends[active]]
-            most = MAX_WINDOW_BYTES // (step * max(len(active), 1))
-            marks = max(min(marks * WINDOW_GROWTH, most), FIRST_WINDOW_MARKS)
-        return sizes
+        matches: NDArray[np.bool_] = ((units & mask) == mark).all(axis=-1)
+        return matches

@@ -271,7 +271,7 @@ def _apply_adapter(info: FieldInfo) -> FieldInfo:
     dtype = info.adapter.dtype
     if info.adapter.decode_bytes is not None:
         return info
-    kinds = {"i": "int", "f": "float"}
+    kinds = {"i": "int", "u": "int", "f": "float"}
     axes = info.axes[:-1] if info.kind == "bytes" else info.axes
     return replace(
         info,

@@ -5,10 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from construct import CString, GreedyBytes, Int8ub, NullTerminated, PaddedString, Struct, VarInt
+from construct import (
+    Const,
+    CString,
+    Default,
+    GreedyBytes,
+    Int8ub,
+    NullTerminated,
+    PaddedString,
+    Struct,
+    VarInt,
+    ZigZag,
+)
 
 from lidarspec import UsageError, WireError
 from lidarspec.errors import MissingField
+from lidarspec.frames.measured_size import TextSize
 from lidarspec.spec import Sensor
 from tests.engine.against_construct import sensor
 from tests.engine.engines import is_compiled
@@ -25,7 +37,7 @@ def make_sensor(text: Any) -> Sensor:
 @pytest.mark.parametrize("term", [b"\0", b"\r\n"])
 @pytest.mark.parametrize("length", [0, 1, 31, 32, 33, 63, 64, 65, 287, 288, 289, 5000])
 def test_the_end_is_found_in_texts_of_any_length(term: bytes, length: int) -> None:
-    """The search advances in steps; these lengths end at the border of a step."""
+    """These lengths end at the border of the window that is searched in each frame."""
     ours = make_sensor(NullTerminated(GreedyBytes, term=term))
     lengths = [length - length % len(term), 0, 2]
     frames = [b"x" * length + term + b"\7" for length in lengths]
@@ -37,7 +49,7 @@ def test_the_end_is_found_in_texts_of_any_length(term: bytes, length: int) -> No
 
 def test_a_text_without_an_end_is_incomplete_or_too_long() -> None:
     ours = make_sensor(CString("ascii"))
-    with pytest.raises(WireError, match="cut off"):
+    with pytest.raises(WireError, match="text is cut off"):
         ours.parse(b"abc")
     stats = ours.decode([b"abc", b"x" * (LONGEST + 9)]).stats
     assert (stats.frames, stats.bad_length) == ({}, 2)
@@ -66,6 +78,61 @@ def test_values_that_cannot_be_built_are_refused() -> None:
         text.build("data", text="a\0b", after=1)
     with pytest.raises(MissingField, match="'text'"):
         text.build("data", after=1)
-    with pytest.raises(UsageError, match="more than 64 bits"):
-        number.build("data", text=1 << 64, after=1)
+    with pytest.raises(UsageError, match=r"expected bytes, got 'ab'"):
+        make_sensor(NullTerminated(GreedyBytes)).build("data", text="ab", after=1)
+    with pytest.raises(UsageError, match="5 cannot be encoded: StringError: string encoding"):
+        text.build("data", text=5, after=1)
+    for wrong in (-1, 1 << 64):
+        with pytest.raises(UsageError, match=f"{wrong} is outside 0 .. {2**64 - 1}"):
+            number.build("data", text=wrong, after=1)
     assert number.build("data", text=300, after=1) == b"\xac\2\1"
+
+
+@pytest.mark.parametrize(
+    ("number", "value"),
+    [
+        (VarInt, 2**63 - 1),
+        (VarInt, 2**63),
+        (VarInt, 2**64 - 1),
+        (ZigZag, 2**63 - 1),
+        (ZigZag, -(2**63)),
+    ],
+)
+def test_numbers_of_64_bits_are_exact(number: Any, value: int) -> None:
+    ours = make_sensor(number)
+    data = bytes(number.build(value)) + b"\1"
+    assert ours.build("data", text=value, after=1) == data
+    assert ours.parse(data).text == value
+    assert ours.decode([data]).table.raw("text").tolist() == [value]
+
+
+@pytest.mark.parametrize(
+    ("text", "built"),
+    [
+        (Default(CString("ascii"), "hi"), b"hi\0\1"),
+        (Default(VarInt, 300), b"\xac\2\1"),
+        (Default(NullTerminated(GreedyBytes), b"zz"), b"zz\0\1"),
+    ],
+)
+def test_a_missing_text_has_its_default(text: Any, built: bytes) -> None:
+    assert make_sensor(text).build("data", after=1) == built
+
+
+def test_noise_is_searched_a_few_times_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each byte could begin a frame with a text of 6000 bytes."""
+    ours = sensor(
+        Struct("mark" / Const(b"UU"), "text" / CString("ascii"), "after" / Int8ub),
+        max_length=LONGEST,
+    )
+    searched = 0
+    match = TextSize._match
+
+    def count_and_match(size: TextSize, units: Any) -> Any:
+        nonlocal searched
+        searched += units.size
+        return match(size, units)
+
+    monkeypatch.setattr(TextSize, "_match", count_and_match)
+    noise = b"U" * 200_000
+    assert ours.decoder(stream=True).feed(noise) == []
+    assert searched < 100 * len(noise)

@@ -201,12 +201,16 @@ def number_adapter(con: Construct) -> tree.Adapter:
 
     A number is invalid if it needs more than 64 bits, or if construct encodes it to bytes that
     differ from the decoded bytes.
+
+    Args:
+        con: construct's VarInt or ZigZag.
     """
-    limits = np.iinfo(np.int64)
+    dtype = np.dtype(np.uint64 if con is construct.VarInt else np.int64)
+    limits = np.iinfo(dtype)
 
     def check(value: int) -> int:
         if not limits.min <= value <= limits.max:
-            raise ValueError(f"{value} needs more than 64 bits")
+            raise ValueError(f"{value} is outside {limits.min} .. {limits.max}")
         return value
 
     def decode(data: bytes) -> int:
@@ -219,7 +223,7 @@ def number_adapter(con: Construct) -> tree.Adapter:
         return bytes(con.build(check(value)))
 
     form = f"{author_class(con)} in its shortest form"
-    return tree.Adapter(decode, encode, np.dtype(np.int64), is_partial=True, form=form)
+    return tree.Adapter(decode, encode, dtype, is_partial=True, form=form)
 
 
 def _find_stripped(con: Construct) -> Construct | None:
