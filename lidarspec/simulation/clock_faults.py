@@ -173,6 +173,10 @@ class ClockTimeline:
         """Whether the clock has no faults and has not jumped."""
         return not self.faults and not self.jump_ns
 
+    def delay_power_on(self, delay_ns: int) -> None:
+        """Move the power-on to a later time of the computer."""
+        self._power_on_ns += delay_ns
+
     def shift(self, readings: Times, times: Times, power_on_reading: int) -> Times:
         """Return the readings of the clock with the faults, (n,) ns, not wrapped.
 

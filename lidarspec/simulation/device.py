@@ -170,8 +170,12 @@ class ReplyMaker:
         requests = (self._find_request(item.frame, item.data, link) for item in decoder.feed(data))
         return [request for request in requests if request is not None]
 
-    def make_replies(self, request: ReceivedCommand) -> list[ReplyPart]:
-        """Return the parts of the reply to a command."""
+    def make_replies(self, request: ReceivedCommand, now: float) -> list[ReplyPart]:
+        """Return the parts of the reply to a command.
+
+        Args:
+            now: the time of the request, ns since power-on.
+        """
         declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
@@ -179,7 +183,7 @@ class ReplyMaker:
                 chosen = declared({**request.values, DATA_PORT: self.data_port})
             else:
                 chosen = declared
-        return [self._make_reply(answer, request) for answer in chosen]
+        return [self._make_reply(answer, request, now) for answer in chosen]
 
     def use_timeline(self, timeline: ClockTimeline) -> None:
         """Apply the faults of a clock to the periodic frames from now on."""
@@ -189,14 +193,14 @@ class ReplyMaker:
         """Return frame number `number` of a type that the sensor sends periodically."""
         return self._frames.make_frame(name, number)
 
-    def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
+    def _make_reply(self, answer: Answer, request: ReceivedCommand, now: float) -> ReplyPart:
         if isinstance(answer, bytes):
             return ReplyPart(data=answer)
         if isinstance(answer, int | float):
             return ReplyPart(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
         given = {**self._matching_values(name, request), **values}
-        return ReplyPart(name, self._frames.make(name, given))
+        return ReplyPart(name, self._frames.make(name, given, now))
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
         """Return a reply's fixed values, and the values that it repeats from its request.
@@ -307,7 +311,7 @@ class _PlannedData(NamedTuple):
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
         repetition: how many frames of a periodic type were sent before; the argument of its
-            `sweep`.
+            `sweep`. None for all other data, such as a reply.
     """
 
     at: float
@@ -315,7 +319,7 @@ class _PlannedData(NamedTuple):
     link: str
     frame: str
     data: bytes
-    repetition: int = 0
+    repetition: int | None = None
 
 
 class _FrameStream:
@@ -602,13 +606,10 @@ class SimulatedDevice:
     @property
     def replied_at(self) -> int | None:
         """The time of the last planned reply to a command; None if there is none."""
-        times = [due.at for due in self._plan if not self._is_periodic(due)]
+        times = [due.at for due in self._plan if due.repetition is None]
         if not times or math.isinf(self.rate):
             return None
         return self._powered + math.ceil(max(times) / self.rate)
-
-    def _is_periodic(self, due: _PlannedData) -> bool:
-        return due.frame in self._periodic_rates
 
     def _clock(self, now: int) -> float:
         """Return the time of the device, ns since power-on.
@@ -618,7 +619,10 @@ class SimulatedDevice:
         if math.isinf(self.rate):
             return self._time
         late = int((now - self._powered) - self._time / self.rate) - MAX_DELAY_NS
-        self._powered += max(late, 0)
+        if late > 0:
+            self._powered += late
+            self._timeline.delay_power_on(late)
+            self._replies.use_timeline(self._timeline)
         return (now - self._powered) * self.rate
 
     def _take_due(self, upto: float) -> list[tuple[str, str, bytes]]:
@@ -639,7 +643,7 @@ class SimulatedDevice:
 
     def _plan_next(self, due: _PlannedData) -> None:
         """Plan the next frame of a type that is sent periodically."""
-        if not self._is_periodic(due):
+        if due.repetition is None:
             return
         repetition = due.repetition + 1
         data = self._replies.make_periodic_frame(due.frame, repetition)
@@ -661,11 +665,11 @@ class SimulatedDevice:
         if command.starts or command.stops:
             self._stream = None
             self._plan = [
-                due for due in self._plan if self.sensor.has_points and self._is_periodic(due)
+                due for due in self._plan if self.sensor.has_points and due.repetition is not None
             ]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
-        for answer in self._replies.make_replies(request):
+        for answer in self._replies.make_replies(request, now):
             if answer.pause:
                 time_ns = self._plan_pause(time_ns, answer.pause, command.link)
             else:
@@ -704,7 +708,7 @@ class SimulatedDevice:
     def _begin_periodic(self, at: float) -> None:
         """Plan the first frame of each type without points that is sent periodically."""
         for name in self._periodic_rates:
-            self._plan_data(at, "data", name, self._replies.make_periodic_frame(name, 0))
+            self._plan_data(at, "data", name, self._replies.make_periodic_frame(name, 0), 0)
 
     def _plan_pause(self, at: float, seconds: float, link: str) -> float:
         """Plan the fillers that are sent during a pause, and return the end of the pause."""
@@ -734,7 +738,7 @@ class SimulatedDevice:
         return stream_simulation
 
     def _plan_data(
-        self, at: float, link: str, frame: str, data: bytes, repetition: int = 0
+        self, at: float, link: str, frame: str, data: bytes, repetition: int | None = None
     ) -> None:
         self._planned += 1
         planned = _PlannedData(at, self._planned, link, frame, data, repetition)

@@ -167,7 +167,10 @@ class FrameMaker:
         result = dict(values)
         for path, info in self._decoded.items():
             value = result.get(path)
-            if value is None or isinstance(value, bytes):
+            if value is None:
+                result.pop(path, None)
+                continue
+            if isinstance(value, bytes):
                 continue
             assert info.adapter is not None
             try:

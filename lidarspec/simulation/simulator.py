@@ -25,7 +25,6 @@ rate of the serial line.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import heapq
 import itertools
@@ -965,9 +964,16 @@ class FramesWithoutPoints:
             self._clocks[name] = FrameClock(self._sensor, name, self._fill(name, range(1), {}))
         return self._clocks[name]
 
-    def make(self, name: str, values: Mapping[str, Any]) -> bytes:
-        """Return a frame with these physical values."""
-        return self._get_maker(name).seal(self._fill(name, range(1), values))[0]
+    def make(self, name: str, values: Mapping[str, Any], now: float) -> bytes:
+        """Return a frame with these physical values.
+
+        Args:
+            now: the time of the frame, ns since power-on.
+        """
+        table = self._fill(name, range(1), values)
+        if not self._timeline.is_perfect and find_clock(self._sensor, name) is not None:
+            self.find_clock(name).apply(table, self._timeline, np.array([round(now)]))
+        return self._get_maker(name).seal(table)[0]
 
     def make_frame(self, name: str, number: int) -> bytes:
         """Return frame number `number` of a type.
@@ -1083,12 +1089,13 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
         return
     others = FramesWithoutPoints(sensor)
     periodic = find_periodic_rates(sensor)
-    if sensor.has_points:
-        frame_simulation(sensor, sensor.data_frame).clock.check(faults)
-    elif not any(others.find_clock(name).has_clock for name in periodic):
+    main = _find_main_clock(sensor, others)
+    if main is None:
         raise UsageError(
             f"{sensor.id} sends no frames with a clock, so the clock cannot have faults"
         )
+    if sensor.has_points:
+        main[1].check(faults)
     if not faults.unlocked:
         return
     status_frames = list(find_status_clocks(sensor))
@@ -1109,37 +1116,48 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
     others.find_clock(sent[0]).check_status()
 
 
+@functools.lru_cache(maxsize=64)
 def find_followed_scale(sensor: Sensor) -> str:
     """Return the time scale that the clock of a simulated sensor follows: "utc", "tai" or "gps".
 
     Returns "" if the simulated clock is not synchronized, or if no date can be written into it.
     """
     others = FramesWithoutPoints(sensor)
-    periodic = find_periodic_rates(sensor)
-    with contextlib.suppress(UsageError):
-        if sensor.has_points:
-            name = sensor.data_frame
-            own = frame_simulation(sensor, name).clock
-        else:
-            name = next((name for name in periodic if others.find_clock(name).has_clock), "")
-            if not name:
-                return ""
-            own = others.find_clock(name)
-        clock = find_clock(sensor, name)
-        if clock is None or not own.can_follow_dates:
+    try:
+        main = _find_main_clock(sensor, others)
+    except UsageError:  # the clock cannot be written
+        return ""
+    if main is None:
+        return ""
+    name, written = main
+    clock = find_clock(sensor, name)
+    if clock is None or not written.can_follow_dates:
+        return ""
+    if clock.status is None:
+        return _find_scale(clock.epoch)
+    status_frame = clock.status.frame or name
+    if status_frame != name:
+        if status_frame not in find_periodic_rates(sensor):
             return ""
-        if clock.status is None:
-            return _find_scale(clock.epoch)
-        frame = clock.status.frame or name
-        if frame == name:
-            state = own.read_state(clock.status)
-        elif frame in periodic:
-            state = others.find_clock(frame).read_state(clock.status)
-        else:
-            return ""
-        if state.locked is not False:
-            return _find_scale(clock.epoch_in(state))
-    return ""
+        written = others.find_clock(status_frame)
+    state = written.read_state(clock.status)
+    if state.locked is False:
+        return ""
+    return _find_scale(clock.epoch_in(state))
+
+
+def _find_main_clock(sensor: Sensor, others: FramesWithoutPoints) -> tuple[str, FrameClock] | None:
+    """Return the frame type with the sensor's clock, and this clock; None if it sends no clock.
+
+    Raises:
+        UsageError: if the clock of the data frame cannot be written.
+    """
+    if sensor.has_points:
+        return sensor.data_frame, frame_simulation(sensor, sensor.data_frame).clock
+    for name in find_periodic_rates(sensor):
+        if others.find_clock(name).has_clock:
+            return name, others.find_clock(name)
+    return None
 
 
 def _find_scale(epoch: str) -> str:

@@ -27,6 +27,7 @@ from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.simulation.clock_faults import ClockFaults, parse_clock_faults
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults
+from lidarspec.simulation.simulator import find_followed_scale
 from lidarspec.spec import (
     Clock,
     ClockState,
@@ -374,8 +375,9 @@ def test_a_clock_follows_the_computer(scale: str, ahead_s: int) -> None:
         (with_states({LOCKED: ClockState("not locked", False)}), None),
         (replace(SYNCED, clock=Clock("time", epoch="boot")), None),
         (replace(SYNCED, clock=Clock("time")), None),
+        (replace(SYNCED, clock=Clock("time", wraps_at=7.0, epoch="utc")), None),
     ],
-    ids=["declared", "locked", "not locked", "since power-up", "not declared"],
+    ids=["declared", "locked", "not locked", "since power-up", "not declared", "seven seconds"],
 )
 def test_only_a_synchronized_clock_shows_the_current_date(
     sensor: Sensor, ahead_s: int | None
@@ -391,6 +393,31 @@ def test_only_a_synchronized_clock_shows_the_current_date(
     device.start(SECOND)
     again = sensor.decode([data for _, data in device.outgoing(2 * SECOND)]).time_ns[0]
     assert again == declared
+
+
+def test_a_synchronized_clock_shows_the_current_date_after_a_stall() -> None:
+    device = SimulatedDevice(replace(SYNCED, clock=Clock("time", epoch="utc")))
+    device.utc_offset_ns = 1_785_283_200 * SECOND
+    device.start(0)
+    device.outgoing(SECOND)
+    device.outgoing(60 * SECOND)
+    frames = [data for _, data in device.outgoing(61 * SECOND)]
+    last = SYNCED.decode(frames).time_ns[-1]
+    assert last == pytest.approx((1_785_283_200 + 61) * SECOND, abs=SECOND // 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [
+        ("velodyne-vlp16", "utc"),  # the hour; the status is in frames without points
+        ("ublox-gnss", "utc"),  # no points
+        ("robosense-m2", "tai"),
+        ("robosense-helios32", ""),  # its clock is not locked
+        ("ldrobot-stl27l", ""),  # it counts from power-up
+    ],
+)
+def test_the_scale_that_a_simulated_clock_follows(name: str, scale: str) -> None:
+    assert find_followed_scale(ls.sensor(name)) == scale
 
 
 def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:

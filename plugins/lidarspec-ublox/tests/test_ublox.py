@@ -15,6 +15,7 @@ from lidarspec.errors import UsageError, WireError
 from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.utc_times import UtcTimes
+from lidarspec.simulation.device import SECOND, SimulatedDevice
 
 GNSS = ls.sensor("ublox-gnss")
 VECTORS = json.loads((Path(lidarspec_ublox.__file__).parent / "vectors.json").read_text())
@@ -136,3 +137,20 @@ def test_the_simulated_hour_moves_north_in_steps_of_the_clock() -> None:
     assert packets.stats.bytes_skipped == 0
     assert set(np.diff(packets.time_ns).tolist()) == {200_000_000}
     assert (np.diff(packets["latitude"]) > 0).all()
+
+
+def test_a_polled_time_is_that_of_the_periodic_messages() -> None:
+    device = SimulatedDevice(GNSS)
+    device.utc_offset_ns = 1_800_000_000 * SECOND
+    device.start(0)
+    stream = b""
+    for step in range(10):
+        if step == 7:
+            device.receive(GNSS.command("nav_timeutc"), step * SECOND // 2)
+        stream += b"".join(data for _, data in device.outgoing(step * SECOND // 2))
+    times = [
+        GNSS.decode(item.data, frame="nav_timeutc").time_ns.item() / SECOND - 1_800_000_000
+        for item in GNSS.split(stream)
+        if item.frame == "nav_timeutc"
+    ]
+    assert times == [0, 1, 2, 3, 3.5, 4]
