@@ -305,22 +305,30 @@ def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
         UsageError: if a required time is unknown, or if only some of the samples have a clock.
     """
     batches = _select_frames(device, device.sensor.imu_frames, selection, None)
-    clocks = dict[bool, str]()
+    frames_by_clock = dict[bool, str]()
     with contextlib.closing(batches):
         for selected in batches:
             for packets in selected.values():
-                has_clock = find_clock(packets.sensor, packets.frame) is not None
-                clocks.setdefault(has_clock, packets.frame)
-                if selection.time == "sensor" and len(clocks) > 1:
-                    raise suggest(
-                        UsageError(
-                            f"the IMU samples of {clocks[True]} have the sensor's time, those of"
-                            f" {clocks[False]} have none, so one file cannot contain both"
-                        ),
-                        "repeat with --time host",
-                    )
+                if selection.time == "sensor":
+                    _require_same_time(packets, frames_by_clock)
                 samples = read_imu(packets)
                 yield samples if device.mount is None else samples.turn(device.mount.rotation)
+
+
+def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> None:
+    """Raise UsageError if these packets have a clock and earlier packets have none, or vice versa.
+
+    Args:
+        frames_by_clock: the first frame type with and without a clock; updated by this function.
+    """
+    has_clock = find_clock(packets.sensor, packets.frame) is not None
+    frames_by_clock.setdefault(has_clock, packets.frame)
+    if len(frames_by_clock) > 1:
+        reason = (
+            f"the IMU samples of {frames_by_clock[True]} have the sensor's time, those of"
+            f" {frames_by_clock[False]} have none, so one file cannot contain both"
+        )
+        raise suggest(UsageError(reason), "repeat with --time host")
 
 
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
@@ -381,7 +389,7 @@ def _write_frames(
     if first is None:
         raise _no_data_error(device, target, " or ".join(frames))
     written = write_frames(target, itertools.chain([first], batches))
-    noun = "rows" if any("." in name for name in types) else "frames"
+    noun = "rows" if any("." in name for name in frames) else "frames"
     note(f"{target}: {written} {noun} from {sensor.id}; {device.stats}")
     return {noun: written}
 

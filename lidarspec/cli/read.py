@@ -207,7 +207,8 @@ def _iter_packets(
 
 
 def _to_scalar(value: Any) -> Any:
-    if np.ndim(value) or isinstance(value, str):
+    """Return a number as a float; arrays, texts and None, for a missing text, unchanged."""
+    if np.ndim(value) or value is None or isinstance(value, str):
         return value
     return float(value)
 
@@ -221,6 +222,8 @@ def _find_width(name: str) -> int:
 
 
 def _format_value(name: str, value: Any) -> str:
+    if value is None:
+        return "-"
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, int | np.bool_):

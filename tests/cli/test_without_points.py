@@ -168,7 +168,7 @@ def test_fields_become_parquet(recording: Path, tmp_path: Path) -> None:
 
 
 LOGGER = """
-from construct import Const, CString, Int8ub, PaddedString, Struct, VarInt
+from construct import Const, CString, If, Int8ub, PaddedString, Struct, VarInt, this
 from lidarspec.spec import Frame, Sensor, Serial, Simulation, hookimpl
 
 REPORT = Struct(
@@ -176,11 +176,14 @@ REPORT = Struct(
     "unit" / PaddedString(6, "ascii"),
     "note" / CString("ascii"),
     "number" / VarInt,
+    "alarms" / Int8ub,
+    "alarm" / If(this.alarms, CString("ascii")),
 )
 
 
 def sweep(i):
-    return {"unit": "A1", "note": "x" * (i % 5), "number": 100 * i}
+    report = {"unit": "A1", "note": "x" * (i % 5), "number": 100 * i}
+    return report | {"alarms": int(i == 2), "alarm": "hot" if i == 2 else None}
 
 
 LOGGER = Sensor(
@@ -206,15 +209,18 @@ def test_texts_are_values_in_every_verb(tmp_path: Path) -> None:
     ran("sim", plugin, "--to", data, "-t", "0.25s")
     ran("convert", data, table, "-s", plugin, "-f", "report")
     assert table.read_text(encoding="utf-8").splitlines() == [
-        "time_ns,unit,note,number",
-        "0,A1,,0",
-        "0,A1,x,100",
-        "0,A1,xx,200",
+        "time_ns,unit,note,number,alarms,alarm",
+        "0,A1,,0,0,",
+        "0,A1,x,100,0,",
+        "0,A1,xx,200,1,hot",
     ]
     lines = ran("read", data, "-s", plugin, "-f", "report", "--json").stdout.splitlines()
     assert [json.loads(line)["note"] for line in lines] == ["", "x", "xx"]
-    assert " xx " in ran("read", data, "-s", plugin, "-f", "report").stdout.splitlines()[-1]
-    explained = ran("explain", data.read_bytes()[-14:].hex(), "-s", plugin).stdout
+    assert [json.loads(line)["alarm"] for line in lines] == [None, None, "hot"]
+    *_, second, third = ran("read", data, "-s", plugin, "-f", "report").stdout.splitlines()
+    assert second.split()[-1] == "-"
+    assert " xx " in third
+    explained = ran("explain", data.read_bytes()[-19:].hex(), "-s", plugin).stdout
     assert "note    'xx'" in explained
     assert "number  200" in explained
     assert "acme-logger: clean" in ran("check", plugin, "--max-examples", "5").stdout
