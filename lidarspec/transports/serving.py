@@ -12,7 +12,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
@@ -348,6 +348,30 @@ class Served(ClosingContext):
             elif time.monotonic() > limit:
                 raise SourceError(f"{self.path}: no program has opened the port")
         self._call_in_thread(lambda: None)
+
+    def wait_for_commands(self, names: Sequence[str], *, timeout: float = 10.0) -> None:
+        """Wait until the device has received exactly these commands, in this order.
+
+        A program may continue before the device has read its last command, so a test that compares
+        `device.commands_received` at once can fail at random.
+
+        Args:
+            names: the names of all commands since the port was opened.
+            timeout: maximum wait in seconds.
+
+        Raises:
+            AssertionError: if other commands were received.
+        """
+        limit = time.monotonic() + timeout
+        while self.device.commands_received != list(names):
+            if time.monotonic() > limit:
+                expected = ", ".join(names) or "no command"
+                received = ", ".join(self.device.commands_received) or "no command"
+                raise AssertionError(
+                    f"the simulated {self.device.sensor.id} received {received}; "
+                    f"expected {expected} within {timeout:g} s"
+                )
+            time.sleep(_MIN_PAUSE_S)
 
     def stop_sending(self) -> None:
         """Stop sending. Bytes that were already sent can still be read."""

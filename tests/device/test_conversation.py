@@ -107,7 +107,7 @@ def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]
             "code": 2,
         }
         assert device.send("hello").values.head.number == 9
-        assert port.device.commands_received == ["call", "send_to", "hello"]
+        port.wait_for_commands(["call", "send_to", "hello"])
         assert device.latest(TIMEOUT_S).complete
 
 
@@ -360,7 +360,7 @@ def test_a_sensor_found_by_broadcast_gets_our_address() -> None:
     ):
         assert device.send("hello", timeout=TIMEOUT_S).confirmed
         assert device.send("call", name="anna").confirmed
-        assert port.device.commands_received == ["hello", "call"]
+        port.wait_for_commands(["hello", "call"])
 
 
 @pytest.mark.skipif(
@@ -432,7 +432,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         assert (reply.values.status, reply.values.body) == (200, body)
         assert device.send("set_mode", mode="fast").values.status == 200
         assert device.send("set_mode", mode="slow").values.status == 400
-        assert port.device.commands_received == ["status", "set_mode", "set_mode"]
+        port.wait_for_commands(["status", "set_mode", "set_mode"])
         asked = http.client.HTTPConnection(
             "127.0.0.1", port.outlet.controls["web"].port, timeout=TIMEOUT_S
         )

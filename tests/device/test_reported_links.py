@@ -73,13 +73,15 @@ def test_a_sensor_sends_to_the_address_in_a_request() -> None:
             assert (host, number > 1023) == ("127.0.0.1", True)
             assert device.send("set_rate", rate=7.5).values.body == b'{"error": "", "rate": 7.5}'
             assert device.send("set_name", name="anna").confirmed
-        assert port.device.commands_received == [
-            "request_handle",
-            "start",
-            "set_rate",
-            "set_name",
-            "stop",
-        ]
+        port.wait_for_commands(
+            [
+                "request_handle",
+                "start",
+                "set_rate",
+                "set_name",
+                "stop",
+            ]
+        )
 
 
 def test_data_comes_from_the_port_that_a_reply_reports() -> None:
@@ -198,7 +200,7 @@ def test_commands_over_the_data_link_go_to_the_sensor_before_it_sends() -> None:
         assert port.path.startswith(f"udp://127.0.0.1:{data}?src=127.0.0.1:")
         with ls.open(port.path, sensor) as device:
             assert device.latest(TIMEOUT_S).complete
-        assert port.device.commands_received == ["hello"]
+        port.wait_for_commands(["hello"])
         # The sensor sends to the port that its commands come from.
         elsewhere = port.path.replace(f":{data}?", f":{free_port()}?")
         with ls.open(elsewhere, sensor) as device:

@@ -17,7 +17,7 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Clock, Simulation
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports import serving
-from tests.lines import free_port, read_until
+from tests.lines import TIMEOUT_S, free_port, read_until
 from tests.shapes import SHAPES
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -179,3 +179,16 @@ def test_advance_needs_virtual_time_and_a_program(monkeypatch: pytest.MonkeyPatc
         pytest.raises(SourceError, match="no program has opened"),
     ):
         port.advance(1.0)
+
+
+@posix
+def test_a_test_waits_for_the_commands_of_a_program() -> None:
+    with virtual_port("cspc-m1c1-mini") as port:
+        port.wait_for_commands([], timeout=0)
+        with ls.open(port.path, "cspc-m1c1-mini") as device:
+            device.latest(timeout=TIMEOUT_S)
+        port.wait_for_commands(["start", "stop"])
+        with pytest.raises(
+            AssertionError, match=r"mini received start, stop; expected start within 0.01 s"
+        ):
+            port.wait_for_commands(["start"], timeout=0.01)

@@ -46,4 +46,4 @@ def test_the_simulated_sensor_sends_to_the_port_of_the_command() -> None:
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port:
         with ls.open(port.path, sensor) as device:
             assert len(device.latest(TIMEOUT_S).points) == 27 * 12 * 20
-        assert port.device.commands_received == ["start", "stop"]
+        port.wait_for_commands(["start", "stop"])

@@ -28,4 +28,4 @@ def test_the_simulated_sensor_is_started_and_stopped() -> None:
         with ls.open(port.path, MS200) as device:
             assert device.latest(TIMEOUT_S).complete
             device.send("set_speed", rate=7)
-        assert port.device.commands_received == ["start", "set_speed", "stop"]
+        port.wait_for_commands(["start", "set_speed", "stop"])

@@ -63,14 +63,16 @@ def test_the_simulated_scanner_sends_what_it_is_asked_for(
             assert len(scan.points) == 1440
             assert set(device.stats.frames) == {f"packet_{packet.lower()}"}
             device.send("set_scan_frequency", value=30)
-        assert port.device.commands_received == [
-            "request_handle",
-            "start",
-            "feed_watchdog",
-            "set_scan_frequency",
-            "stop",
-            "release_handle",
-        ]
+        port.wait_for_commands(
+            [
+                "request_handle",
+                "start",
+                "feed_watchdog",
+                "set_scan_frequency",
+                "stop",
+                "release_handle",
+            ]
+        )
 
 
 def test_a_gap_of_the_clock_is_a_loss() -> None:
