@@ -30,7 +30,7 @@ from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import Finding, list_unacknowledged
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.sensor_under_test import EXAMPLES, SensorUnderTest
-from lidarspec.testing.vectors import lacking
+from lidarspec.testing.vectors import describe_missing_vectors
 from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
@@ -62,7 +62,7 @@ class CheckTarget:
 
 
 def find_target(text: str | Path) -> CheckTarget:
-    """Return the sensors to check that a name refers to.
+    """Return the sensors to check for a name that the user typed.
 
     The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
     distribution, or the folder of a distribution.
@@ -294,10 +294,12 @@ def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
         text = error.reason
     else:
         text = f"{type(cause).__name__}: {cause}"
-    return Finding(_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line)
+    return Finding(
+        _find_loading_rule(error, cause), " ".join(text.split()), path, sensor, file, line
+    )
 
 
-def _loading_rule(error: BaseException, cause: BaseException) -> str:
+def _find_loading_rule(error: BaseException, cause: BaseException) -> str:
     """Return the code of the rule that is violated if loading raises this error."""
     functions = [location.name for location in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
@@ -384,7 +386,10 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Location | None:
-        """Return the location of the field with the longest path that `parts` ends with."""
+        """Return the location of a field of the source; None if there is no such field.
+
+        If the path `parts` ends with the paths of several fields, the longest path is selected.
+        """
         fitting = [
             (len(chain), location)
             for chain, location in self._iter_fields
@@ -474,7 +479,7 @@ def check_texts(trees: Mapping[str, ast.Module]) -> list[Finding]:
 def _iter_mistakes(
     tree: ast.Module,
 ) -> Iterator[tuple[str, str, ast.expr | ast.stmt | ast.ExceptHandler]]:
-    expressions = _names_of_this(tree)
+    expressions = _find_expression_names(tree)
     sockets = any(
         isinstance(node, ast.Import | ast.ImportFrom) and "socket" in ast.unparse(node)
         for node in ast.walk(tree)
@@ -505,8 +510,8 @@ def _iter_mistakes(
                 yield "LS804", f"Python tests whether `{ast.unparse(test)}` is true", test
 
 
-def _names_of_this(tree: ast.Module) -> set[str]:
-    """Return the names under which a module imports construct's `this` and `obj_`."""
+def _find_expression_names(tree: ast.Module) -> set[str]:
+    """Return the names under which a module imports construct's `this`, `obj_` and `len_`."""
     imported = [
         alias
         for node in ast.walk(tree)
@@ -653,14 +658,20 @@ def reports(
 
 
 def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -> None:
-    """Report the progress of one sensor of several."""
+    """Report the progress of one sensor as progress of the whole check.
+
+    Args:
+        before: number of properties of all sensors before this one.
+        total: number of properties of all sensors.
+        done: number of finished properties of this sensor.
+    """
     watch(text, before + done, total)
 
 
 def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
     """Yield (name, text) of declared facts to compare with the measured values."""
     sensor = subject.sensor
-    missing = lacking(subject)
+    missing = describe_missing_vectors(subject)
     if missing:
         yield (
             "vectors",

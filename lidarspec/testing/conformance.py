@@ -28,10 +28,10 @@ def assert_conformance(
     vectors: str | Path | None = None,
     tested: Sequence[Sensor] = (),
 ) -> list[Report]:
-    """Fail with every finding of `lidarspec check`; return the reports.
+    """Fail if `lidarspec check` has findings, with all of them; return the reports.
 
-    Findings of rule LS005 are not included. They report that another installed plugin uses the same
-    id, which is a fault of the environment, not of the sensor.
+    Findings of rule LS005 are ignored. They report that another installed plugin uses the same id,
+    which is a fault of the environment, not of the sensor.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.

@@ -20,7 +20,12 @@ from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
 from lidarspec.spec.tree import to_exact
 from lidarspec.testing.findings import require
-from lidarspec.testing.geometry import ANGLE_CHANGE_STEPS, MAX_BACK_STEP_RAD, make_sweep, read
+from lidarspec.testing.geometry import (
+    ANGLE_CHANGE_STEPS,
+    MAX_BACK_STEP_RAD,
+    decode_frames,
+    make_sweep,
+)
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Indices of the packets of the `sweep` for the check of the clock. The last ones are so large that
@@ -43,7 +48,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     try:
         maker = FrameMaker(subject.sensor, name)
         frames = maker.seal(maker.table([sweep(number) for number in FAR_PACKETS]))
-        packets = read(subject, name, frames, by_clock=False)
+        packets = decode_frames(subject, name, frames, by_clock=False)
         readings = clock_ns(subject.sensor, packets.batch())
     except LidarSpecError:  # another property reports the failure
         return
@@ -62,7 +67,7 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
         return
-    packets = read(subject, name, frames)
+    packets = decode_frames(subject, name, frames)
     if len(packets) < 3:
         return
     step = float(packets.time_ns[-1] - packets.time_ns[0]) / (len(packets) - 1) / 1e9
@@ -147,7 +152,9 @@ def _read_azimuths(
     """Return the azimuths of a packet with these values; None if it is invalid."""
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
-        packets = read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
+        packets = decode_frames(
+            subject, name, [frame] * max(2, subject.sensor.frames[name].confirm)
+        )
         if len(packets):
             return np.asarray(packets.points().azimuth, np.float64)
         return None

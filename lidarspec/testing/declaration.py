@@ -31,7 +31,7 @@ from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.timing import DAY_S
 from lidarspec.spec.tree import NAME_IS_COMPARED, Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
-from lidarspec.testing.geometry import field_of, find_fields, trace_points
+from lidarspec.testing.geometry import find_field_of_node, find_fields, trace_points
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Names of fields that hold a measured value.
@@ -368,7 +368,7 @@ def _find_range_fields(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields that `range` is calculated from, if one of them is in metres."""
     try:
         infos = [
-            field_of(subject, name, node)
+            find_field_of_node(subject, name, node)
             for node in find_fields(getattr(trace_points(subject, name), "range", None))
         ]
     except Exception:  # another check reports it
@@ -497,7 +497,7 @@ def _check_strength(
     ]
     constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
     weakest = min(map(sum, zip(checked, constant, strict=True)))
-    if weakest <= _find_strength_limit(subject.sensor, frame):
+    if weakest <= _find_max_weak_bits(subject.sensor, frame):
         yield (
             "LS206",
             (
@@ -508,8 +508,8 @@ def _check_strength(
         )
 
 
-def _find_strength_limit(sensor: Sensor, frame: Frame) -> int:
-    """Return the number of constant and checksum bits up to which a frame is weak."""
+def _find_max_weak_bits(sensor: Sensor, frame: Frame) -> int:
+    """Return the maximum number of constant and checksum bits of a weak frame."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:
@@ -538,7 +538,8 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
     This is the case if another field is named like an intensity and no column uses it.
     """
     own = [
-        field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))
+        find_field_of_node(subject, name, node)
+        for node in find_fields(getattr(result, "intensity", None))
     ]
     if not own or any(info is None or INTENSITY_NAMES.search(info.path) for info in own):
         return
@@ -547,12 +548,12 @@ def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findin
         info.path
         for value in columns
         for node in find_fields(value)
-        if (info := field_of(subject, name, node)) is not None
+        if (info := find_field_of_node(subject, name, node)) is not None
     }
     ranges = [
         info
         for node in find_fields(getattr(result, "range", None))
-        if (info := field_of(subject, name, node)) is not None
+        if (info := find_field_of_node(subject, name, node)) is not None
     ]
     axes = {info.axes for info in ranges if info.axes}
     for path, info in subject.fields(name).items():
@@ -580,7 +581,7 @@ def _check_range_limit(subject: SensorUnderTest) -> Findings:
             return
         value = getattr(result, "range", None)
         if isinstance(value, TracedColumn) and value.node.kind == "field":
-            info = field_of(subject, name, value.node)
+            info = find_field_of_node(subject, name, value.node)
         else:
             info = None
         if info is not None and info.kind == "int":
@@ -610,7 +611,9 @@ def _check_column(
     subject: SensorUnderTest, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
     """Yield a finding if no source field of a column has one of these units."""
-    infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]
+    infos = [
+        find_field_of_node(subject, name, node) for node in find_fields(value, looked_up=False)
+    ]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
     if column == "range" and measured and all(CODE_NAMES.fullmatch(info.name) for info in measured):
         yield (

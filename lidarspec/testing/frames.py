@@ -83,7 +83,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
         f"an example has {longest} bytes, but max_length is {frame.max_length}",
         name,
     )
-    fixed = material.seals(subject.sensor, name, examples[0])
+    fixed = material.find_checksum_paths(subject.sensor, name, examples[0])
     free = [
         info
         for info in get_codec(frame).schema.fields.values()
@@ -116,15 +116,15 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
 
 
 def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
-    """Check that an example with a changed byte is parsed and built without a change.
+    """Check that parsing and building keeps all values if a byte of an example is changed.
 
-    The bytes of checksums may differ. Only frames that are not compiled are tested, because they
+    Checksums may differ. Only frame types that are not compiled are tested, because their structs
     may contain functions of the author that lose values.
     """
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
         return
-    sealed = material.seals(subject.sensor, name, b"")
+    sealed = material.find_checksum_paths(subject.sensor, name, b"")
     follows = {
         info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held
     }
@@ -216,7 +216,7 @@ def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) ->
     """Check that building a frame from its physical values gives the original bytes."""
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
-        values = material.physical(subject.sensor, name, data)
+        values = material.parse_physical(subject.sensor, name, data)
         if values is None:
             built = data
         else:
@@ -226,7 +226,7 @@ def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) ->
 
 
 def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing without a type gives the values of a type that matches."""
+    """Check that `parse` without a frame type finds a type that matches the bytes."""
     data = subject.example(name, seed=1)
     fitting = [
         other for other in subject.sensor.frames if is_valid_frame(subject.sensor, data, other)
@@ -301,8 +301,8 @@ def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, parsed
 
 
-def acceptable(subject: SensorUnderTest, name: str, values: Any) -> bytes | None:
-    """Return the frame with these values; None if they contradict each other."""
+def build_if_valid(subject: SensorUnderTest, name: str, values: Any) -> bytes | None:
+    """Build a frame from its values; return None if the values are invalid together."""
     try:
         return subject.sensor.build(name, values)
     except UsageError:
@@ -323,7 +323,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
     if not any(
         has_free_values(fields.get(path))
         for base in bases
-        for _, _, path in material.integers(base)
+        for _, _, path in material.iter_integers(base)
     ):
         return
     values = {
@@ -344,7 +344,7 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
     @given(st.data())
     def check_edited(data: Any) -> None:
         parsed = copy.deepcopy(bases[data.draw(st.integers(0, len(bases) - 1))])
-        integers = list(material.integers(parsed))
+        integers = list(material.iter_integers(parsed))
         candidates = [index for index, (_, _, path) in enumerate(integers) if path in values]
         edits = []
         for _ in range(data.draw(st.integers(1, MAX_EDITS)) if candidates else 0):
@@ -365,14 +365,14 @@ def _check_edit(
     subject: SensorUnderTest, name: str, parsed: Any, integers: list[Any], edits: list[int]
 ) -> None:
     """Check that edited integers of a frame are the same after building and parsing."""
-    built = acceptable(subject, name, parsed)
+    built = build_if_valid(subject, name, parsed)
     if built is None:
         return
     again = subject.sensor.parse(built, frame=name)
-    read = list(material.integers(again))
+    read = list(material.iter_integers(again))
     if len(read) != len(integers):
         return
-    sealed = material.seals(subject.sensor, name, built)
+    sealed = material.find_checksum_paths(subject.sensor, name, built)
     for index in edits:
         (holder, key, path) = integers[index]
         (target, read_key, _) = read[index]

@@ -49,7 +49,7 @@ from lidarspec.spec.vocabulary import TableLookup
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.cloud_assertions import assert_well_formed
 from lidarspec.testing.findings import ViolationError, require
-from lidarspec.testing.frames import acceptable
+from lidarspec.testing.frames import build_if_valid
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Number of packets of the `sweep` for the check of directions.
@@ -120,7 +120,7 @@ def make_sweep(
     return made[:packets]
 
 
-def read(
+def decode_frames(
     subject: SensorUnderTest, name: str, frames: list[bytes], *, by_clock: bool = True
 ) -> Packets:
     """Decode frames of one data type, with or without the sensor's clock.
@@ -154,7 +154,7 @@ def _trace_points(subject: SensorUnderTest, name: str) -> Any:
         subject.example(name, seed=seed)
         for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))
     ]
-    packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
+    packets = decode_frames(subject, name, few * subject.sensor.frames[name].confirm).with_points
     if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
         return None
     return trace(
@@ -175,8 +175,11 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
     return [node for node in nodes if node.kind in ("field", "state")]
 
 
-def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
-    """Return the field of a node, which is a field of this frame type or of the state."""
+def find_field_of_node(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
+    """Return the field that a node of a traced expression reads; None if there is none.
+
+    A node reads a field of this frame type, or a field of another type from the state.
+    """
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
     if node.kind == "state":
@@ -188,13 +191,13 @@ def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | Non
     )
 
 
-def directions(
+def calculate_directions(
     subject: SensorUnderTest, name: str, packets: Packets
 ) -> list[NDArray[np.float64]] | None:
-    """Return the azimuths and elevations that `points` returns, without padding.
+    """Return the azimuths and elevations of packets as `points` calculates them.
 
-    The angles are not limited to a full circle. For Cartesian points, the directions that the
-    simulation declares are returned instead, or None if it declares none.
+    The angles are not reduced to one full circle. If `points` returns Cartesian coordinates, the
+    result has the directions that the simulation declares, or is None if it declares none.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -238,7 +241,7 @@ def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
     """
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
-        packets = read(subject, name, frames)
+        packets = decode_frames(subject, name, frames)
         cloud = packets.points()
     except SpecError as error:
         raise ViolationError(error.rule or "LS414", error.reason, f"{name}.points") from error
@@ -257,7 +260,7 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     if not along and any(info.kind == "float" for info in subject.fields(name).values()):
         return  # a float may have any value
     frames = along or [subject.example(name, seed=seed) for seed in range(16)]
-    angles = directions(subject, name, read(subject, name, frames))
+    angles = calculate_directions(subject, name, decode_frames(subject, name, frames))
     if angles is None:
         return
     azimuth, elevation = (float(np.nanmax(np.abs(part), initial=0)) for part in angles)
@@ -298,7 +301,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
         except SpecError:
             continue
         try:
-            cloud = read(
+            cloud = decode_frames(
                 subject, name, [single] * max(3, subject.sensor.frames[name].confirm)
             ).points()
         except SpecError as error:
@@ -307,7 +310,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
             ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
             continue
-        examples = read(
+        examples = decode_frames(
             subject, name, [subject.example(name, seed=seed) for seed in range(12)]
         ).points()
         require(
@@ -418,7 +421,7 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     )
     if not frames:
         return
-    evaluated = evaluate_plainly(read(subject, name, frames).with_points)
+    evaluated = evaluate_plainly(decode_frames(subject, name, frames).with_points)
     if evaluated.counts.ndim > 1:
         counts = evaluated.counts.reshape(len(evaluated.counts), -1).sum(axis=1)
     else:
@@ -466,9 +469,9 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that no packet of the sweep is counted as lost, late or duplicate.
+    """Check that counter and clock increase from packet to packet of the sweep.
 
-    The clock may not run backwards.
+    No packet may count as lost, late or duplicate.
     """
     if name != subject.sensor.data_frame:
         return
@@ -480,10 +483,10 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
     )
     if not frames:
         return
-    packets = read(subject, name, frames)
+    packets = decode_frames(subject, name, frames)
     if subject.sensor.sequence is not None:
         # The clock would compensate for the counter.
-        stats = read(subject, name, frames, by_clock=False).stats
+        stats = decode_frames(subject, name, frames, by_clock=False).stats
         message = (
             f"{stats.lost} packets of the sweep count as lost, {stats.late} as late, and"
             f" {stats.duplicates} as duplicates"
@@ -535,7 +538,9 @@ def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldIn
     if result is None:
         return angles
     nodes = find_fields(*vars(result).values())
-    sources = {info.path for info in (field_of(subject, name, node) for node in nodes) if info}
+    sources = {
+        info.path for info in (find_field_of_node(subject, name, node) for node in nodes) if info
+    }
     return {path: info for path, info in angles.items() if info.optional or path in sources}
 
 
@@ -572,7 +577,7 @@ def _decode_with_values(
     """
     for seed in range(1, 1 + subject.scale_rounds(TRIED_EXAMPLES, least=4)):
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
-        if all(own != path for _, _, own in material.integers(parsed)):
+        if all(own != path for _, _, own in material.iter_integers(parsed)):
             continue
         frames = list(
             itertools.takewhile(
@@ -582,7 +587,7 @@ def _decode_with_values(
         if len(frames) < len(values):
             continue
         packets = [
-            read(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
+            decode_frames(subject, name, [frame] * max(2, subject.sensor.frames[name].confirm))
             for frame in frames
         ]
         clouds = [each.points() for each in packets if len(each)]
@@ -615,10 +620,10 @@ def _set_value(subject: SensorUnderTest, name: str, path: str, value: int, parse
 
     Returns b"" if the frame is not valid with this value.
     """
-    for holder, key, own in list(material.integers(parsed)):
+    for holder, key, own in list(material.iter_integers(parsed)):
         if own == path:
             holder[key] = value
-    built = acceptable(subject, name, parsed) or b""
+    built = build_if_valid(subject, name, parsed) or b""
     with contextlib.suppress(LidarSpecError):
         subject.sensor.parse(built, frame=name)
         return built
@@ -645,9 +650,9 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half of the largest raw step of all fields in metres, in metres.
+    """Return half the resolution of the coarsest length field, in metres.
 
-    Returns `MIN_HALF_STEP_M` if no step is larger.
+    The result is `MIN_HALF_STEP_M` if the resolution is not larger than this value.
     """
     fields = subject.fields(name).values()
     metres = [
@@ -677,7 +682,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         return
     except LidarSpecError as error:
         raise ViolationError("LS508", str(error), f"{name}.sweep") from error
-    cloud = read(subject, name, block.frames).points()
+    cloud = decode_frames(subject, name, block.frames).points()
     seconds = float(block.times[-1]) / 1e9
     if seconds:
         rate = len(cloud) / seconds

@@ -87,13 +87,13 @@ class Property:
         return self.function.__name__
 
     def cases(self, subject: SensorUnderTest) -> Iterable[tuple[str, ...]]:
-        """Return the arguments of each call, apart from the subject."""
+        """Return the arguments of each call of `function`, without the first, `subject`."""
         if self._is_tested_elsewhere(subject):
             return []
         if self.each == "sensor":
             return [()]
         if self.each == "vector":
-            return [(key,) for key in vectors.places(subject)]
+            return [(key,) for key in vectors.list_keys(subject)]
         names = {
             "frame": subject.frames,
             "data": subject.sensor.data_frames,
@@ -178,19 +178,19 @@ PROPERTIES = (
     Property(frames.every_single_bit_error_is_seen, "frame", "LS310"),
     Property(vectors.every_checksum_is_checked, "frame", "LS212"),
     Property(vectors.the_status_is_proven, "sensor", "LS710"),
-    Property(vectors.vectors_hold, "vector", "LS706", lacks=vectors.lacking),
+    Property(vectors.vectors_hold, "vector", "LS706", lacks=vectors.describe_missing_vectors),
     Property(
         vectors.every_data_field_is_pinned_down,
         "data",
         "LS711",
-        lacks=vectors.lacking,
+        lacks=vectors.describe_missing_vectors,
         unless=("LS702", "LS703", "LS707"),
     ),
     Property(
         vectors.points_stand_in_two_quadrants,
         "data",
         "LS712",
-        lacks=vectors.lacking,
+        lacks=vectors.describe_missing_vectors,
         unless=("LS702", "LS703", "LS707"),
     ),
     Property(geometry.clouds_keep_the_conventions, "data", "LS501", depends_on=DECODING_ATTRIBUTES),

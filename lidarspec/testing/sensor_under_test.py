@@ -1,7 +1,7 @@
 """A sensor under test, and functions that make, edit and truncate its examples.
 
-A `SensorUnderTest` has the sensor, its examples (with values of the author's strategies, if there
-are any) and measured values. All random values are seeded, so that a failure can be repeated.
+A `SensorUnderTest` makes example frames of its sensor, and collects values that the properties
+measure. All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -80,13 +80,17 @@ def mutate(
     return bytes(mutated)
 
 
-def integers(
+def iter_integers(
     parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
 ) -> Iterator[tuple[Any, Any, str]]:
-    """Yield (container, key in it, field path) for each integer of a parsed frame.
+    """Yield (container, key, field path) for each integer of a parsed frame.
+
+    The integer is ``container[key]``.
 
     Args:
-        kinds: the types of the values.
+        parsed: a dict or list of the frame.
+        path: the path of `parsed` in the frame.
+        kinds: the Python types that count as integers.
     """
     entries: Iterable[tuple[Any, Any]] = (
         parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
@@ -99,19 +103,19 @@ def integers(
         else:
             below = key
         if isinstance(value, dict | list):
-            yield from integers(value, below, kinds)
+            yield from iter_integers(value, below, kinds)
         elif type(value) in kinds:
             yield parsed, key, below
 
 
-def physical(sensor: Sensor, name: str, data: bytes) -> Any:
+def parse_physical(sensor: Sensor, name: str, data: bytes) -> Any:
     """Parse a frame, with scaled numbers in their units.
 
     Returns None if a number is too large for an exact float.
     """
     fields = get_codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
-    for holder, key, path in list(integers(parsed, kinds=(int, float))):
+    for holder, key, path in list(iter_integers(parsed, kinds=(int, float))):
         info = fields.get(path)
         if info is not None and info.scaled:
             value = info.physical(holder[key])
@@ -127,7 +131,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
     return parsed
 
 
-def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
+def find_checksum_paths(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """Return the paths of all fields in a frame that store a checksum."""
     engine = get_codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
@@ -234,10 +238,13 @@ class SensorUnderTest:
         return random.Random(f"{self.sensor.id} {purpose}")
 
     def seeds(self, name: str, share: float = 1.0) -> range:
-        """Return the seeds of the examples of a frame type that a property uses.
+        """Return the seeds of the examples with which a property tests a frame type.
 
-        There are fewer seeds if the frame is long, because each field takes time, or if the sensor
-        has many frame types.
+        There are fewer seeds if the frame type is long, or if the sensor has many frame types.
+
+        Args:
+            name: the frame type.
+            share: the part of the usual number of examples that the property needs.
         """
         few = 8 if self.sensor.frames[name].max_length > MAX_SHORT_BYTES else 1
         few *= 2 if len(self.sensor.frames) > MANY_FRAME_TYPES else 1
@@ -260,7 +267,12 @@ class SensorUnderTest:
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
-        """Scale `rounds` from the default number of examples to `examples`."""
+        """Return a number of rounds that is proportional to `examples`.
+
+        Args:
+            rounds: the number of rounds for the default number of examples.
+            least: the minimum of the result.
+        """
         return max(rounds * self.examples // USUAL_EXAMPLES, least)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
@@ -296,10 +308,14 @@ class SensorUnderTest:
         return self._drawers[frame]
 
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
-        """Return frames of all incoming types in a possible order, as (type, bytes).
+        """Return frames as the sensor could send them: (type, bytes) of each frame.
 
-        If a frame type is only valid after another type (`after`), a frame of that type comes
-        first.
+        Each round contains all incoming types. If a type is only valid after another type
+        (`after`), a frame of that type precedes it.
+
+        Args:
+            seed: selects the content of the frames.
+            rounds: number of rounds; None to derive it from `examples`.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0
@@ -325,7 +341,7 @@ class SensorUnderTest:
         return frames
 
     def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:
-        """Return the bytes of a conversation."""
+        """Return the bytes of the frames of `conversation`, joined."""
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
 
 

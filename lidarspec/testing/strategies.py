@@ -224,7 +224,7 @@ def streams(
             sends datagrams. With a strategy, the bytes that it draws are inserted.
     """
     resolved = _resolve(sensor)
-    runs = [_run(resolved, name) for name in resolved.incoming]
+    runs = [_consecutive_frames(resolved, name) for name in resolved.incoming]
     if noise is True:
         noise = st.binary(min_size=1, max_size=MAX_NOISE_BYTES)
         runs.append(_truncated(resolved))
@@ -245,7 +245,7 @@ def _joined_runs(
 
 
 @st.composite
-def _run(draw: DrawFn, sensor: Sensor, frame: str) -> list[bytes]:
+def _consecutive_frames(draw: DrawFn, sensor: Sensor, frame: str) -> list[bytes]:
     """Draw consecutive frames of a type, after the frame that must precede them."""
     declared = sensor.frames[frame]
     before = [] if declared.after is None else [draw(frames(sensor, declared.after))]
@@ -353,7 +353,7 @@ def _to_plain(parsed: Any) -> Any:
 
 @st.composite
 def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw the header fields, and then the other fields of the layout."""
+    """Draw a frame of a compiled type: first its header fields, then all other fields."""
     ranges = ranges_of(sensor, frame, draw(_headers(sensor, frame, fields)))
     if ranges is None:
         # No plausible frame has this header.
@@ -440,7 +440,12 @@ def _floats(width: int) -> SearchStrategy[float]:
 
 
 def _draw_leaf(draw: DrawFn, leaf: Leaf, element: SearchStrategy[Any]) -> NDArray[Any]:
-    """Draw the values of a field, (1, *shape)."""
+    """Draw the values of a field as an array of the shape (1, *leaf.shape).
+
+    Args:
+        leaf: the field.
+        element: a strategy for each element.
+    """
     count = math.prod(leaf.shape)
     drawn = _draw_array(draw, count, functools.partial(draw, element))
     return np.array(drawn, leaf.info.dtype).reshape(1, *leaf.shape)

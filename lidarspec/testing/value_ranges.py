@@ -93,7 +93,7 @@ class LayoutRanges:
         return self._make_rows([self.repair(values, kept)]).tobytes()
 
     def _rebase(self, values: Mapping[str, Values]) -> LayoutRanges | None:
-        """Return ranges whose base has these values; None if no such base is found."""
+        """Return new ranges with a `base` that has these values; None if none is found."""
         fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
         for path, value in values.items():
             elements = itertools.cycle(value.flat)
@@ -127,7 +127,13 @@ class LayoutRanges:
     def _replace_invalid_elements(
         self, kept: Mapping[str, Values], leaf: Leaf, values: Values
     ) -> Values:
-        """Replace each invalid element of an array by the same element of the base."""
+        """Return an array in which the elements of `base` replace invalid elements.
+
+        Args:
+            kept: the values of other fields, by path.
+            leaf: the field with the array.
+            values: the elements, valid and invalid.
+        """
         base = leaf.load(self._base)
         mixed = base.copy()
         tried = []
@@ -135,14 +141,14 @@ class LayoutRanges:
             trial = base.copy()
             trial.flat[index] = values.flat[index]
             tried.append({**kept, leaf.info.path: trial})
-        for index, is_valid in enumerate(self._iter_valid(tried)):
+        for index, is_valid in enumerate(self._iter_validity(tried)):
             if is_valid:
                 mixed.flat[index] = values.flat[index]
         return mixed
 
     @functools.cached_property
     def ranges(self) -> Mapping[str, tuple[int, int]]:
-        """Path of each free integer or bytes field -> its lowest and highest raw value."""
+        """The lowest and highest raw value of the integer and bytes fields in `free`, by path."""
         if not self._has_rules:
             return {
                 leaf.info.path: _find_limits(leaf)
@@ -167,7 +173,7 @@ class LayoutRanges:
         return ranges
 
     def _find_ranges(self, leaves: Sequence[Leaf]) -> dict[str, tuple[int, int]]:
-        """Return the range of each field; the other fields keep their values of the base."""
+        """Return the range of each field, found by varying this field alone in `base`."""
         starts = {leaf.info.path: int(leaf.load(self._base).flat[0]) for leaf in leaves}
         lowest = {
             leaf.info.path: (starts[leaf.info.path], _find_limits(leaf)[0]) for leaf in leaves
@@ -180,7 +186,7 @@ class LayoutRanges:
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Set each field of the base to the valid value nearest to 0."""
+        """Set each field of `base` to the valid value nearest to 0; return if any changed."""
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
@@ -201,22 +207,22 @@ class LayoutRanges:
         )
 
     def _check_values(self, values: Sequence[tuple[str, int]]) -> list[bool]:
-        """Return for each (path, value) whether the base with this value is valid."""
+        """Return for each (path, value) whether `base` with this value is valid."""
         tried = []
         for path, value in values:
             leaf = self.layout.leaves[path]
             full = np.broadcast_to(np.array(value, leaf.info.dtype), (1, *leaf.shape))
             tried.append({path: full})
-        return list(self._iter_valid(tried))
+        return list(self._iter_validity(tried))
 
-    def _iter_valid(self, tried: list[dict[str, Values]]) -> Iterator[bool]:
-        """Yield for each set of values whether the base is valid with it."""
+    def _iter_validity(self, tried: list[dict[str, Values]]) -> Iterator[bool]:
+        """Yield for each set of values whether `base` with these values is valid."""
         step = max(BATCH_BYTES // self.layout.size, 1)
         for start in range(0, len(tried), step):
             yield from self._check_rows(self._make_rows(tried[start : start + step])).tolist()
 
     def _make_rows(self, values: list[Any]) -> NDArray[np.uint8]:
-        """Return copies of the base with these sets of values and checksums, (n, size)."""
+        """Return a copy of `base` for each set of values, with valid checksums, (n, size)."""
         rows = np.repeat(self._base, len(values), 0)
         for index, own in enumerate(values):
             for path, raw in own.items():
@@ -240,11 +246,11 @@ def find_ends(
     wanted: Mapping[str, tuple[int, int]],
     are_valid: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
 ) -> dict[str, int]:
-    """Return for each field the last valid value between a valid and a wanted value.
+    """Return the valid value nearest to a wanted value for each field, by bisection.
 
     Args:
-        wanted: path -> (valid value, wanted value).
-        are_valid: returns for each (path, value) whether it is valid.
+        wanted: the path of each field -> (a value that is valid, the wanted value).
+        are_valid: a function that returns for each (path, value) whether the value is valid.
     """
     valid = {path: start for path, (start, _) in wanted.items()}
     refused: dict[str, int] = {}
@@ -309,7 +315,7 @@ def ranges_of(
 
 @functools.lru_cache(maxsize=1024)
 def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]]:
-    """Return the distinct headers of a few random frames, the shortest frame first.
+    """Return the distinct headers of a few random frames, in order of frame length.
 
     Raises:
         SpecError: if no random frame is plausible.
@@ -355,7 +361,7 @@ def _are_valid(
 
 @functools.lru_cache(maxsize=1024)
 def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
-    """Return a few valid frames without layouts, the shortest frame first.
+    """Return a few valid frames of a type that is not compiled, the shortest first.
 
     Returns an empty list if none is found.
     """
@@ -440,7 +446,7 @@ def _with_value(parsed: Any, path: str, value: int) -> Any:
 
 
 def _iter_holders(parsed: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the mappings at a path of a parsed frame."""
+    """Yield each struct at a path of a parsed frame, one for each array element."""
     if isinstance(parsed, list):
         for element in parsed:
             yield from _iter_holders(element, names)

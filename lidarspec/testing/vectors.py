@@ -6,15 +6,15 @@
       "points": {"0": {"range": 0.224, "x": 0.18186, "y": 0.13078}}}]
 
 `values` are raw integers. `units` are physical values in the fields' units. `points` are the
-columns of single points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a
-further column). All
-three may be omitted. In any case, the bytes must be a frame of this type, and building the parsed
-values must give the same bytes. `sensor` is the id or a list of ids of the sensors that an entry
-belongs to; it may be omitted if the file belongs to a single sensor. An entry with `command` has
-the frame of that command with the arguments `args`, in their units; `reply` is its reply.
+columns of single points: range, x, y, z, azimuth and elevation in radians, intensity, ring, or
+another column of the sensor. Each of these three keys may be omitted. In any case, the bytes must
+be a frame of this type, and building the parsed values must give the same bytes.
 
-It is also checked that a sensor with the status "vectors" has vectors, and that they have a value
-of each data field.
+`sensor` is the id or a list of ids of the sensors that an entry belongs to. It may be omitted if
+the file belongs to a single sensor. In an entry with `command`, `hex` is the frame of that command
+with the arguments `args` in their units, and `reply` is the reply.
+
+A sensor with the status "vectors" must have vectors with a value of each data field.
 """
 
 from __future__ import annotations
@@ -37,8 +37,12 @@ from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import leaves
-from lidarspec.testing.geometry import read
-from lidarspec.testing.sensor_under_test import MAX_SHORT_BYTES, SensorUnderTest, seals
+from lidarspec.testing.geometry import decode_frames
+from lidarspec.testing.sensor_under_test import (
+    MAX_SHORT_BYTES,
+    SensorUnderTest,
+    find_checksum_paths,
+)
 from lidarspec.transports.hex_text import parse_hex
 from lidarspec.trusted_files import read_document
 
@@ -142,7 +146,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
             _compare_points(subject, name, data, vector["points"], key)
 
 
-def lacking(subject: SensorUnderTest) -> str:
+def describe_missing_vectors(subject: SensorUnderTest) -> str:
     """Return the reason why the sensor has no vectors.
 
     Returns "" if it has vectors, or if the file is invalid (`vectors_hold` reports that).
@@ -157,11 +161,8 @@ def lacking(subject: SensorUnderTest) -> str:
         return ""
 
 
-def places(subject: SensorUnderTest) -> list[str]:
-    """Return the keys of the sensor's vectors in their file.
-
-    Returns a single "" if the file cannot be read.
-    """
+def list_keys(subject: SensorUnderTest) -> list[str]:
+    """Return the keys of the sensor's vectors; [""] if their file cannot be read."""
     try:
         return list(_read_entries(subject))
     except ViolationError:
@@ -169,12 +170,8 @@ def places(subject: SensorUnderTest) -> list[str]:
 
 
 def the_status_is_proven(subject: SensorUnderTest) -> None:
-    """Check that a sensor with the status "vectors" has golden vectors.
-
-    If a capture is too large or its license does not allow publication, the sensor has another
-    status, and its `source` names the capture.
-    """
-    missing = lacking(subject)
+    """Check that a sensor with the status "vectors" has golden vectors."""
+    missing = describe_missing_vectors(subject)
     status = subject.sensor.status
     require(status != "vectors" or not missing, "LS710", f"status is {status!r}, but {missing}")
 
@@ -190,7 +187,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
         for path in (*vector.get("values", {}), *vector.get("units", {})):
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
-    sealing = _sealing_fields(subject, name)
+    sealing = _find_verified_fields(subject, name)
     free = [
         path
         for path, info in subject.fields(name).items()
@@ -218,7 +215,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     ]
     quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
     clouds = [
-        read(
+        decode_frames(
             subject, name, [parse_hex(vector["hex"])] * subject.sensor.frames[name].confirm
         ).points()
         for vector in vectors
@@ -257,7 +254,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     A checksum is recognized by its name, or by a search in the vectors. A field is accepted if its
     docs say that it is not checked, unless the search finds its algorithm.
     """
-    sealing = _sealing_fields(subject, name)
+    sealing = _find_verified_fields(subject, name)
     free = [
         path
         for path, info in subject.fields(name).items()
@@ -291,16 +288,16 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     )
 
 
-def _sealing_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields that store a verified checksum in any of several examples.
+def _find_verified_fields(subject: SensorUnderTest, name: str) -> set[str]:
+    """Return the fields of a frame type that store a verified checksum.
 
-    One example is not enough, because a header may omit a part with its checksum.
+    They are found in several examples, because some headers omit the part with the checksum.
     """
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
     return set().union(
         *(
-            seals(subject.sensor, name, subject.example(name, seed=seed))
+            find_checksum_paths(subject.sensor, name, subject.example(name, seed=seed))
             for seed in range(LAYOUT_EXAMPLES)
         )
     )
@@ -311,8 +308,7 @@ def _find_matches(
 ) -> list[ChecksumMatch]:
     """Return the checksums that match frames and lie in the field at `path`.
 
-    If a checksum of `lidarspec.spec` matches, checksums that need a new class are omitted, because
-    they match only as a consequence of this match.
+    Checksums that need a new class are returned only if no checksum of `lidarspec.spec` matches.
     """
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
@@ -428,10 +424,12 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
 
 
 def _check_entry(subject: SensorUnderTest, vector: Any, entry_key: str) -> bool:
-    """Return whether an entry belongs to the sensor; set the frame of a command.
+    """Check an entry of the file, and return whether it belongs to the sensor.
+
+    If the entry is for a command and has no key "frame", the key is added.
 
     Raises:
-        ViolationError: for an invalid entry.
+        ViolationError: if the entry is invalid.
     """
     require(isinstance(vector, dict), "LS702", "not an object", entry_key)
     unknown = sorted(vector.keys() - KEYS.keys())
@@ -489,10 +487,11 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
 
 
 def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: str) -> Any:
-    """Return the parsed vector.
+    """Parse the frame of a vector, and return its values.
 
     Raises:
-        ViolationError: if it cannot be parsed; for a wrong checksum, with the checksums that match.
+        ViolationError: if the frame cannot be parsed. If its checksum is wrong, the message names
+            checksums that would be valid.
     """
     try:
         return subject.sensor.parse(data, frame=name)
@@ -587,7 +586,7 @@ def _compare_points(
     entry_key: str,
 ) -> None:
     """Compare single points of a vector's frame with their expected columns."""
-    cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
+    cloud = decode_frames(subject, name, [data] * subject.sensor.frames[name].confirm).points()
     columns_of_points = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
         number = int(index)

@@ -11,7 +11,7 @@ from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec import Frame
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.frames import acceptable, has_free_values
+from lidarspec.testing.frames import build_if_valid, has_free_values
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import assert_backends_agree
 
@@ -63,11 +63,11 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
         edged = []
         for seed in range(count):
             parsed = sensor.parse(subject.example(name, seed=seed), frame=name)
-            for holder, key, path in list(material.integers(parsed)):
+            for holder, key, path in list(material.iter_integers(parsed)):
                 info = fields.get(path)
                 if info is not None and has_free_values(info) and source.random() < 0.3:
                     holder[key] = source.choice(info.limits)
-            built = acceptable(subject, name, parsed)
+            built = build_if_valid(subject, name, parsed)
             if built is not None:
                 edged.append((name, built))
         assert_backends_agree(sensor, material.make_input(sensor, edged))

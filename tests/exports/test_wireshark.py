@@ -233,7 +233,9 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
 def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
     sensor = SHAPED.get(name) or lidarspec.sensor(name)
     sealed = [
-        kind for kind in sensor.incoming if material.seals(sensor, kind, sensor.example(kind))
+        kind
+        for kind in sensor.incoming
+        if material.find_checksum_paths(sensor, kind, sensor.example(kind))
     ]
     frames = []
     for kind in sealed:
