@@ -116,8 +116,8 @@ def test_replies_after_a_pause_come_without_advance() -> None:
         virtual_port(paused, virtual_time=True) as port,
         ls.open(port.path, paused, start=False) as device,
     ):
-        assert device.send("get_info").values.hardware == 9
-        assert device.send("scan").confirmed
+        assert device.send("get_info", timeout=TIMEOUT_S).values.hardware == 9
+        assert device.send("scan", timeout=TIMEOUT_S).confirmed
         port.advance(0.5)
         read_until(device, lambda: device.stats.frames["node"] > 500)
 
