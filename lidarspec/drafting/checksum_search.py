@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.drafting.crc_search import crc_matches
+from lidarspec.drafting.crc_search import iter_crc_matches
 from lidarspec.drafting.samples import (
     ChecksumMatch,
     ChecksumPlace,
@@ -168,9 +168,9 @@ def search(
         return []
     matches = list(iter_plain_matches(samples, is_possible_place))
     if not any(match.is_sure for match in matches):
-        matches += crc_matches(samples, quick=quick, is_possible_place=is_possible_place)
+        matches += iter_crc_matches(samples, quick=quick, is_possible_place=is_possible_place)
     if not matches and not quick:
-        matches += crc_matches(samples, mixed=True, is_possible_place=is_possible_place)
+        matches += iter_crc_matches(samples, mixed=True, is_possible_place=is_possible_place)
     return sort_matches(matches)[:MAX_MATCHES]
 
 
@@ -203,7 +203,7 @@ def iter_plain_matches(
     has_sure_sum = False
     longest = len(few.frames[-1])  # the frames are sorted by length
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
-        for place in filter(is_possible_place, few.places(size)):
+        for place in filter(is_possible_place, few.iter_places(size)):
             for span in iter_spans(place, few):
                 if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
                     continue
@@ -249,7 +249,7 @@ def _iter_matches(
     mask = np.uint64((1 << 8 * place.size) - 1)
     byte_orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
     for order in byte_orders:
-        stored = few.fields(place, order)
+        stored = few.read_field(place, order)
         algorithms: list[Checksum]
         if isinstance(algorithm, Fletcher | Fold15):
             if are_enough(int((stored == computed).sum()), len(few)):
@@ -312,7 +312,7 @@ def _add_constant(algorithm: Checksum, constant: int) -> Checksum:
 
 
 def _find_constant(values: NDArray[np.uint64]) -> list[int]:
-    """Return the value that enough elements have, in a list; [] if there is none."""
+    """Return [value] if nearly all elements have the same value, otherwise []."""
     distinct, counts = np.unique(values, return_counts=True)
     most_frequent = int(counts.argmax())
     if are_enough(int(counts[most_frequent]), len(values)):
@@ -324,7 +324,7 @@ def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
     """Yield the match of an XOR that is stored in the low nibbles of two bytes."""
     for offset in range(min(3, samples.shortest - 4)):
         place = ChecksumPlace(offset, 2)
-        stored = samples.fields(place, "little")
+        stored = samples.read_field(place, "little")
         halves = (stored & np.uint64(15)) | (stored >> np.uint64(4)) & np.uint64(0xF0)
         spans = [CoveredSpan("behind")]
         if offset > 0:

@@ -7,9 +7,11 @@ polynomial is therefore a divisor of the greatest common divisor of such XORs.
 
 The start value and the final XOR are calculated from the polynomial. If the frames have several
 lengths, the two values are the solution of linear equations. If all frames have the same length,
-many pairs of values are equivalent, and the most usual pair is returned. If few frames have the
-same length, usual pairs are tried first, because the polynomial divides each frame if the pair is
-correct.
+many pairs of values are equivalent, and the most usual pair is returned.
+
+The XOR of two frames needs frames of the same length. If there are few of them, the search first
+assumes a usual pair of start value and final XOR, because the polynomial then divides each frame
+alone.
 """
 
 from __future__ import annotations
@@ -86,7 +88,7 @@ def quotient(a: int, b: int) -> int:
     return result
 
 
-def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
+def find_common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     """Return the greatest common divisor of polynomials; 0 if all are 0.
 
     Args:
@@ -131,10 +133,7 @@ def divisors(polynomial: int, degree: int) -> list[int]:
 
 
 def _try_all(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a small degree that a polynomial has.
-
-    The polynomial is divided by all candidates of this degree at the same time.
-    """
+    """Return the divisors of a polynomial that have the given degree, which must be small."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
     top = np.uint32(degree)
@@ -220,7 +219,7 @@ class _BitOrder:
         return Crc(self.width, low, init, self.refin, self.refout, self.register(xorout))
 
 
-def crc_matches(
+def iter_crc_matches(
     samples: SampleFrames,
     *,
     mixed: bool = False,
@@ -247,7 +246,7 @@ def crc_matches(
     by_width = [
         [
             place
-            for place in filter(is_possible_place, samples.places(width // 8))
+            for place in filter(is_possible_place, samples.iter_places(width // 8))
             if _varies_like_crc(samples, place)
         ]
         for width in WIDTHS
@@ -287,12 +286,14 @@ def crc_matches(
 
 
 def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
-    """Return the cost of a search, in bytes of CRC computation.
+    """Return the estimated time of a search for candidates, in a unit of work.
+
+    The unit is the time to compute the CRC of one byte.
 
     Args:
-        few: the frames from which candidates are calculated.
+        few: the frames from which the search calculates the candidates.
         reading: the bit order.
-        by_catalogue: whether only the CRCs of the catalogue are tried.
+        by_catalogue: whether the search tries only the CRCs of the catalogue.
     """
     if by_catalogue:
         return few.shortest * len(reading.catalogue_crcs())
@@ -305,7 +306,7 @@ def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
         return True
     min_distinct = max(min(len(samples) // 2, 24), 2)
     columns = (
-        samples.fields(ChecksumPlace(place.offset + index, 1), "little")
+        samples.read_field(ChecksumPlace(place.offset + index, 1), "little")
         for index in range(place.size)
     )
     return all(len(np.unique(column)) >= min_distinct for column in columns)
@@ -315,7 +316,7 @@ def _make_codewords(
     samples: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
 ) -> Codewords:
     rows = [row.tobytes() for group in samples.cut_span(place, span) for row in group]
-    stored = samples.fields(place, reading.order).tolist()
+    stored = samples.read_field(place, reading.order).tolist()
     return [
         (len(row), reading.message(row) ^ reading.register(value))
         for row, value in zip(rows, stored, strict=True)
@@ -335,12 +336,12 @@ def _iter_matches(
     """Yield the CRCs that match for one place, one span and one bit order.
 
     Args:
-        samples: all frames, on which candidates are tested.
+        samples: all frames; a CRC must be valid for most of them.
         few: the frames from which candidates are calculated.
-        tried: number of combinations that were tried so far.
+        tried: number of combinations of place, span and bit order that were tried so far.
         by_catalogue: whether to try only the CRCs of the catalogue.
     """
-    stored = samples.fields(place, reading.order)
+    stored = samples.read_field(place, reading.order)
     if by_catalogue:
         candidates = _iter_catalogue(few, place, span, reading)
     else:
@@ -403,12 +404,12 @@ def _iter_catalogue(
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield the CRCs of the catalogue that are valid for the first frame."""
     covered = few.cut_span(place, span)[0][0].tobytes()
-    stored = int(few.fields(place, reading.order)[0])
+    stored = int(few.read_field(place, reading.order)[0])
     yield from ((crc, 0, ()) for crc in reading.catalogue_crcs() if crc(covered) == stored)
 
 
 def _find_differences(words: Codewords) -> list[int]:
-    """Return the XOR of each frame with the first frame of the same length, if not 0."""
+    """Return the XOR of each frame with the first frame of the same length, without zeros."""
     first: dict[int, int] = {}
     return [word ^ first[size] for size, word in words if first.setdefault(size, word) != word]
 
@@ -418,7 +419,7 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
     xor_polynomial = (1 << width) | 1  # its CRC is a plain XOR, which is searched elsewhere
     polynomials = [
         poly
-        for poly in divisors(common_divisor(multiples, floor=width), width)
+        for poly in divisors(find_common_divisor(multiples, floor=width), width)
         if poly != xor_polynomial
     ]
     catalogued = [
@@ -430,14 +431,14 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
 def _iter_crcs(
     words: Codewords, poly: int, reading: _BitOrder, *, has_one_length: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield a CRC for a polynomial, with its start value and final XOR, if they exist.
+    """Yield the CRC with a polynomial; nothing if no start value and final XOR match.
 
     Args:
         words: the codewords of the frames.
         poly: the polynomial.
         reading: the bit order.
-        has_one_length: whether all frames have the same length, so that start value and final XOR
-            are ambiguous.
+        has_one_length: whether all frames have the same length. Several pairs of start value and
+            final XOR match such frames.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}
@@ -480,12 +481,12 @@ def _iter_crcs(
 def _solve_registers(
     remainders: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Solve linear equations for the start value and final XOR, and yield the CRC.
+    """Calculate start value and final XOR from frames of several lengths; yield the CRC.
 
-    Yields nothing if the equations have no solution.
+    Yields nothing if no pair of values matches all frames.
 
     Args:
-        remainders: the remainder of a frame of each length, by length.
+        remainders: for each length, the remainder of a frame of this length modulo `poly`.
     """
     (size, rest), *others = remainders.items()
     equations = []

@@ -24,7 +24,7 @@ from lidarspec.drafting.periods import (
     RisingField,
     find_rising_fields,
     find_structure,
-    usual_bytes,
+    find_usual_bytes,
 )
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import WireError
@@ -92,8 +92,8 @@ class Draft:
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: other checksums that match.
-        common_bytes: the number of first bytes that nearly all frames have, and that are searched
-            for fields; 0 unless the length field counts bytes.
+        common_bytes: if the length field counts bytes, the number of bytes at the start of nearly
+            all frames in which fields are searched; otherwise 0.
     """
 
     datagrams: bool
@@ -110,7 +110,7 @@ class Draft:
 
     @property
     def share(self) -> float:
-        """The share of the bytes that are in frames."""
+        """The share of the input bytes that are in frames, from 0 to 1."""
         return sum(len(frame) for _, frame in self.frames) / self.bytes_in
 
     @property
@@ -122,7 +122,10 @@ class Draft:
 
     @property
     def head_size(self) -> int:
-        """The number of bytes before the part of varying length; without it, all bytes."""
+        """The number of bytes before the part of varying length.
+
+        It is the length of the frame if all frames have the same length.
+        """
         if self.size is not None or self.length is None:
             return self.size or 0
         return max(self.length.rest - self.tail_size, self.length.end, self.common_bytes)
@@ -191,7 +194,7 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
     else:
         return None
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
-    usual = usual_bytes(rows[:, :MAX_SYNC_BYTES])
+    usual = find_usual_bytes(rows[:, :MAX_SYNC_BYTES])
     min_share = MIN_CONSTANT_SHARE if len(rows) >= FEW_FRAMES else 1
     is_constant = (rows[:, : len(usual)] == usual).mean(axis=0) >= min_share
     if is_constant.all():
@@ -207,10 +210,7 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
 
 
 def _iter_frames(draft: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield (offset, bytes) of each frame that has all known properties, in order.
-
-    If no valid frame begins at sync bytes, the search continues at the next byte.
-    """
+    """Yield (offset, bytes) of each frame that has the properties in the draft, in order."""
     base = 0
     for part in parts:
         offset = part.find(draft.sync)
@@ -254,11 +254,10 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 
 
 def _find_count(draft: Draft, data: bytes) -> Draft:
-    """Return the draft with a length field, if an incomplete last frame shows one.
+    """Search for a length field with the help of an incomplete frame at the end.
 
-    If all whole frames have the same length, a constant byte in them may be the number of elements.
-    This is so if the byte has another value in an incomplete frame at the end of the data.
-    Otherwise, the draft is returned unchanged.
+    A byte that is equal in all other frames, but not in the incomplete frame, is probably a number
+    of elements. The result is the draft with this length field, or the unchanged draft.
 
     Args:
         draft: the draft.
@@ -291,9 +290,9 @@ def _find_count(draft: Draft, data: bytes) -> Draft:
 
 
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
-    """Return the draft with `common_bytes`, if the length field counts bytes.
+    """Return the draft with `common_bytes`, and without frames that are shorter than that.
 
-    Frames that have fewer bytes are removed, because they are probably of another type.
+    Shorter frames are probably of another type.
     """
     if draft.length is None or draft.length.unit > 1 or not draft.frames:
         return draft
@@ -418,9 +417,10 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
 
 
 def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
-    """Return the largest blocks that begin with a rising field of the same kind.
+    """Return blocks at equal distances, each of which begins with a similar rising field.
 
-    Returns None if no blocks are found.
+    If there are several such groups of blocks, the one with the most bytes is returned. Returns
+    None if there is none.
     """
     found_blocks = []
     for field in fields:

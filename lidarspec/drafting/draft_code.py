@@ -22,9 +22,9 @@ from lidarspec.drafting.periods import (
     FULL_CIRCLES,
     RisingField,
     find_runs,
-    share_between,
+    measure_share_between,
 )
-from lidarspec.drafting.samples import ChecksumMatch, values
+from lidarspec.drafting.samples import ChecksumMatch, read_values
 from lidarspec.spec.checksums import ByteOrder
 
 #: The maximum number of characters in a line of the written files.
@@ -153,7 +153,7 @@ def _iter_fields(draft: Draft) -> Iterator[DraftField]:
         {
             0,
             draft.head_size,
-            *_span_cuts(draft),
+            *_find_span_edges(draft),
             *(
                 edge
                 for known_field in known_fields
@@ -172,7 +172,10 @@ def _iter_fields(draft: Draft) -> Iterator[DraftField]:
 
 
 def _find_known_fields(draft: Draft) -> list[DraftField]:
-    """Return the fields with evidence by offset, without overlaps."""
+    """Return the fields for which there is evidence, in wire order.
+
+    If two of them overlap, only one is returned.
+    """
     fields = list(_iter_sync_fields(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
@@ -184,7 +187,7 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
             DraftField(
                 length.offset,
                 length.size,
-                _length_field_name(draft),
+                _make_length_field_name(draft),
                 _format_integer(length.size, length.order),
                 (f"length of the frame, {length}: {seen}",),
             )
@@ -214,7 +217,7 @@ def _iter_sync_fields(draft: Draft) -> Iterator[DraftField]:
         end = len(draft.sync)
     else:
         end = min(len(draft.sync), draft.blocks.start)
-    edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
+    edges = [0, *(cut for cut in _find_span_edges(draft) if 0 < cut < end), end]
     for first, last in itertools.pairwise(edges):
         if last <= first:
             continue
@@ -304,9 +307,9 @@ def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | Non
         is_same_kind = field.circle == end_field.circle and field.kind == end_field.kind
         if not is_same_kind or field.offset >= end_field.offset:
             continue
-        starts = values(draft.rows, field.offset, field.size, field.order)
-        ends = values(draft.rows, end_field.offset, end_field.size, end_field.order)
-        if share_between(starts, ends, end_field.circle) > MIN_BETWEEN_SHARE:
+        starts = read_values(draft.rows, field.offset, field.size, field.order)
+        ends = read_values(draft.rows, end_field.offset, end_field.size, end_field.order)
+        if measure_share_between(starts, ends, end_field.circle) > MIN_BETWEEN_SHARE:
             return field
     return None
 
@@ -342,10 +345,10 @@ def _make_block_field(draft: Draft, blocks: RepeatedBlocks) -> DraftField:
 
 
 def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield a field for the part of varying length, and the checksum after this part."""
+    """Yield a field with the bytes of varying length, and then the checksum at the end."""
     assert draft.length is not None
     rest = draft.head_size + draft.tail_size - draft.length.rest
-    name = _length_field_name(draft)
+    name = _make_length_field_name(draft)
     if draft.length.unit > 1 and rest == 0:
         code = f'Array(this.{name}, Struct("unknown_0" / Bytes({draft.length.unit})))'
         yield DraftField(draft.head_size, 0, "samples", code)
@@ -370,7 +373,7 @@ def _iter_varying_fields(draft: Draft) -> Iterator[DraftField]:
         yield _make_checksum_field(draft, draft.checksum, -draft.tail_size)
 
 
-def _length_field_name(draft: Draft) -> str:
+def _make_length_field_name(draft: Draft) -> str:
     if draft.length is not None and draft.length.unit > 1:
         return "count"
     return "length"
@@ -422,8 +425,8 @@ def _format_checksum_arguments(
     return f"{text}    over={over},\n"
 
 
-def _span_cuts(draft: Draft) -> list[int]:
-    """Return the offsets at which the covered bytes begin and end.
+def _find_span_edges(draft: Draft) -> list[int]:
+    """Return the offsets at which bytes covered by the checksum begin or end.
 
     Offsets in the part of varying length are omitted.
     """
@@ -446,7 +449,7 @@ def _find_angles(draft: Draft) -> list[str]:
 
 
 def _count_fixed_bits(draft: Draft) -> int:
-    """Return the number of bits of constants and checksum in a frame."""
+    """Return how many bits of a frame are constant or belong to the checksum."""
     size = len(draft.sync)
     if draft.blocks:
         size += len(draft.blocks.flag) * draft.blocks.count
@@ -506,8 +509,8 @@ def _make_imports(text: dict[str, str]) -> dict[str, str]:
     )
     own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *names}
     return {
-        "construct_names": ", ".join(sorted(construct, key=_import_order)),
-        "own_import": _format_import("lidarspec.spec", sorted(own, key=_import_order)),
+        "construct_names": ", ".join(sorted(construct, key=_make_import_key)),
+        "own_import": _format_import("lidarspec.spec", sorted(own, key=_make_import_key)),
         "typing": "from typing import Any\n" if "Any" in code else "",
     }
 
@@ -520,7 +523,7 @@ def _format_import(module: str, names: list[str]) -> str:
     return f"from {module} import (\n" + "".join(f"    {name},\n" for name in names) + ")"
 
 
-def _import_order(name: str) -> tuple[bool, str, int]:
+def _make_import_key(name: str) -> tuple[bool, str, int]:
     """Return the sort key of a name: upper case first, and numbers by value."""
     number = re.search(r"\d+", name)
     return (

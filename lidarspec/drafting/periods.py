@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.drafting.checksum_search import search
-from lidarspec.drafting.samples import ChecksumMatch, values
+from lidarspec.drafting.samples import ChecksumMatch, read_values
 from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
@@ -178,7 +178,7 @@ def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
     return sorted(chosen, key=lambda field: field.offset)
 
 
-def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
+def measure_share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
     """Return the share of frames whose `last` is between `first` and the next `first`.
 
     Args:
@@ -225,7 +225,7 @@ def _iter_counters(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[RisingField]:
     """Yield the field if it is a counter: it rises by one, and wraps to its minimum."""
-    counts = values(rows, offset, size, order)
+    counts = read_values(rows, offset, size, order)
     steps = np.diff(counts)
     first = int(counts.min())
     last = int(counts.max())
@@ -251,7 +251,7 @@ def _iter_rising(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[RisingField]:
     """Yield the field if it rises by about the same step each time."""
-    field_values = values(rows, offset, size, order)
+    field_values = read_values(rows, offset, size, order)
     steps = np.diff(field_values)
     moved = steps[steps != 0]
     if (
@@ -291,9 +291,9 @@ def _iter_rising(
 
 
 def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte belongs to the field.
+    """Return whether the lowest byte of the values belongs to the field.
 
-    If it belongs to the field, the steps vary less with it than without it.
+    If it does, the steps vary clearly more without this byte.
     """
     steps = np.diff(field_values)
     moved = steps != 0
@@ -310,12 +310,12 @@ def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
 def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
-    This is a full circle in a usual unit if the highest value and the decrease at a wrap match the
-    circle. Otherwise it is the decrease.
+    If a full circle in a usual unit (such as 36,000) is near `highest` and `fallen`, the result is
+    this circle. Otherwise it is `fallen`.
 
     Args:
-        highest: the highest value.
-        fallen: the usual decrease at a wrap, plus one step.
+        highest: the highest value of the field.
+        fallen: the sum of the decrease at a wrap and the usual step.
         usual: the usual step.
     """
     near = [
@@ -402,7 +402,7 @@ def find_structure(chunks: Sequence[bytes], *, datagrams: bool) -> FrameStructur
     return _find_in_stream(np.frombuffer(b"".join(chunks)[:MAX_SEARCHED_BYTES], np.uint8))
 
 
-def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def find_usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the most frequent value of each column, (n,)."""
     return np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
 
@@ -514,7 +514,7 @@ def _iter_frames_of_length(
     """
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
-    usual = usual_bytes(rows)
+    usual = find_usual_bytes(rows)
     if count >= 2 * MIN_FRAMES:
         steady = (rows == usual).mean(axis=0) >= MIN_CONSTANT_SHARE
     else:
@@ -522,7 +522,7 @@ def _iter_frames_of_length(
     steady_count = int((steady & (usual != 0)).sum())
     if steady_count == 0 or steady.all() or _is_chance(data, steady_count, count, period):
         return
-    start, length = _longest_run(steady, usual)
+    start, length = _find_longest_run(steady, usual)
     sync = bytes(np.roll(usual, -start)[:length])
     frames = [
         frame for frame in split_frames(data.tobytes(), period, start) if frame.startswith(sync)
@@ -559,7 +559,7 @@ def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period:
     return math.log(periods) + log_chance > math.log(MAX_CHANCE_PROBABILITY)
 
 
-def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
+def _find_longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
     """Return (start, length) of the run with the most nonzero constant bytes.
 
     A run may continue from the end of the period to its start. Zeros at the start of a run are
@@ -629,7 +629,7 @@ def _find_length_field(
         ):
             for unit in range(1, MAX_UNIT_BYTES + 1):
                 rest = steps - unit * lengths
-                usual, count = _most_frequent(rest)
+                usual, count = _find_most_frequent(rest)
                 fits = rest == usual
                 distinct = len(np.unique(steps[fits]))
                 share = float(steps[fits].sum() / len(data))
@@ -646,7 +646,7 @@ def _find_length_field(
     return FrameStructure(sync, None, length, share, tuple(frames))
 
 
-def _most_frequent(integers: NDArray[np.int64]) -> tuple[int, int]:
+def _find_most_frequent(integers: NDArray[np.int64]) -> tuple[int, int]:
     """Return the most frequent value and its number of occurrences."""
     distinct, counts = np.unique(integers, return_counts=True)
     return int(distinct[counts.argmax()]), int(counts.max())

@@ -45,7 +45,7 @@ class ChecksumPlace:
     size: int
 
     def start(self, length: int) -> int:
-        """Return the offset from the start of a frame of this length."""
+        """Return the offset of the checksum from the start of a frame of this length."""
         if self.offset < 0:
             return self.offset + length
         return self.offset
@@ -149,7 +149,7 @@ class ChecksumMatch:
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums of which one matches by chance, such as "1e+09"."""
+        """A text such as "1e+09": one of this many wrong checksums matches by chance."""
         return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property
@@ -167,7 +167,9 @@ class ChecksumMatch:
         )
 
 
-def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
+def read_values(
+    rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
+) -> NDArray[np.int64]:
     """Return the unsigned value at an offset in each row, (n,).
 
     Args:
@@ -225,9 +227,9 @@ class SampleFrames:
         """Return frames of the most frequent length, and up to two of each other length.
 
         Args:
-            number: the maximum number of frames of the most frequent length, and the maximum number
+            number: maximum number of frames of the most frequent length. It also limits the number
                 of other lengths.
-            pick: index of the selection. Different indices select different frames.
+            pick: a number that selects the frames. Other numbers select other frames.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
@@ -240,18 +242,18 @@ class SampleFrames:
             for row in rows
         )
 
-    def fields(self, place: ChecksumPlace, order: ByteOrder) -> NDArray[np.uint64]:
+    def read_field(self, place: ChecksumPlace, order: ByteOrder) -> NDArray[np.uint64]:
         """Return the value at a place in each frame, (n,)."""
         if (place, order) not in self._fields:
             columns = [
-                values(group, place.start(group.shape[1]), place.size, order)
+                read_values(group, place.start(group.shape[1]), place.size, order)
                 for group in self.groups
             ]
             self._fields[place, order] = np.concatenate(columns).view(np.uint64)
         return self._fields[place, order]
 
     def cut_span(self, place: ChecksumPlace, span: CoveredSpan) -> list[NDArray[np.uint8]]:
-        """Return the bytes that a span covers, an array (frames, bytes) for each group."""
+        """Return the covered bytes of all frames: one array (frames, bytes) for each length."""
         return [
             np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
             for group in self.groups
@@ -273,10 +275,10 @@ class SampleFrames:
     ) -> int:
         """Return the number of frames with a valid checksum."""
         return int(
-            (self.compute_checksums(algorithm, place, span) == self.fields(place, order)).sum()
+            (self.compute_checksums(algorithm, place, span) == self.read_field(place, order)).sum()
         )
 
-    def places(self, size: int) -> Iterator[ChecksumPlace]:
+    def iter_places(self, size: int) -> Iterator[ChecksumPlace]:
         """Yield the possible places of a checksum, from both ends of the frame inwards.
 
         Places with nearly constant values are omitted.
@@ -304,7 +306,7 @@ class SampleFrames:
                 place
                 for place in places
                 if self.is_single
-                or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1
+                or len(np.unique(self.read_field(place, "little"))) > len(self) // 8 + 1
             )
 
     @property
@@ -316,10 +318,11 @@ class SampleFrames:
         """Return a measure of how much the bytes at a place vary.
 
         It is calculated for the byte that varies least, from its range and its number of distinct
-        values. It is larger for the usual place, the end of the frame.
+        values. For a place at the end of the frame it is increased, because checksums are usually
+        there.
         """
         columns = [
-            self.fields(ChecksumPlace(place.offset + index, 1), "little")
+            self.read_field(ChecksumPlace(place.offset + index, 1), "little")
             for index in range(place.size)
         ]
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
@@ -337,9 +340,9 @@ def accept_any_place(_: ChecksumPlace) -> bool:
 
 
 def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredSpan]:
-    """Yield the possible ranges of covered bytes, the most usual first.
+    """Yield the possible spans of covered bytes, the most usual first.
 
-    A span that covers the same bytes of the shortest frame as an earlier span is omitted.
+    If two spans cover the same bytes of the shortest frame, only the first is yielded.
     """
     start = place.start(samples.shortest)
     before = start

@@ -34,7 +34,7 @@ from lidarspec.detect.listen import (
     probe,
     read_samples,
 )
-from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, remainder
+from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, iter_crc_matches, remainder
 from lidarspec.drafting.periods import find_structure
 from lidarspec.drafting.samples import SampleFrames
 from lidarspec.spec import Crc
@@ -543,11 +543,11 @@ class TestStructure:
         monkeypatch.setattr("lidarspec.drafting.crc_search.remainder", count_and_divide)
         monkeypatch.setattr("lidarspec.drafting.crc_search.QUICK_WORK", QUICK_WORK // 64)
         samples = SampleFrames(make_bodies(size, number))
-        assert list(crc_matches(samples, quick=True)) == []
+        assert list(iter_crc_matches(samples, quick=True)) == []
         # The steps of Euclid's algorithm pass over the bytes twice.
         assert 0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK
         quick = divided
-        assert list(crc_matches(samples)) == []
+        assert list(iter_crc_matches(samples)) == []
         assert divided - quick > 2 * quick
 
     @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
@@ -555,7 +555,7 @@ class TestStructure:
         sealed = SampleFrames(
             body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number)
         )
-        assert next(crc_matches(sealed, quick=True)).name == "CRC-32"
+        assert next(iter_crc_matches(sealed, quick=True)).name == "CRC-32"
 
     @pytest.mark.slow
     def test_frames_of_one_length(self) -> None:

@@ -13,9 +13,9 @@ import lidarspec
 import lidarspec.spec
 from lidarspec.drafting.checksum_search import OffsetChecksum, WordSum, search
 from lidarspec.drafting.crc_search import (
-    common_divisor,
-    crc_matches,
     divisors,
+    find_common_divisor,
+    iter_crc_matches,
     quotient,
     remainder,
     solve,
@@ -55,7 +55,9 @@ def find_best(frames: list[bytes]) -> ChecksumMatch:
 def found_among_crcs(frames: list[bytes]) -> ChecksumMatch:
     """Search only the CRCs, without trying plain checksums first."""
     samples = SampleFrames(frames)
-    return sort_matches(list(crc_matches(samples)) or list(crc_matches(samples, mixed=True)))[0]
+    return sort_matches(
+        list(iter_crc_matches(samples)) or list(iter_crc_matches(samples, mixed=True))
+    )[0]
 
 
 def assert_found_by_name(
@@ -280,7 +282,7 @@ def test_divisors_of_a_common_multiple() -> None:
         return product
 
     multiples = [times(source.getrandbits(200)) for _ in range(4)]
-    assert divisors(common_divisor(multiples), 16) == [poly]
+    assert divisors(find_common_divisor(multiples), 16) == [poly]
     assert poly in divisors(times(0b1011), 16)
     assert poly in divisors(multiples[0], 16)  # every polynomial of degree 16 is tried at once
     assert divisors(0, 8) == []
