@@ -288,25 +288,25 @@ def trust(folder: str) -> None:
 
 def _sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     """Return the facts about a sensor as a JSON object."""
-    from lidarspec.exports.json import facts, link_data
+    from lidarspec.exports.json import link_data, select_attributes
 
     return {
-        **facts(sensor, "id", "vendor", "model", "status", "source", "aliases"),
+        **select_attributes(sensor, "id", "vendor", "model", "status", "source", "aliases"),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
         "frames": list(sensor.frames),
         "commands": list(sensor.commands),
-        **facts(sensor, "range_limits"),
+        **select_attributes(sensor, "range_limits"),
         "info": {name: fact.paths[0] for name, fact in sensor.reported.items()},
     }
 
 
 def _frame_to_dict(frame: Frame) -> dict[str, Any]:
-    from lidarspec.exports.json import facts
+    from lidarspec.exports.json import select_attributes
     from lidarspec.frames.wire_table import frame_size, wire_table
 
     rows = [vars(row) for row in wire_table(frame)]
     return {
-        **facts(frame, "direction", "data"),
+        **select_attributes(frame, "direction", "data"),
         "size": frame_size(frame),
         "max_length": frame.max_length,
         "rows": rows,

@@ -1,8 +1,8 @@
 """Export the spec of a sensor to the formats of other tools.
 
 `export` returns the text of an export, which is selected by name. The modules below get the frame
-types from `messages` and walk their frame trees (`lidarspec.spec.tree`). They raise `ExportError`
-if a tree contains Python code, or if the target format cannot express the spec. Modules in reading
+types from `list_frames`, and read their trees (`lidarspec.spec.tree`). They raise `ExportError` if
+a tree contains Python code, or if the target format cannot express the spec. Modules in reading
 order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
@@ -124,13 +124,13 @@ class ExportedFrame:
         }
 
 
-def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
+def list_frames(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
     """Return the frame types of a sensor that can be exported, in declared order.
 
     Args:
-        on_wire: whether the export describes the bytes as they are sent, not only the fields. If
-            so, frame types with a wire form (text or escaped bytes) are omitted, because other
-            languages cannot decode them.
+        on_wire: whether the export describes the bytes as they are sent. Frame types with a wire
+            form (text or escaped bytes) are then omitted, because other languages cannot decode
+            them.
 
     Raises:
         ExportError: if the sensor has no frames until it is configured, if a frame contains Python
@@ -180,14 +180,14 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
     formulas = [
         value
         for below in tree.nodes(node)
-        for value in (*tree.formulas(below), *find_held_formulas(below).values())
+        for value in (*tree.formulas(below), *find_required_formulas(below).values())
     ]
     formulas += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
     return [ref for value in formulas for ref in tree.refs(value)]
 
 
-def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """Return the formulas that fields of a node must be equal to, by path."""
+def find_required_formulas(node: tree.Node) -> dict[str, tree.Formula]:
+    """Return the formulas of fields whose value must equal a formula, by field path."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)

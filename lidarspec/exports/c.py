@@ -28,8 +28,8 @@ from lidarspec.exports import (
     ExportError,
     c_fields,
     describe_left_out,
+    list_frames,
     make_prefix,
-    messages,
 )
 from lidarspec.exports.c_fields import (
     CEntry,
@@ -187,10 +187,7 @@ def _make_word_xor_body(algorithm: WordXor) -> _ChecksumBody:
 
 
 def _make_crc_body(crc: Crc) -> _ChecksumBody:
-    """Return the body of a CRC that uses the byte table of `lidarspec.spec.checksums`.
-
-    As in that module, the low byte of the register is combined with the next byte of data.
-    """
+    """Return the body of a CRC that uses the byte table of `lidarspec.spec.checksums`."""
     size = next(size for size in (8, 16, 32, 64) if crc.width <= size)
     entries = [
         _format_literal(register, size) for register in byte_table(crc.width, crc.poly, crc.refin)
@@ -373,7 +370,12 @@ def _iter_covered_spans(
 
 
 def _format_stored_checksum(held: list[CEntry], order: str) -> str:
-    """Return the C expression of a checksum that several fields store, low bits first."""
+    """Return the C expression of a checksum that is stored in one or more fields.
+
+    Args:
+        held: the fields, in the order of their bits, lowest first.
+        order: the byte order of fields of bytes.
+    """
     terms = []
     shift = 0
     for access in held:
@@ -439,12 +441,12 @@ def _format_number(value: Any) -> str:
 
 
 def _format_check(entry: CEntry, wrong: str) -> str:
-    """Return a C statement `return 0`, executed if a condition is true.
+    """Return a C statement that returns 0 if the value of an entry is invalid.
 
-    For an entry in arrays, the statement loops over all elements.
+    For an entry in arrays, the statement checks all elements.
 
     Args:
-        wrong: the C condition.
+        wrong: the C condition that is true if the value is invalid.
     """
     where = " && ".join(filter(None, (entry.where, wrong)))
     names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
@@ -502,7 +504,7 @@ def header(sensor: Sensor) -> str:
         text.replace("*/", "* /").replace("/*", "/ *")
         for text in (f"{sensor.vendor} {sensor.model}", sensor.source)
     )
-    all_messages = messages(sensor)
+    all_messages = list_frames(sensor)
     algorithms = dict.fromkeys(
         seal.algorithm for message in all_messages for seal in message.seals.values()
     )

@@ -155,7 +155,7 @@ class CEntry:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """The array indices of a part of a bit block, for arrays inside the block."""
+        """The indices of this part in the arrays inside its bit block; () for other nodes."""
         if self.part is not None:
             return self.part.indices
         return ()
@@ -187,9 +187,10 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The C condition under which the field is present; "" if it is always present.
+        """The C condition under which a function returns this field; "" if it always does.
 
-        For a part of a bit block inside an array, the array indices must be those of the part.
+        If an array inside a bit block contains the field, the condition compares the arguments of
+        the function with `indices`.
         """
         inside = [
             f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
@@ -363,7 +364,7 @@ class CLayout:
                 start = start + self.extent(below)
 
     def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
-        """Yield the entries of the members of a struct, each with its own start."""
+        """Yield an entry for each member of a struct; all have the start of the struct."""
         node = entry.node
         if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
@@ -458,9 +459,9 @@ def accesses(layout: CLayout, path: str) -> list[CEntry]:
 
 
 def fields(layout: CLayout) -> Iterator[str]:
-    """Yield the functions of all fields in wire order.
+    """Yield the C functions of all fields, in wire order.
 
-    If several alternatives contain a field, its functions are at the place of the last alternative.
+    The position of a field that several alternatives contain is its position in the last one.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
@@ -477,7 +478,10 @@ Writer = Callable[[CLayout, str], Iterator[str]]
 
 
 def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
-    """Yield (writer, path) for each kind of function that an entry needs."""
+    """Yield (writer, path) for each C function of an entry.
+
+    The writer is a Python function that writes the C function of the node at `path`.
+    """
     if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
             yield from ((_write_inner_count, axis) for axis in _find_inner_axes(part))
@@ -491,7 +495,10 @@ def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
 
 
 def _iter_extents(layout: CLayout) -> Iterator[str]:
-    """Yield the size functions of parts with alternatives of different sizes."""
+    """Yield a C function that returns the size, for each part with alternatives.
+
+    Parts are omitted if all their alternatives have the same size.
+    """
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.sizes(entry)

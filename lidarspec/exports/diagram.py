@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.exports import ExportedFrame, messages
+from lidarspec.exports import ExportedFrame, list_frames
 from lidarspec.frames.wire_table import (
     INDICES,
     SizeFormula,
@@ -93,8 +93,8 @@ class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
-        seals: the seal of each field that contains a checksum, by path.
-        mixed: whether the frame has both byte orders, so that the order of each number is shown.
+        seals: for each field that stores a checksum, by path, the node with the algorithm.
+        mixed: whether the frame has both byte orders. If so, each number shows its byte order.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -297,7 +297,7 @@ def svg(sensor: Sensor) -> str:
         ExportError: if the content of a frame depends on Python code.
     """
     sheet = _Sheet()
-    for message in messages(sensor, on_wire=False):
+    for message in list_frames(sensor, on_wire=False):
         size = frame_size(message.frame)
         order = byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (
@@ -422,7 +422,7 @@ class _Sheet:
         self.parts += _draw_bracket_label(x + 12, (top + self.top) / 2, group.label)
 
     def _draw_box(self, cell: DiagramBox) -> None:
-        """Draw a field as one piece in each row; its name is in the widest piece."""
+        """Draw a field, which may continue in the next rows; write its name where most fits."""
         pieces: list[Piece] = []
         left = cell.bits
         lead = self.used % 8
@@ -468,10 +468,11 @@ class _Sheet:
         self.used = 0
 
     def _draw_offset(self, cell: DiagramBox, more: int) -> None:
-        """Draw the offset of the current row at its left; a long formula takes two lines.
+        """Write the offset of the current row to its left; a long formula takes two lines.
 
         Args:
-            more: the number of bytes of the field that are drawn in the rows above.
+            cell: the first field of the row.
+            more: number of bytes of this field that are already drawn in the rows above.
         """
         text = str(cell.offset + SizeFormula(more))
         middle = text.find(" + ", len(text) // 2 - 4)

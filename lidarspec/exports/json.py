@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from lidarspec.exports import ExportedFrame, messages
+from lidarspec.exports import ExportedFrame, list_frames
 from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Checksum, Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Filled
@@ -41,7 +41,7 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
     """
     return {
         "lidarspec": FORMAT_VERSION,
-        **facts(
+        **select_attributes(
             sensor,
             "id",
             "vendor",
@@ -54,32 +54,34 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
             "returns",
         ),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
-        "scan": _scan(sensor.scan),
-        "clock": _clock(sensor),
-        "sequence": _sequence(sensor.sequence),
+        "scan": _scan_data(sensor.scan),
+        "clock": _clock_data(sensor),
+        "sequence": _sequence_data(sensor.sequence),
         "fillers": sensor.fillers.hex(),
-        "frames": {message.name: _frame(message) for message in messages(sensor, on_wire=False)},
-        "commands": {name: _command(command) for name, command in sensor.commands.items()},
-        **facts(sensor, "on_open", "on_close"),
+        "frames": {
+            message.name: _frame_data(message) for message in list_frames(sensor, on_wire=False)
+        },
+        "commands": {name: _command_data(command) for name, command in sensor.commands.items()},
+        **select_attributes(sensor, "on_open", "on_close"),
     }
 
 
-def _scan(rule: Split | None) -> dict[str, Any] | None:
+def _scan_data(rule: Split | None) -> dict[str, Any] | None:
     """Return the rule for the end of a scan; None for a sensor without points."""
     if rule is None:
         return None
     return {"rule": type(rule).__name__, **dataclasses.asdict(rule)}
 
 
-def _sequence(counter: PacketCounter | None) -> dict[str, Any] | None:
+def _sequence_data(counter: PacketCounter | None) -> dict[str, Any] | None:
     """Return the counter of packets; values that functions calculate are null."""
     if counter is None:
         return None
-    data = facts(counter, "field", "first", "last", "returns")
+    data = select_attributes(counter, "field", "first", "last", "returns")
     return {name: None if callable(value) else value for name, value in data.items()}
 
 
-def facts(value: object, *names: str) -> dict[str, Any]:
+def select_attributes(value: object, *names: str) -> dict[str, Any]:
     """Return the attributes `names` of an object as JSON data, by name."""
     own = ((name, getattr(value, name)) for name in names)
     return {name: _to_json(fact) for name, fact in own}
@@ -103,17 +105,17 @@ def link_data(link: Link) -> dict[str, Any]:
 
     The key "kind" is the class of the link; the other keys are its attributes.
     """
-    data = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
+    data = {"kind": type(link).__name__.lower(), **select_attributes(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
         data["assembled"] = {
-            **facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"),
+            **select_attributes(rule, "keys", "index", "count", "payload", "first", "in_bytes"),
             "fragment": fragment,
         }
     return data
 
 
-def _clock(sensor: Sensor) -> dict[str, Any] | None:
+def _clock_data(sensor: Sensor) -> dict[str, Any] | None:
     if sensor.clock is None:
         return None
     source = sensor.clock.source
@@ -128,11 +130,11 @@ def _clock(sensor: Sensor) -> dict[str, Any] | None:
         "fields": fields,
         "wraps_at": sensor.clock.wraps_at,
         "epoch": sensor.clock.epoch,
-        "status": None if status is None else _clock_status(status),
+        "status": None if status is None else _status_data(status),
     }
 
 
-def _clock_status(status: ClockStatus) -> dict[str, Any]:
+def _status_data(status: ClockStatus) -> dict[str, Any]:
     return {
         "frame": status.frame,
         "field": None if callable(status.source) else status.source,
@@ -140,41 +142,41 @@ def _clock_status(status: ClockStatus) -> dict[str, Any]:
     }
 
 
-def _frame(message: ExportedFrame) -> dict[str, Any]:
+def _frame_data(message: ExportedFrame) -> dict[str, Any]:
     frame = message.frame
     return {
-        **facts(frame, "direction", "data"),
+        **select_attributes(frame, "direction", "data"),
         "size": frame_size(frame),
-        **facts(frame, "max_length", "after", "confirm"),
+        **select_attributes(frame, "max_length", "after", "confirm"),
         "plausible": frame.plausible is not None,
-        "wire": None if frame.wire is None else _wire_form(frame.wire),
+        "wire": None if frame.wire is None else _wire_form_data(frame.wire),
         "layout": node_data(message.root),
     }
 
 
-def _wire_form(form: WireForm) -> dict[str, Any]:
+def _wire_form_data(form: WireForm) -> dict[str, Any]:
     """Return the class and the arguments of a wire form as JSON data.
 
     Arguments that are objects, such as a `HexCheck`, become Python text.
     """
     return {"form": type(form).__name__} | {
         name: repr(value) if dataclasses.is_dataclass(value) else _to_json(value)
-        for name, value in _arguments(form).items()
+        for name, value in _read_arguments(form).items()
     }
 
 
-def _arguments(described: object) -> dict[str, Any]:
+def _read_arguments(described: object) -> dict[str, Any]:
     """Return the values of a dataclass's fields, by name; {} for any other class."""
     if not dataclasses.is_dataclass(described):
         return {}
     return {item.name: getattr(described, item.name) for item in dataclasses.fields(described)}
 
 
-def _command(command: Command) -> dict[str, Any]:
+def _command_data(command: Command) -> dict[str, Any]:
     return {
-        **facts(command, "frame", "values"),
+        **select_attributes(command, "frame", "values"),
         "args": {name: argument.to_dict() for name, argument in command.arguments.items()},
-        **facts(
+        **select_attributes(
             command,
             "replies",
             "matches",
@@ -205,14 +207,14 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             }
         case tree.Sealed():
             body = node_data(node.body)
-            return body | {"checksum": _seal(node) | {"inner": body.get("checksum")}}
+            return body | {"checksum": _seal_data(node) | {"inner": body.get("checksum")}}
         case tree.Number():
             return {
                 "kind": node.kind,
                 "name": node.name,
                 "bytes": node.size,
                 "order": node.order,
-            } | _info(node.info)
+            } | _info_data(node.info)
         case tree.Blob():
             data = {"kind": "bytes", "name": node.name, "bytes": formula_data(node.size)}
             if node.info.adapter is not None:
@@ -223,13 +225,13 @@ def node_data(node: tree.Node) -> dict[str, Any]:
                     "mask": node.ending.mask.hex(),
                     "is_content": node.ending.is_content,
                 }
-            return data | _info(node.info)
+            return data | _info_data(node.info)
         case tree.Block():
             return {
                 "kind": "block",
                 "name": node.name,
                 "bytes": node.size,
-                "parts": [_part(part) for part in node.parts],
+                "parts": [_part_data(part) for part in node.parts],
             }
         case tree.Repeat():
             return {
@@ -239,7 +241,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
                 "element": node_data(node.element),
             }
         case tree.PartSequence():
-            return _parts(node)
+            return _parts_data(node)
         case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
             return {
@@ -266,13 +268,8 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "nothing", "name": node.name}
 
 
-def _parts(node: tree.PartSequence) -> dict[str, Any]:
-    """Return the rules and the kinds of a sequence of parts as JSON data.
-
-    The rules determine where the sequence ends.
-
-    For each kind, the key "following" has the size of the next part in bytes.
-    """
+def _parts_data(node: tree.PartSequence) -> dict[str, Any]:
+    """Return a sequence of parts as JSON data: its kinds of parts, and where it ends."""
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}
     kinds = [
@@ -301,7 +298,7 @@ def formula_data(formula: tree.Formula | None) -> Any:
             return formula
 
 
-def _info(info: tree.FieldInfo) -> dict[str, Any]:
+def _info_data(info: tree.FieldInfo) -> dict[str, Any]:
     if isinstance(info.const, bytes | bytearray):
         const = info.const.hex()
     else:
@@ -321,7 +318,7 @@ def _info(info: tree.FieldInfo) -> dict[str, Any]:
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 
 
-def _part(part: tree.Part) -> dict[str, Any]:
+def _part_data(part: tree.Part) -> dict[str, Any]:
     runs = [
         {"byte": run.byte, "low": run.low, "width": run.mask.bit_count(), "target": run.target}
         for run in part.bits.segments
@@ -332,18 +329,21 @@ def _part(part: tree.Part) -> dict[str, Any]:
         "width": part.bits.width,
         "signed": part.bits.signed,
     }
-    return {**head, "runs": runs} | _info(part.info)
+    return {**head, "runs": runs} | _info_data(part.info)
 
 
-def _seal(node: tree.Sealed) -> dict[str, Any]:
-    return {**facts(node, "fields", "over", "absent"), "algorithm": _algorithm(node.algorithm)}
+def _seal_data(node: tree.Sealed) -> dict[str, Any]:
+    return {
+        **select_attributes(node, "fields", "over", "absent"),
+        "algorithm": _algorithm_data(node.algorithm),
+    }
 
 
-def _algorithm(algorithm: Checksum) -> dict[str, Any]:
+def _algorithm_data(algorithm: Checksum) -> dict[str, Any]:
     parameters: dict[str, Any] = {}
-    for name, value in _arguments(algorithm).items():
+    for name, value in _read_arguments(algorithm).items():
         if isinstance(value, Checksum):
-            parameters[name] = _algorithm(value)
+            parameters[name] = _algorithm_data(value)
         elif isinstance(value, int | str | tuple):
             parameters[name] = value
     return {

@@ -25,8 +25,8 @@ from lidarspec.exports import (
     ExportedFrame,
     ExportError,
     describe_left_out,
+    list_frames,
     make_prefix,
-    messages,
 )
 from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Sensor, tree
@@ -120,16 +120,19 @@ _OPERATIONS = {
 }
 
 
-def number(formula: tree.Formula, scope: Scope) -> str:
+def format_integer(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula as an integer expression."""
     return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula of fields of the last part, which Kaitai calls "_".
+    """Return a formula that Kaitai evaluates after each part, to find the last one.
+
+    Kaitai calls the part that was just read "_".
 
     Args:
-        scope: the scope of the frame around the parts.
+        formula: the formula. A field is in the part, or in the frame if its path begins with "_.".
+        scope: the types around the parts.
     """
 
     def format_field(ref: tree.Ref) -> str:
@@ -141,17 +144,17 @@ def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
 
 
 def to_condition(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula as a condition, true if it is not 0."""
+    """Return a Kaitai condition that is true if the value of a formula is not 0."""
     match formula:
         case tree.Op("not", (operand,)):
             return f"not ({to_condition(operand, scope)})"
         case tree.Op(symbol, (left, right)) if symbol in tree.COMPARISONS:
-            return f"{number(left, scope)} {symbol} {number(right, scope)}"
+            return f"{format_integer(left, scope)} {symbol} {format_integer(right, scope)}"
         case int():
             if formula:
                 return "true"
             return "false"
-    return f"{number(formula, scope)} != 0"
+    return f"{format_integer(formula, scope)} != 0"
 
 
 Attribute = dict[str, Any]
@@ -181,14 +184,14 @@ def block_type(
     ordered = _find_bit_order(block)
     if ordered is None:
         calculated = {
-            _name(part): {"value": _assemble_part(part, "raw")} | doc(part.info)
+            _make_part_name(part): {"value": _assemble_part(part, "raw")} | doc(part.info)
             for part in block.parts
         }
         return [{"id": "raw", "size": block.size}], calculated
     seq: list[Attribute] = []
     instances: dict[str, Attribute] = {}
     for part in ordered[0]:
-        name = _name(part)
+        name = _make_part_name(part)
         width = part.bits.width
         kind: Attribute = {"type": f"b{width}{ordered[1]}"}
         if part.bits.signed:
@@ -201,10 +204,10 @@ def block_type(
     return seq, instances
 
 
-def inline(
+def inline_block(
     block: tree.Block, more: Mapping[str, Any]
 ) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """Return the attribute and the instances of a bit block that is a single integer.
+    """Return (attribute, instances) of a bit block that consists of a single integer.
 
     Returns None for any other block.
 
@@ -221,7 +224,7 @@ def inline(
     if "repeat" in more:
         return None
     return {"id": f"{name}_raw", "size": block.size, **more}, {
-        name: {"value": _assemble_part(part, f"{name}_raw")} | _condition(more)
+        name: {"value": _assemble_part(part, f"{name}_raw")} | _copy_condition(more)
     }
 
 
@@ -240,13 +243,13 @@ def as_block(node: tree.Node) -> tree.Node:
     return tree.Block(node.name, node.info, node.size, (part,))
 
 
-def _name(part: tree.Part) -> str:
+def _make_part_name(part: tree.Part) -> str:
     """Return the name of a part in the type of its block."""
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
 def _list_allowed_values(info: tree.FieldInfo) -> Attribute:
-    """Return the key with the allowed values of a field; {} if there are too many."""
+    """Return the Kaitai entry that lists the allowed values; {} if there are too many."""
     if info.allowed and len(info.allowed) <= MAX_LISTED_VALUES:
         return {"valid": {"any-of": list(info.allowed)}}
     return {}
@@ -260,8 +263,8 @@ def _valid(part: tree.Part) -> Attribute:
     return {"valid": bool(part.info.const) if part.bits.width == 1 else part.info.const}
 
 
-def _condition(more: Mapping[str, Any]) -> Attribute:
-    """Return the "if" of an attribute for use in its instances; {} without an "if"."""
+def _copy_condition(more: Mapping[str, Any]) -> Attribute:
+    """Return the entry "if" of `more` as a dict; {} if there is none."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
@@ -286,9 +289,9 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the possible bit positions of a field's start, one for each segment.
+    """Return the bit position of the field's start that each segment implies.
 
-    The set has one position if Kaitai can read the field as consecutive bits.
+    If all segments imply the same position, Kaitai can read the field as consecutive bits.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -325,7 +328,7 @@ def ksy(sensor: Sensor) -> str:
         ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names
             that differ only in case.
     """
-    frames = messages(sensor)
+    frames = list_frames(sensor)
     main = next((message for message in frames if message.frame.data), frames[0])
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
@@ -398,7 +401,7 @@ class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
-        seals: the seal of each field that contains a checksum, by path.
+        seals: for each field that stores a checksum, by path, the node with the algorithm.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -407,10 +410,10 @@ class _KaitaiWriter:
         """Return the Kaitai type of a struct inside the types of `scope`."""
         kaitai = _KaitaiType()
         for member in node.struct.members:
-            self._member(kaitai, member, (*scope, node.struct.path))
+            self._add_member(kaitai, member, (*scope, node.struct.path))
         return kaitai.done(node.struct.path)
 
-    def _member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
+    def _add_member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add a member to a type; `more` contains further keys of the attribute."""
         node = as_block(node)
         match node:
@@ -430,12 +433,12 @@ class _KaitaiWriter:
                     {"id": identifier(node.name), "size": 0, "valid": {"expr": "false"}, **more}
                 )
             case tree.When(otherwise=tree.Empty()):
-                self._member(
+                self._add_member(
                     kaitai, node.then, scope, **more, **{"if": to_condition(node.condition, scope)}
                 )
             case tree.When():
                 cases = {"1": node.then, "0": node.otherwise}
-                self._switch(
+                self._add_switch(
                     kaitai,
                     node.name,
                     f"{to_condition(node.condition, scope)} ? 1 : 0",
@@ -445,22 +448,24 @@ class _KaitaiWriter:
                 )
             case tree.Select():
                 cases = {str(value): case for value, case in node.cases} | {"_": node.default}
-                self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
+                self._add_switch(
+                    kaitai, node.name, format_integer(node.key, scope), cases, scope, **more
+                )
             case tree.Repeat():
                 self._repeat(kaitai, node, scope, **more)
             case tree.PartSequence():
-                self._parts(kaitai, node, scope, **more)
-            case tree.Block() if (plain := inline(node, more)) is not None:
+                self._add_parts(kaitai, node, scope, **more)
+            case tree.Block() if (plain := inline_block(node, more)) is not None:
                 kaitai.seq.append(plain[0] | self._doc(node.info))
                 kaitai.instances |= plain[1]
-                self._physical(kaitai, node.info, more)
+                self._add_physical(kaitai, node.info, more)
             case tree.Number() | tree.Blob():
-                kaitai.seq.append(self._plain(node, scope) | more)
-                self._physical(kaitai, node.info, more)
+                kaitai.seq.append(self._make_plain(node, scope) | more)
+                self._add_physical(kaitai, node.info, more)
             case _:
                 self._add_typed(kaitai, node.name, node, scope, **more)
 
-    def _parts(
+    def _add_parts(
         self, kaitai: _KaitaiType, node: tree.PartSequence, scope: Scope, **more: Any
     ) -> None:
         """Add the attribute of a sequence of parts, which must all have the same type."""
@@ -472,7 +477,7 @@ class _KaitaiWriter:
         if node.within is not None:
             inner = _KaitaiType(
                 [{"id": "value", "type": "part", "repeat": "eos"}],
-                types={"part": self._type(kind.element, (*scope, None))},
+                types={"part": self._make_type(kind.element, (*scope, None))},
             )
             kaitai.types[name] = inner.done(node.axis)
             kaitai.seq.append({"id": name, "type": name, "size": _size(node.within, scope), **more})
@@ -482,9 +487,9 @@ class _KaitaiWriter:
         elif node.size is not None and kind.following is not None:
             ends = _format_of_last_part(kind.following, scope)
             if "if" in more:
-                condition = f"({more['if']}) and {number(node.size, scope)} != 0"
+                condition = f"({more['if']}) and {format_integer(node.size, scope)} != 0"
             else:
-                condition = f"{number(node.size, scope)} != 0"
+                condition = f"{format_integer(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
         elif kind.until is not None:
             ends = _format_of_last_part(kind.until, scope)
@@ -496,10 +501,10 @@ class _KaitaiWriter:
     ) -> None:
         """Add an attribute, and a new type for it."""
         name = identifier(name)
-        kaitai.types[name] = self._type(node, scope)
+        kaitai.types[name] = self._make_type(node, scope)
         kaitai.seq.append({"id": name, "type": name, **more})
 
-    def _type(self, node: tree.Node, scope: Scope) -> Attribute:
+    def _make_type(self, node: tree.Node, scope: Scope) -> Attribute:
         """Return the Kaitai type of a node.
 
         A node that is neither a struct nor a bit block is the member `value` of the type.
@@ -511,22 +516,24 @@ class _KaitaiWriter:
             kaitai.seq, kaitai.instances = block_type(node, self._doc)
             for part in node.parts:
                 if not part.indices:
-                    self._physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
+                    self._add_physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
             return kaitai.done(node.info.path)
-        self._member(kaitai, _value(node), (*scope, None))
+        self._add_member(kaitai, _name_value(node), (*scope, None))
         return kaitai.done(node.name)
 
     def _repeat(self, kaitai: _KaitaiType, node: tree.Repeat, scope: Scope, **more: Any) -> None:
         more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         element = as_block(node.element)
         if isinstance(element, tree.Number | tree.Blob):
-            kaitai.seq.append(self._plain(element, scope) | {"id": identifier(node.name)} | more)
-        elif isinstance(element, tree.Block) and (plain := inline(element, more)) is not None:
+            kaitai.seq.append(
+                self._make_plain(element, scope) | {"id": identifier(node.name)} | more
+            )
+        elif isinstance(element, tree.Block) and (plain := inline_block(element, more)) is not None:
             kaitai.seq.append(plain[0] | self._doc(element.info))
         else:
             self._add_typed(kaitai, node.name, element, scope, **more)
 
-    def _switch(
+    def _add_switch(
         self,
         kaitai: _KaitaiType,
         name: str,
@@ -545,12 +552,12 @@ class _KaitaiWriter:
             if isinstance(case, tree.Empty):
                 kaitai.types[types[value]] = {"seq": []}
             else:
-                kaitai.types[types[value]] = self._type(case, scope)
+                kaitai.types[types[value]] = self._make_type(case, scope)
         kaitai.seq.append(
             {"id": identifier(name), "type": {"switch-on": key, "cases": types}, **more}
         )
 
-    def _plain(self, node: tree.Number | tree.Blob, scope: Scope) -> Attribute:
+    def _make_plain(self, node: tree.Number | tree.Blob, scope: Scope) -> Attribute:
         """Return the attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
         if isinstance(node, tree.Blob):
@@ -595,7 +602,7 @@ class _KaitaiWriter:
             return {"doc": text}
         return {}
 
-    def _physical(
+    def _add_physical(
         self, kaitai: _KaitaiType, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
     ) -> None:
         """Add instances for the physical value and the name of a field, if it has them."""
@@ -603,12 +610,16 @@ class _KaitaiWriter:
         if info.labels and own:
             kaitai.enums[own] = _make_enum(info.labels)
             number = f"{own}.to_i" if info.bits == 1 else own
-            kaitai.instances[f"{own}_name"] = {"value": number, "enum": own, **_condition(more)}
+            kaitai.instances[f"{own}_name"] = {
+                "value": number,
+                "enum": own,
+                **_copy_condition(more),
+            }
         if info.scaled and own:
             value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
             kaitai.instances[f"{own}_{slug(info.unit) or 'physical'}"] = {
                 "value": value.replace("+ -", "- "),
-                **_condition(more),
+                **_copy_condition(more),
             }
 
 
@@ -630,10 +641,10 @@ def _make_enum(labels: Mapping[int, str]) -> Attribute:
 def _size(formula: tree.Formula, scope: Scope) -> int | str:
     if isinstance(formula, int):
         return formula
-    return number(formula, scope)
+    return format_integer(formula, scope)
 
 
-def _value(node: tree.Node) -> tree.Node:
+def _name_value(node: tree.Node) -> tree.Node:
     """Return an array element, or an alternative, as a member named `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]

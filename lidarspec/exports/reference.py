@@ -264,9 +264,10 @@ def _decode_example(sensor: Sensor, name: str) -> PointCloud | None:
 
 
 def _list_channels(cloud: PointCloud) -> Sequence[tuple[str, str]]:
-    """Return the number and the elevation of each channel.
+    """Return the number and the elevation of each channel as texts.
 
-    Returns an empty list if an elevation varies, or if there are too many channels.
+    Returns an empty list if the points of a channel have different elevations, or if there are too
+    many channels.
     """
     if cloud.ring is None:
         return []

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from lidarspec.exports import ExportedFrame, ExportError, messages
+from lidarspec.exports import ExportedFrame, ExportError, list_frames
 from lidarspec.frames.commands import argument_slot, list_choices
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_table import describe_field, unit_text
@@ -54,7 +54,7 @@ def pyi(sensor: Sensor) -> str:
     Raises:
         ExportError: if a frame contains Python code, or two frame types have the same class name.
     """
-    frames = messages(sensor, on_wire=False)
+    frames = list_frames(sensor, on_wire=False)
     names = {message.name: to_class_name(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise ExportError(f"{sensor.id}: two frame types have the same class name")
@@ -66,7 +66,7 @@ def pyi(sensor: Sensor) -> str:
     parts = [
         _HEAD.format(id=sensor.id, title=_quote(f"{sensor.vendor} {sensor.model}")),
         *classes.done,
-        _sensor(sensor, frames, names),
+        _write_sensor(sensor, frames, names),
     ]
     return "\n\n".join(part.rstrip() + "\n" for part in parts)
 
@@ -109,7 +109,11 @@ class _StubClasses:
         while name in self.taken:
             name += "_"
         self.taken.add(name)
-        lines = [line for member in self._members(node) for line in self._attribute(name, *member)]
+        lines = [
+            line
+            for member in self._write_members(node)
+            for line in self._write_attribute(name, *member)
+        ]
         self.done.append(
             "\n".join(
                 [f"class {name}:", f'    """{_quote(docstring)}"""', "", *(lines or ["    ..."])]
@@ -117,7 +121,7 @@ class _StubClasses:
         )
         return name
 
-    def _members(
+    def _write_members(
         self, node: Struct | Sealed | Block
     ) -> Iterator[tuple[str, Node | list[FieldInfo]]]:
         if isinstance(node, Struct | Sealed):
@@ -126,7 +130,7 @@ class _StubClasses:
             for name in dict.fromkeys(part.names[0] for part in node.parts):
                 yield name, [part.info for part in node.parts if part.names[0] == name]
 
-    def _attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
+    def _write_attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
         """Return the lines of a member.
 
         Args:
@@ -204,15 +208,15 @@ def _bytes_type(info: FieldInfo) -> str:
     return {"i": "int", "u": "int", "f": "float"}.get(info.adapter.dtype.kind, "Any")
 
 
-def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
+def _write_sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
     """Return the class with the sensor's `parse`, `build`, `example` and `command`."""
     parses = "\n".join(
         f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSE_OPTIONS})'
         f" -> {name}: ..."
         for frame, name in names.items()
     )
-    builds = "\n".join(_build(message) for message in frames)
-    commands = "\n".join(_command(sensor, name) for name in sensor.commands)
+    builds = "\n".join(_write_build(message) for message in frames)
+    commands = "\n".join(_write_command(sensor, name) for name in sensor.commands)
     if len(sensor.commands) > 0:
         rest = "    @overload\n    def command(self, _name: str, /, **arguments: Any) -> bytes: ..."
     else:
@@ -236,7 +240,7 @@ class {to_class_name(sensor.id)}(Sensor):
 {rest}'''
 
 
-def _build(message: ExportedFrame) -> str:
+def _write_build(message: ExportedFrame) -> str:
     """Return the signature of `build` with the fields of one frame type."""
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."
@@ -255,7 +259,7 @@ def _build(message: ExportedFrame) -> str:
     )
 
 
-def _command(sensor: Sensor, name: str) -> str:
+def _write_command(sensor: Sensor, name: str) -> str:
     args = "".join(
         f", {argument}: {_argument_type(sensor, name, argument)}"
         for argument in sensor.commands[name].args

@@ -24,9 +24,9 @@ from lidarspec.exports import (
     ExportedFrame,
     ExportError,
     describe_left_out,
-    find_held_formulas,
     find_references,
-    messages,
+    find_required_formulas,
+    list_frames,
 )
 from lidarspec.frames.layout_tree import find_prefix
 from lidarspec.framing.frame_engine import get_codec
@@ -146,13 +146,15 @@ class _TableWriter:
         prefix: the text before the path of a field in Wireshark's filters.
         kept: the paths of the fields that formulas or checksums use.
         marked: the paths of the first and the last part that each checksum covers.
-        types: the type family of each Wireshark field, by its name in filters.
+        types: for each Wireshark field, by its name in filters, the family of its type ("uint").
     """
 
     def __init__(self, message: ExportedFrame, prefix: str) -> None:
         self.message = message
         self.prefix = prefix
-        lengths = {path for node in tree.nodes(message.root) for path in find_held_formulas(node)}
+        lengths = {
+            path for node in tree.nodes(message.root) for path in find_required_formulas(node)
+        }
         self.kept = (
             {ref.path for ref in find_references(message.root)} | message.seals.keys() | lengths
         )
@@ -167,24 +169,24 @@ class _TableWriter:
         """
         match node:
             case tree.Number():
-                return self._number(node)
+                return self._make_number_table(node)
             case tree.Blob():
-                return self._blob(node)
+                return self._make_blob_table(node)
             case tree.Block():
-                return self._block(node)
+                return self._make_block_table(node)
             case tree.Struct():
-                return self._struct(node)
+                return self._make_struct_table(node)
             case tree.Sealed():
                 return {
                     "kind": "sealed",
                     "name": node.name or None,
                     "body": self.node(node.body),
-                    "seal": self._seal(node),
+                    "seal": self._make_seal_table(node),
                 }
             case tree.Repeat():
-                return self._repeat(node, path)
+                return self._make_repeat_table(node, path)
             case tree.PartSequence():
-                return self._parts(node)
+                return self._make_parts_table(node)
             case tree.When():
                 then = self.node(node.then, path)
                 otherwise = self.node(node.otherwise, path)
@@ -216,8 +218,8 @@ class _TableWriter:
             case tree.Empty() | tree.Derived() | tree.Opaque():
                 return {"kind": "empty", "skip": 0}
 
-    def _number(self, node: tree.Number) -> Table:
-        width = _width(8 * node.size)
+    def _make_number_table(self, node: tree.Number) -> Table:
+        width = _find_width(8 * node.size)
         kind = {
             "uint": f"UINT{width}",
             "int": f"INT{width}",
@@ -230,7 +232,7 @@ class _TableWriter:
         }
         return table | {"skip": self._skip(node.info, node.size)}
 
-    def _blob(self, node: tree.Blob) -> Table:
+    def _make_blob_table(self, node: tree.Blob) -> Table:
         if node.ending is not None:
             raise ExportError(f"{node.info.path}: the end of the bytes is found by their content")
         name = node.name or "constant"
@@ -255,9 +257,9 @@ class _TableWriter:
             )
         }
 
-    def _block(self, node: tree.Block) -> Table:
-        order = _word_order(node)
-        parts = [self._part(node, part, order) for part in node.parts]
+    def _make_block_table(self, node: tree.Block) -> Table:
+        order = _find_word_order(node)
+        parts = [self._make_part_table(node, part, order) for part in node.parts]
         looked_at = any(
             part[fact] is not None for fact in ("keep", "const", "allowed") for part in parts
         )
@@ -271,7 +273,7 @@ class _TableWriter:
             "parts": parts,
         }
 
-    def _part(self, block: tree.Block, part: tree.Part, order: str | None) -> Table:
+    def _make_part_table(self, block: tree.Block, part: tree.Part, order: str | None) -> Table:
         offsets = [segment.byte for segment in part.bits.segments]
         is_masked = order is not None and part.bits.width < 8 * block.size
         if order is not None and is_masked:
@@ -280,7 +282,7 @@ class _TableWriter:
                 _find_lowest_bit(part.bits, block.size, order) or 0
             )
         else:
-            bits = _width(part.bits.width)
+            bits = _find_width(part.bits.width)
             mask = None
         kind = f"INT{bits}" if part.bits.signed else f"UINT{bits}"
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
@@ -299,7 +301,7 @@ class _TableWriter:
             **self._number_entries(part.info, kind, mask),
         }
 
-    def _struct(self, node: tree.Struct) -> Table:
+    def _make_struct_table(self, node: tree.Struct) -> Table:
         members = []
         for member in node.members:
             path = ".".join(filter(None, (node.path, member.name)))
@@ -310,12 +312,12 @@ class _TableWriter:
         inside = {
             path: value
             for below in tree.nodes(node)
-            for path, value in find_held_formulas(below).items()
+            for path, value in find_required_formulas(below).items()
         }
         lengths = [
             {"path": path, "value": _format_function(value, " or 0")}
             for path, value in inside.items()
-            if node.path == _common_path(path, *(ref.path for ref in tree.refs(value)))
+            if node.path == _find_common_path(path, *(ref.path for ref in tree.refs(value)))
         ]
         return {
             "kind": "struct",
@@ -325,7 +327,7 @@ class _TableWriter:
             "lengths": lengths or None,
         }
 
-    def _repeat(self, node: tree.Repeat, path: str) -> Table:
+    def _make_repeat_table(self, node: tree.Repeat, path: str) -> Table:
         element = self.node(node.element, path)
         size = element.get("skip")
         if isinstance(node.count, int) and size is not None:
@@ -346,7 +348,7 @@ class _TableWriter:
             "element": element,
         }
 
-    def _parts(self, node: tree.PartSequence) -> Table:
+    def _make_parts_table(self, node: tree.PartSequence) -> Table:
         kinds = []
         for kind in node.kinds:
             if kind.until is not None:
@@ -424,10 +426,10 @@ class _TableWriter:
         labels: Any = None,
         mask: int | None = None,
     ) -> LuaCode:
-        """Return Lua code that declares a Wireshark field, and store its type family.
+        """Return Lua code that declares a Wireshark field, and add the field to `types`.
 
-        Wireshark requires the same type family for all fields with one name, so a name that is used
-        with another family gets "_" appended.
+        Wireshark requires that fields with the same name have types of the same family. If a field
+        with this name has another family, "_" is appended to the new name.
         """
         family = "".join(letter for letter in kind if letter.isalpha())
         if kind.endswith("64"):
@@ -459,10 +461,10 @@ class _TableWriter:
             return None
         return size
 
-    def _seal(self, node: tree.Sealed) -> Table:
+    def _make_seal_table(self, node: tree.Sealed) -> Table:
         widths = {info.path: info.bits for below in tree.nodes(node) for info in tree.infos(below)}
         return {
-            **_algorithm(node.algorithm),
+            **_make_algorithm_table(node.algorithm),
             "fields": [{"path": path, "width": widths[path]} for path in node.fields],
             "first": node.over[0] if node.over else None,
             "last": node.over[1] if node.over else None,
@@ -472,7 +474,7 @@ class _TableWriter:
         }
 
 
-def _algorithm(algorithm: Checksum) -> Table:
+def _make_algorithm_table(algorithm: Checksum) -> Table:
     match algorithm:
         case Crc():
             digits = {name: f"{getattr(algorithm, name):x}" for name in ("poly", "init", "xorout")}
@@ -499,7 +501,7 @@ def _algorithm(algorithm: Checksum) -> Table:
                 raise ExportError(
                     "Wireshark does not support a checksum over data that is padded twice"
                 )
-            return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
+            return {**_make_algorithm_table(algorithm.algorithm), "pad": algorithm.to}
     raise ExportError(
         f"the checksum {type(algorithm).__name__} is Python code and cannot be exported to"
         " Wireshark"
@@ -519,7 +521,7 @@ def _list_numbers(node: tree.Node) -> list[tree.Node | tree.Part]:
     ]
 
 
-def _common_path(*paths: str) -> str:
+def _find_common_path(*paths: str) -> str:
     """Return the path of the innermost struct that contains all of these fields."""
     parents = [path.split(".")[:-1] for path in paths]
     depth = next(
@@ -533,15 +535,14 @@ def _common_path(*paths: str) -> str:
     return ".".join(parents[0][:depth])
 
 
-def _width(bits: int) -> int:
+def _find_width(bits: int) -> int:
     return next(width for width in (8, 16, 24, 32, 64) if bits <= width)
 
 
-def _word_order(block: tree.Block) -> str | None:
-    """Return the byte order in which Wireshark can show the parts of a block as masks.
+def _find_word_order(block: tree.Block) -> str | None:
+    """Return the byte order in which each part of a block is a bit mask of one word.
 
-    In this order, the bits of each part are contiguous in one word. Returns None if no byte order
-    fits or if the block has more than 4 bytes.
+    Returns None if there is no such byte order, or if the block has more than 4 bytes.
     """
     orders = (
         order
@@ -625,7 +626,7 @@ def dissector(sensor: Sensor) -> str:
     # match both directions are shown as incoming. Types with more constants come before others,
     # because they match less often by chance.
     by_direction = sorted(
-        messages(sensor),
+        list_frames(sensor),
         key=lambda message: (message.frame.direction, -len(get_codec(message.frame).prefix)),
     )
     about = {
@@ -633,8 +634,8 @@ def dissector(sensor: Sensor) -> str:
         "has_udp": any(isinstance(link, Udp) for link in sensor.links.values()),
         "is_stream": any(isinstance(link, Udp) and link.stream for link in sensor.links.values()),
         "announcing": {frame.after: True for frame in sensor.frames.values() if frame.after},
-        "places": _list_patterns(sensor),
-        "frames": [_frame(message, name) for message in by_direction],
+        "places": _list_ports(sensor),
+        "frames": [_make_frame_entry(message, name) for message in by_direction],
     }
     left_out = describe_left_out(sensor)
     head = _HEAD.format(
@@ -651,7 +652,7 @@ def dissector(sensor: Sensor) -> str:
     return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 
 
-def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
+def _make_frame_entry(message: ExportedFrame, name: str) -> dict[str, Any]:
     prefix = get_codec(message.frame).prefix
     return {
         "name": message.name,
@@ -664,7 +665,7 @@ def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
     }
 
 
-def _list_patterns(sensor: Sensor) -> dict[str, list[int]]:
+def _list_ports(sensor: Sensor) -> dict[str, list[int]]:
     """Return the ports or link types of a sensor, by the name of Wireshark's table."""
     links = sensor.links.values()
     patterns = {

@@ -12,7 +12,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Sensor, UsageError
-from lidarspec.exports import ExportError, UnknownExport, export, messages
+from lidarspec.exports import ExportError, UnknownExport, export, list_frames
 from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.exports.oddities import SENSOR
@@ -82,7 +82,7 @@ def test_c_has_no_place_for_elements_that_differ_in_size_and_no_number_for_all_p
 
 def test_a_function_that_only_calculates_is_written_down() -> None:
     counted = with_frame("list" / Array(lambda context: 2 * context.a - 1, Int8ub))
-    (found,) = [node for node in nodes(messages(counted)[0].root) if isinstance(node, Repeat)]
+    (found,) = [node for node in nodes(list_frames(counted)[0].root) if isinstance(node, Repeat)]
     assert isinstance(found.count, Op)
     inner, one = found.count.args
     assert (found.count.symbol, one) == ("-", 1)
