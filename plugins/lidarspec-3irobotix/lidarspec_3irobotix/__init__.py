@@ -4,9 +4,10 @@ Lidars of vacuum cleaners, which send without a request. The host drives the mot
 
 Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
 packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
-angle of its first sample. Its span is 360 degrees divided by the packets per revolution, which are
-16, or 15 for a 2G. One driver computes the sum modulo FFFF (hexadecimal) instead of modulo 10000,
-which is an error. The zero offset in the packets is not added to the angles, as in the drivers.
+angle of its first sample. A packet covers 360 degrees divided by the number of packets per
+revolution, which is 16, or 15 for a 2G. One driver computes the sum modulo FFFF (hexadecimal)
+instead of modulo 10000, which is an error. The zero offset in the packets is not added to the
+angles, as in the drivers.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ SPEED_STRUCT = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """Return whether both lengths agree, samples exist, and angle and version are valid."""
+    """Return whether sizes, start angle and version are valid, and samples exist."""
     return (
         (f.length == f.size + 8)
         & (f.size > 5)
@@ -88,7 +89,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, packets: int) -> Polar:
-    """Return points at even steps, clockwise, over the span of a packet.
+    """Return points at even steps, clockwise, over the angle that a packet covers.
 
     `packets` is the number of packets per revolution.
     """
@@ -106,10 +107,10 @@ def points(f: Fields, packets: int) -> Polar:
 
 
 def starts_on_grid(f: Fields, packets: int) -> Any:
-    """Return whether the start angle is a multiple of a packet's span, but not 0.
+    """Return whether the start angle is a multiple of a packet's angle, but not 0.
 
-    `packets` is the number of packets per revolution, and the span 360 degrees / `packets`. An
-    angle of 0 does not identify a model, since it is a multiple of all spans.
+    A packet covers 360 degrees divided by `packets`, the number of packets per revolution. The
+    start angle 0 is left out, because it does not identify a model.
     """
     return (f.start_angle > 0) & (f.start_angle % (360 / packets) == 0)
 

@@ -1,4 +1,4 @@
-"""Tests of 3iRobotix Delta: packets of a real unit, their span, and the 2G model."""
+"""Tests of 3iRobotix Delta: packets of a real unit, wrong lengths, and the 2G."""
 
 from __future__ import annotations
 
