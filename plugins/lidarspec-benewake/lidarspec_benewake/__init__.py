@@ -146,7 +146,7 @@ def make_action(number: int) -> Command:
 
 
 def make_setting(number: int, value: int, **more: Any) -> Command:
-    """Return the command that sets a value, which the reply repeats."""
+    """Return the command that sets a value; the reply repeats the id and the value."""
     return Command(
         "set",
         {"id": number, "value": value},
