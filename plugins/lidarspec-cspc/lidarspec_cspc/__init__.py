@@ -16,10 +16,11 @@ or have one sample (the formula divides by LSN - 1), and no command for the anno
 5.5 and 7 Hz. A COIN-D4 sends the fillers FE and FF, and FA FA once, which no manual mentions.
 
 Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
-captures: 10 revolutions a second, 400 points each, and an unexplained frame every three seconds.
-Both are assumed to report their model name. The M1C1_Mini of the manual's edition v1.1 is a
-separate sensor: samples of two bytes, replies that begin with AA 55, no exposure, and packets
-without the rotation speed. The M1CT_Coin_Plus, which sends Camsense's packets, is left out.
+captures: 10 revolutions a second, 400 points per revolution, and an unexplained frame every three
+seconds. A COIN-D4A and a COIN-D6 are assumed to report their model names. The M1C1_Mini of the
+manual's edition v1.1 is a separate sensor: samples of two bytes, replies that begin with AA 55, no
+exposure, and packets without the rotation speed. The M1CT_Coin_Plus, which sends Camsense's
+packets, is left out.
 """
 
 from __future__ import annotations
@@ -264,8 +265,8 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
     Uncorrected angles are evenly spaced from FSA to LSA, relative to the zero direction of the
     data. Corrected angles (manual 2.2.3) are clockwise from the zero direction of the data, or from
     the mark on the housing if `zero` is "housing". If the sensor reports that it does not turn
-    clockwise, the sent
-    angles are assumed to be counter-clockwise; the manual describes only clockwise rotation.
+    clockwise, the sent angles are assumed to be counter-clockwise; the manual describes only
+    clockwise rotation.
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     corrected = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
@@ -303,10 +304,9 @@ def configure(
 ) -> Sensor:
     """Return a sensor with angles from the zero direction of the data or the housing.
 
-    The angles in packets count from the zero direction of the data, which is 12 degrees clockwise
-    from the
-    mark on the housing. Source: manual 2.2.2, bytes 13 and 14, for the angle; its edition v1.1,
-    page 4, for the direction. Whether the host should add the angle is not documented.
+    Angles are sent relative to the zero direction of the data. On an M1C1_Mini, this direction is
+    12 degrees clockwise from the mark on the housing (manual 2.2.2, bytes 13 and 14; edition v1.1,
+    page 4, for the direction). The manual does not state whether the host should add these degrees.
     """
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
@@ -369,11 +369,12 @@ class Turning:
 
 
 def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
-    """Return the values from packet i on, with a new speed after this revolution.
+    """Return the sweep from packet i on; its speed changes after the revolution.
 
     Args:
-        sweep: the values so far.
-        hertz: revolutions per second; the sensor measures as many points per second as before.
+        sweep: the sweep before packet i.
+        i: the number of the packet.
+        hertz: the new revolutions per second. The points per second do not change.
     """
     values = map(sweep, itertools.count(i))
     before = tuple(itertools.takewhile(lambda packet: not packet["mt.start"], values))
@@ -432,10 +433,10 @@ def has_customer_firmware(f: Fields) -> Any:
 
 
 def has_bits_beside_firmware(f: Fields) -> Any:
-    """Return whether the upper bits of M&T are set, and are not the customer firmware.
+    """Return whether the upper bits of M&T have a value other than the firmware.
 
-    The firmware is sent in the packet after a start packet, and is the same in each revolution. The
-    first packet of a batch is ignored, because the packet before it is not known.
+    The customer firmware is sent in the packet after a start packet, and is the same in each
+    revolution. The first packet of a batch is ignored, because the packet before it is not known.
     """
     begins = np.asarray(f.mt.start == 1)
     values = np.asarray(f.mt.m)
@@ -575,7 +576,8 @@ M1C1_MINI_V11 = Sensor(
 def make_coin(model: str, **facts: Any) -> Sensor:
     """Return a sensor of the COIN series, which measures by time of flight.
 
-    It is an M1C1_Mini without correction of the angles, changed by `facts`, arguments of `Sensor`.
+    It is derived from the M1C1_Mini, and its angles need no correction. `facts` are the arguments
+    of `Sensor` that this model changes.
     """
     name = f"cspc-{model.lower()}"
     return dataclasses.replace(

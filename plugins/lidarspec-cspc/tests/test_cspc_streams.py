@@ -30,7 +30,7 @@ EVENTS = {"ack": "ack_50", "info": "info_01", "scan_start": "info_81"}
 
 
 def turn(*, start: int = 0, number: int = 17) -> bytes:
-    """Return packets along the sensor's sweep, all at 1 m."""
+    """Return `number` simulated packets from packet `start` on, all at 1 m."""
     frames = []
     for i in range(start, start + number):
         values = SENSOR.simulation.sweep(i) if SENSOR.simulation.sweep else {}
@@ -44,8 +44,8 @@ def turn(*, start: int = 0, number: int = 17) -> bytes:
     return b"".join(frames)
 
 
-def event(found: ls.Found) -> str:
-    """Return the name of a frame in the vectors."""
+def name_event(found: ls.Found) -> str:
+    """Return the name that the vectors use for a frame."""
     if found.frame != "data":
         return EVENTS[found.frame]
     parsed = SENSOR.parse(found.data)
@@ -56,7 +56,7 @@ def event(found: ls.Found) -> str:
 def test_a_start_up_in_order(name: str) -> None:
     sensor = SENSOR if name.startswith("cspc") else COIN
     data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
-    assert [event(found) for found in sensor.split(data)] == expected["events"]
+    assert [name_event(found) for found in sensor.split(data)] == expected["events"]
     stats = decode(sensor, data).stats
     assert (stats.bytes_filler, stats.bytes_skipped - stats.bytes_filler) == (
         expected["fill"],

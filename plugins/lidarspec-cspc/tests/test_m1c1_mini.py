@@ -138,7 +138,7 @@ class Running:
         self.device.receive(SENSOR.command(command), self.now)
 
     def read(self, seconds: float) -> bytes:
-        """Return the bytes of the next seconds."""
+        """Return the bytes that the sensor sends in the next `seconds`."""
         end = self.now + round(seconds * SECOND)
         data = b""
         while self.now < end:
