@@ -138,7 +138,7 @@ class Mirror(Calibration):
         )
 
     def to_file(self) -> bytes:
-        """Return the angles in the unit's file format."""
+        """Return the angles as a correction file (.dat)."""
         start = np.rint(self.faces * AZIMUTH_STEPS_PER_DEG).astype(int).tolist()
         no_adjustment = bytes(LASERS * 180)
         values = {
@@ -196,9 +196,10 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Return the points of a packet. The last shot is at the packet's time (nebula).
+    """Return the points of a packet; the last shot is at the packet's time (nebula).
 
-    Azimuths are measured from the start of the last face, clockwise from the left.
+    Clockwise from the left, the azimuth of a point is twice the angle of the mirror from the start
+    of the face, plus the azimuth and the correction of the channel.
     """
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]

@@ -88,7 +88,7 @@ class Calibration:
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
 
     def to_file(self) -> bytes:
-        """Return the angles in the unit's file format."""
+        """Return the angles as a correction file (CSV)."""
         rows = zip(self.elevation, self.azimuth, strict=True)
         return "".join(
             [
@@ -151,12 +151,12 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
     headings and the hash below the table are ignored.
 
     Args:
-        wanted: the columns, with the values of the model. The values of the unit must have a
-            similar spread, which means the difference between the highest and the lowest value.
+        wanted: the columns to read, each with the nominal values of the model.
 
     Raises:
-        UsageError: if the file cannot be read, or does not have one value in these columns for
-            every channel of the model. The error has the line and column.
+        UsageError: if the file cannot be read, does not have one value in these columns for every
+            channel of the model, or if `check_spread` rejects a column. The error has the line and
+            column.
     """
     (line, headings), *rows = read_rows(path)
     indexes = [find_column(path, line, headings, column) for column in (CHANNEL, *wanted)]
@@ -284,9 +284,10 @@ def check_spread(
     table: Table,
     nominal_values: Table,
 ) -> None:
-    """Raise UsageError if the spread of values differs greatly from that of the model.
+    """Raise UsageError if the spread of `table` differs greatly from the model's.
 
-    Values are not checked if the spread of the model is at most 1.
+    The spread is the difference between the highest and the lowest value. Columns with a nominal
+    spread of at most 1 are not checked.
     """
     spread = float(np.ptp(table))
     nominal_spread = float(np.ptp(nominal_values))

@@ -10,7 +10,7 @@ The models differ in the status. The CRCs are probably the same as in packets of
 captured packet was available, so they are not verified. The operational state and the azimuth state
 of the block determine which channels fire and when; each of sixteen groups of eight channels has
 common firing times. Below 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in
-these tables.
+the tables of this module.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
@@ -190,7 +190,7 @@ def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
 
     Args:
         last: the time from the packet's time to the last shot, seconds.
-        times: the firing times of the channels in each state, (states, channels) s.
+        times: the firing times of the channels in each state, (states, channels), seconds.
     """
     block = np.arange(BLOCKS)[:, None]
     returns = count_returns(f.return_mode)
@@ -215,12 +215,22 @@ def sweep(i: int, status: int) -> dict[str, Any]:
 
 
 def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
-    """Return the firing times of the channels in each state, (states, channels) s."""
+    """Return the firing time of each channel in each state, (states, channels).
+
+    Times are in seconds.
+
+    Args:
+        groups: the letter of the group of each channel.
+        times_us: the firing times of a group, one for each state.
+    """
     return np.array([times_us[group] for group in groups]).T * 1e-6
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return the other models that send these packets, with another status."""
+    """Return how to recognize the other models that send these packets, by id.
+
+    Their packets have another status. `own` is the id of this model.
+    """
     others = {
         "hesai-pandar128": Relative(
             "a status_version below 128", lambda f: f.status_version < MIN_OT128_STATUS

@@ -94,7 +94,7 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 
 def pace(f: Fields, blocks: int) -> Any:
-    """Return the time that the shots of a packet take, seconds (HesaiLidar_SDK_2.0)."""
+    """Return the duration of the shots of a packet in seconds (HesaiLidar_SDK_2.0)."""
     return SHOT_PERIOD_S * blocks / count_returns(f.return_mode)
 
 

@@ -722,10 +722,7 @@ AT128_FILE = at128.TABLE.to_file()
 
 
 def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
-    """Two steps of the file are 0.04 degrees.
-
-    Corrections are interpolated between the entries at 172 and 174 degrees.
-    """
+    """The corrections at 173.5 degrees are interpolated from those at 172 and 174."""
     adjust = bytearray(128 * 180)
     adjust[0 * 180 + 86], adjust[0 * 180 + 87] = 10, 0xFC  # 0.2 and -0.08 degrees of channel 0
     start = [295_360, 1_836_032, 3_368_102]  # 23.075, 143.44 and 263.133 degrees

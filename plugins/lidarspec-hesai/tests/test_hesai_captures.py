@@ -1,9 +1,11 @@
 """Tests of Hesai captures: our points are the published points, and no others.
 
-Each published cloud is one revolution in the vendor's axes. It is cut where the azimuth of a point
-(not of its block) passes 0. It has no second return with the same position as the first, and no
-point nearer than its nearest one. So these tests sort our points of all packets into revolutions by
-their own azimuths, and count them by position.
+A published cloud is one revolution in the vendor's axes. It begins where the azimuth of a point
+(not of its block) passes 0. It has no second return at the position of the first return, and no
+points below a minimum range.
+
+The tests therefore assign our points to revolutions by the azimuth of each point, leave out points
+that are nearer than the nearest published point, and compare distinct positions.
 """
 
 from __future__ import annotations
@@ -48,9 +50,9 @@ def read_published_points(name: str) -> Points:
 
 
 def nearest(points: Points, queries: Points) -> NDArray[np.float64]:
-    """Return the distance from each query to the nearest point; inf beyond REACH.
+    """Return the distance from each query to the nearest point; inf beyond `REACH`.
 
-    Points are sorted into cells of that size.
+    The points are sorted into cells of the size `REACH`, so that only adjacent cells are searched.
     """
 
     def codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -71,7 +73,7 @@ def nearest(points: Points, queries: Points) -> NDArray[np.float64]:
 
 
 def turns(cloud: PointCloud) -> NDArray[np.intp]:
-    """Return how often each point's own azimuth has passed 0 since the first point."""
+    """Return how often the azimuth has passed 0 since the first point, for each point."""
     assert cloud.shape is not None
     clockwise = np.rad2deg(-cloud.azimuth.astype(np.float64)).reshape(cloud.shape)
     return np.asarray(np.unwrap(clockwise, axis=0, period=360) // 360, np.intp).ravel()
