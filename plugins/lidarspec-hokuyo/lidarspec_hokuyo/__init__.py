@@ -63,7 +63,7 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 
 
 def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
-    """Return how to distinguish a scanner from another scanner."""
+    """Return how to recognize a scanner with the geometry `other`."""
     if own.last == other.last:
         return "the scans are identical; the reply to get_parameters names the model"
     if other.last > own.last:
@@ -113,10 +113,10 @@ def configure(
             f"{sensor.id}: the steps must be from 0 to {geometry.end}, and the cluster from 1 to"
             f" 99, got {steps.text.decode()}"
         )
-    return dataclasses.replace(sensor, **make_scan_parts(sensor.id, content, steps))
+    return dataclasses.replace(sensor, **make_scan_arguments(sensor.id, content, steps))
 
 
-def make_scan_parts(name: str, kind: str, steps: RequestedSteps) -> dict[str, Any]:
+def make_scan_arguments(name: str, kind: str, steps: RequestedSteps) -> dict[str, Any]:
     """Return the arguments of `Sensor` that depend on the requested scans."""
     model, geometry, limits, _, _ = MODELS[name]
     limits_mm = {"shortest": f"{limits[0] * 1000:g}", "longest": f"{limits[1] * 1000:g}"}
@@ -159,7 +159,7 @@ def make_scanner(name: str) -> Sensor:
         scan=OnChange("time"),
         clock=Clock("time", wraps_at=CLOCK_WRAP_S, pace=partial(pace, rate=geometry.rate)),
         links={"data": link},
-        **make_scan_parts(name, "distances", RequestedSteps(geometry.first, geometry.last, 1)),
+        **make_scan_arguments(name, "distances", RequestedSteps(geometry.first, geometry.last, 1)),
         on_open=("stop", "start"),
         on_close=("stop",),
         configure=configure,

@@ -70,9 +70,9 @@ VALUE_REPLIES = {f"get_{name}": name for name in REPORTED_VALUES}
 
 @dataclass(frozen=True)
 class LineCheck(Checksum):
-    """The check character of a line: the lowest six bits of a sum, plus 0x30.
+    """The check character of a line: 0x30 plus the lowest six bits of a sum.
 
-    The sum is that of all characters of the line, except the semicolon at its end.
+    The sum covers all characters before the semicolon.
     """
 
     width: int = 8
@@ -97,7 +97,7 @@ def make_line(name: str, letters: str) -> Construct:
 def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
     """Return the frame of a reply with these lines.
 
-    `lines` maps the name of each line to its first four letters.
+    `lines` maps the field name of each line to the four letters with which the line begins.
     """
     struct = Struct(
         "head" / Const(command + b"\n00P\n"),

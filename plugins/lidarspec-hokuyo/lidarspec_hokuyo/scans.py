@@ -82,12 +82,12 @@ class RequestedSteps:
 
 
 def make_decimal(name: str, places: int, most: int = 9999) -> Any:
-    """Return the struct of a decimal number with `places` digits, each a field.
+    """Return the struct of a decimal number, with a field for each digit.
 
     Args:
         name: the name of the field.
         places: the number of digits.
-        most: the largest number; the first digit is at most the first digit of this number.
+        most: the largest number, which limits the first of four digits.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
@@ -103,12 +103,12 @@ def decimal_value(digits: Any) -> Any:
 
 
 def two_digit_value(digits: Any) -> Any:
-    """Return the value of the last two digits."""
+    """Return the value of the tens and ones of a `make_decimal` struct."""
     return digits.tens * 10 + digits.ones
 
 
 def split_digits(name: str, value: int, places: int) -> dict[str, int]:
-    """Return the digits of a number by their field path."""
+    """Return the digits of `value`, keyed by their paths in the struct `name`."""
     return {
         f"{name}.{digit_name}": int(digit)
         for digit_name, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
