@@ -39,7 +39,11 @@ MAX_STEP_S = 0.2
 
 
 class Pin(Protocol):
-    """A PWM output, as gpiozero's `PWMOutputDevice`: `value` is the duty cycle, 0 to 1."""
+    """A PWM output, for example a `PWMOutputDevice` of gpiozero.
+
+    Attributes:
+        value: the duty cycle, 0 to 1.
+    """
 
     value: float
 
@@ -70,7 +74,7 @@ class LinuxPwm:
 
 
 class SpeedControl:
-    """Corrects the duty cycle by the reported speed: a proportional and integral controller.
+    """A proportional and integral controller of the speed.
 
     Args:
         pin: the PWM output.
@@ -83,7 +87,10 @@ class SpeedControl:
         self._duty = START_DUTY
 
     def begin(self) -> None:
-        """Output the duty cycle that begins external control; keep it for `START_S` seconds."""
+        """Output the duty cycle that begins external control.
+
+        The sensor needs this duty cycle for `START_S` seconds.
+        """
         self._pin.value = START_DUTY
 
     def update(self, measured_hz: float, seconds: float) -> None:

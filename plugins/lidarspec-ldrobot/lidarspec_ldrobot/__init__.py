@@ -62,12 +62,12 @@ MS200_POINT_RATE_HZ = 4_500
 CRC8 = Crc(width=8, poly=0x4D)
 
 
-def with_crc(*members: Any) -> Checksummed:
-    """Return a frame that ends with its CRC."""
+def add_crc(*members: Any) -> Checksummed:
+    """Return the struct with these members, followed by their CRC."""
     return Checksummed(Struct(*members, "crc" / Int8ul), field="crc", algorithm=CRC8)
 
 
-DATA = with_crc(
+DATA = add_crc(
     "header" / Const(b"\x54\x2c") * "start byte 0x54; type 1 and 12 points",
     "speed" / Scaled(Int16ul, 1, "deg/s"),
     "start_angle" / Scaled(Int16ul, 0.01, "deg"),
@@ -82,11 +82,11 @@ DATA = with_crc(
     "end_angle" / Scaled(Int16ul, 0.01, "deg"),
     "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts at 30 s",
 )
-HEALTH = with_crc(
+HEALTH = add_crc(
     "header" / Const(b"\x54\xe0"),
     "error" / Enum(Int8ul, none=0, motor_blocked=1, occluded=2, both=3),
 )
-INFO = with_crc(
+INFO = add_crc(
     "header" / Const(b"\x54\x0f"),
     "speed" / Scaled(Int16ul, 1, "deg/s"),
     "product_version" / Int16ul,
@@ -97,7 +97,7 @@ INFO = with_crc(
 )
 #: Codes of commands; "get_firmware" returns the firmware of the motor's board.
 CODES = {"start": 0xA0, "stop": 0xA1, "set_speed": 0xA2, "get_firmware": 0xA8}
-COMMAND = with_crc(
+COMMAND = add_crc(
     "header" / Const(b"\x54"),
     "command" / Enum(Int8ul, **CODES),
     "length" / Const(4, Int8ul),
@@ -114,10 +114,10 @@ def plausible(f: Fields) -> Any:
 
 
 def parallax_angle(distance: Any) -> Any:
-    """Return the angle in degrees from a point to its laser beam.
+    """Return the degrees to subtract from the clockwise angle of an LD14's points.
 
-    The receiver of an LD14 sits beside the axis of rotation. `distance` is in metres. Source: SDK,
-    sl_transform.cpp.
+    The receiver of an LD14 is beside the axis of rotation, so the angle depends on the distance.
+    `distance` is in metres. Source: SDK, sl_transform.cpp.
     """
     mm = distance * 1000
     return np.where(mm > 0, np.rad2deg(np.arctan((0.11923 * mm - 18.975571) / (mm + 5.9))), 0)
@@ -126,13 +126,13 @@ def parallax_angle(distance: Any) -> Any:
 def points(f: Fields, rate: int, *, correct_parallax: bool = False) -> Polar:
     """Return points at even steps from the start angle to the end angle.
 
+    Source: manual 3.2.
+
     Args:
         f: the fields of n frames.
         rate: points per second.
-        correct_parallax: whether to convert angles at the receiver to angles around the axis of
-            rotation, which a model that measures by triangulation needs.
-
-        Source: manual 3.2.
+        correct_parallax: whether to subtract `parallax_angle`, for a model that measures by
+            triangulation.
     """
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
     if correct_parallax:

@@ -1,4 +1,7 @@
-"""Tests of wiring and speed control of an STL-27L on its page (manual, sections 1 and 2)."""
+"""Tests that the page of the STL-27L describes its wiring and its speed control.
+
+Source: manual, sections 1 and 2.
+"""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Motor:
         self.hertz = 10.0  # internal control until external control begins
 
     def run(self, seconds: float) -> bytes:
-        """Return the packets of some time."""
+        """Advance the motor by `seconds`, and return three packets with its new speed."""
         self.hertz += (self._gain * self._pin.value - self.hertz) * min(seconds / self._lag, 1)
         sweep = partial(SENSOR.simulation.sweep, turns=self.hertz)  # type: ignore[arg-type]
         points = [{"distance": 2.0, "intensity": 9}] * 12
