@@ -50,7 +50,7 @@ def make_returns(count: int, *members: Any) -> Any:
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
     """Return points from the sent x, y and z, which are in REP-103 axes.
 
-    A point without a return has three zeros.
+    If a point has no return, its x, y and z are 0.
 
     Args:
         f: the fields of n packets.

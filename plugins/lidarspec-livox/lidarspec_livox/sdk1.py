@@ -134,7 +134,7 @@ STATUS_CODE = ByteSwapped(
 
 
 def make_packet(kind: int, *members: Any) -> Struct:
-    """Return the struct of a packet with one type of data."""
+    """Return the struct of a data packet; `kind` is its data type."""
     return Struct(
         "version" / Const(5, Int8ul),
         "slot" / Int8ul,

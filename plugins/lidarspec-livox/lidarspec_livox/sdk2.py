@@ -100,7 +100,7 @@ TIME_TYPES = {
 
 
 def make_packet(kind: int, *members: Any) -> Checksummed:
-    """Return the struct of a packet with one type of data."""
+    """Return the struct of a data packet; `kind` is its data type."""
     header = Struct(
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul),
