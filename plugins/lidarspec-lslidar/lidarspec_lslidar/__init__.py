@@ -197,7 +197,7 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     Args:
         i: the number of the packet.
         hertz: revolutions per second.
-        count: the number of samples of a packet that contains its length; 0 for other packets.
+        count: the number of samples, if packets contain their length; otherwise 0.
         timed: whether packets have a time.
     """
     seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS_PER_TURN)), 1_000_000)
@@ -321,8 +321,8 @@ class Model:
         sweep: the function that returns simulated values.
         baud: the baud rate.
         hertz: the lowest and the highest number of revolutions per second.
-        clock: the clock.
-        status: the status of the sensor.
+        clock: the clock in the packets; None if they have no time.
+        status: how the model was verified, as in `Sensor`.
     """
 
     name: str

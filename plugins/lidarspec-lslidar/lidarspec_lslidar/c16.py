@@ -1,6 +1,7 @@
 """LSLIDAR C16 with packets of 1212 bytes: a rotating lidar with 16 lasers over UDP.
 
-Numbers are little-endian.
+Numbers are little-endian. A previous edition of the C16 sends packets of 1206 bytes, which are the
+same as those of a Velodyne except for their angles. They are not supported.
 
 Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
 manual of the C32 for the offsets of the device information. The lasers fire at intervals of 3.125
@@ -9,10 +10,9 @@ us, as in the previous edition. This agrees with the steps of 0.36 degrees in a 
 
 The clock is read as a date and nanoseconds, which the sensor sends if it is synchronized by GPS.
 With PTP, the same bytes are seconds, and with NTP, the last bytes are microseconds. Only the device
-information contains the source of the time. A C16 of the previous edition sends packets of 1206
-bytes, which are the same as those of a Velodyne except for their angles. They are not supported.
-Two more features are not supported: configuration, for which the whole device information has to be
-sent to the sensor, and angles that a unit has measured itself.
+information contains the source of the time. Two features are not supported: configuration, for
+which the whole device information has to be sent to the sensor, and angles that a unit has measured
+itself.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
 
 
 def pace(f: Fields) -> Any:
-    """Return the time that the blocks of a packet take, seconds.
+    """Return the duration of the blocks of a packet in seconds.
 
     With dual return, two blocks are one firing.
     """
