@@ -205,13 +205,18 @@ def default_beam_origin_mm(product: str) -> float:
 
 @dataclass(frozen=True)
 class MetadataKeys:
-    """The keys of metadata without sections, and the name of their source."""
+    """The keys of all sections of the metadata.
+
+    Attributes:
+        name: where the metadata are from, for messages.
+        data: the values by key.
+    """
 
     name: str
     data: Mapping[str, Any]
 
     def to_unit(self) -> Unit:
-        """Return the unit.
+        """Return the unit that the metadata describe.
 
         Raises:
             UsageError: if a key is missing or has an invalid value.

@@ -336,7 +336,7 @@ def rotate(rotation: Rotation, vector: Any) -> tuple[Any, ...]:
 
 
 def has_near_times(f: Fields) -> Any:
-    """Return whether the three times are within one second."""
+    """Return whether both sample times are within 1 s of the packet's timestamp."""
     return (abs(f.acceleration_timestamp - f.timestamp) < 1e9) & (
         abs(f.gyro_timestamp - f.timestamp) < 1e9
     )

@@ -1,12 +1,14 @@
 """Recognize the layout of packets from their content, because they do not declare it.
 
 Several layouts have the same packet length, for example 32 pixels of 16 bytes, 64 pixels of 8 bytes
-and 128 pixels of 4 bytes. If a layout with too many pixels is tried, every second or fourth range
-is actually another field, so the mean ranges of four adjacent rows differ. Among layouts with the
-same number of pixels, the first layout in `PROFILES` whose unused bits are 0 in most pixels is
-used. Some layouts cannot be distinguished. In LEGACY, the number of columns per revolution is
-determined from the encoder. In other profiles, it is estimated from the largest column number and
-the time between columns, assuming ten revolutions a second, which is the factory setting.
+and 128 pixels of 4 bytes. If the tried layout has too many pixels, every second or fourth range is
+actually another field. The mean ranges of four adjacent rows then differ. Among layouts with the
+same number of pixels, the first one in `PROFILES` whose unused bits are 0 in most pixels is used.
+Some layouts cannot be distinguished.
+
+In LEGACY, the number of columns per revolution is determined from the encoder. In other profiles,
+it is estimated from the largest column number and the time between columns. The estimate assumes
+ten revolutions a second, which is the factory setting.
 """
 
 from __future__ import annotations
@@ -116,7 +118,7 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 
 
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
-    """Return a measure of the similarity of every fourth row, from 0 to 1.
+    """Return how similar the mean ranges of every fourth row are, from 0 to 1.
 
     Rows are grouped by their index modulo four. The result is the smallest mean range of a group
     divided by the largest mean range; -1 if unused bits are set in many pixels.
@@ -135,14 +137,20 @@ def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
 
 
 def read_bits(rows: NDArray[Any], bit_offset: int, width: int) -> NDArray[np.int64]:
-    """Return bits of the little-endian numbers in the last axis, from `bit_offset` on."""
+    """Return `width` bits of each little-endian number in the last axis.
+
+    `bit_offset` is the number of the lowest of these bits.
+    """
     return read_numbers(
         rows, bit_offset // 8, -(-(bit_offset % 8 + width) // 8)
     ) >> bit_offset % 8 & ((1 << width) - 1)
 
 
 def read_numbers(rows: NDArray[Any], start: int, count: int) -> NDArray[np.int64]:
-    """Return little-endian numbers of `count` bytes from the last axis."""
+    """Return the little-endian numbers in `count` bytes of the last axis.
+
+    `start` is the index of the first byte.
+    """
     numbers: NDArray[np.int64] = (
         rows[..., start : start + count].astype(np.int64) << (8 * np.arange(count))
     ).sum(axis=-1)
