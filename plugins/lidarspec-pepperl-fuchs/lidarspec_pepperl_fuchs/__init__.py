@@ -4,11 +4,11 @@ A program requests a handle from the scanner over HTTP, and starts the output wi
 UDP, the request names the receiver of the data. With TCP, the reply contains the port of the data.
 Without ``feed_watchdog``, the output ends after a minute.
 
-Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as far as the drivers
-of the vendor repeat it: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg, pf_r2000_packet_a,
-_b and _c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for `status_flags`) and
-the older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be that of an OMD30M. An
-R2300 has packets of another type.
+Source: R2000 Ethernet communication protocol, version 1.04, chapters 1 and 3, as far as the
+vendor's drivers repeat them: pf_lidar_ros_driver (PFHeader.msg, PFR2000Header.msg,
+pf_r2000_packet_a, _b and _c.cpp, pfsdp_base.cpp, PFDriverR2000.cfg, the tables of its topics for
+`status_flags`) and the older pepperl_fuchs_r2000 (packet_structure.h). The range is assumed to be
+that of an OMD30M. An R2300 has packets of another type.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def points(f: Fields, letter: str) -> Polar:
 
 
 def sweep(i: int, letter: str) -> dict[str, Any]:
-    """Return the values of simulated packet i, which begins at -180 degrees in each scan."""
+    """Return the values of simulated packet i; a scan begins at -180 degrees."""
     count = SAMPLES // PACKETS
     turn, part = divmod(i, PACKETS)
     seconds, fraction = divmod(i / PACKETS / SCAN_RATE_HZ, 1.0)
@@ -271,7 +271,10 @@ def read_reply(reply: Any) -> dict[str, Any]:
 
 
 def make_request(command: str, **more: Any) -> Command:
-    """Return the command for a request, "reboot_device" or "start_scanoutput?handle={handle}"."""
+    """Return the command for a request, for example "reboot_device".
+
+    Names in braces are replaced by values, as in "start_scanoutput?handle={handle}".
+    """
     path = f"/cmd/{command}"
     values = {
         "method": "GET",
