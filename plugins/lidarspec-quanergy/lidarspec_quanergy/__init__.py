@@ -4,10 +4,10 @@ Numbers are big-endian. Source: the vendor's quanergy_client (packet_header.h,
 m_series_data_packet.h, data_packet_parser_00.cpp, data_packet_parser_04.cpp,
 data_packet_parser_m_series.h). In the client, the time of a packet is the time of its last firing.
 It is assumed that firings are evenly spaced, with 420,000 points a second; range limits and
-revolutions per second are assumed as well. The positions increase or decrease with the direction of
-rotation. The nanoseconds of packets before version 4 are in units of ten nanoseconds, which is not
-corrected here. Packets of other kinds (1 and 6) and settings over HTTP are not supported. No
-captured packet was available.
+revolutions per second are assumed as well. The positions of the firings increase or decrease,
+depending on the direction of rotation. The nanoseconds of packets before version 4 are in units of
+ten nanoseconds, which is not corrected here. Packets of other kinds (1 and 6) and settings over
+HTTP are not supported. No captured packet was available.
 """
 
 from __future__ import annotations

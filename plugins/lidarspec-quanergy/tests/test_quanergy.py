@@ -1,4 +1,4 @@
-"""Tests of Quanergy M8 and MQ8: a packet of three returns, and older distances."""
+"""Tests of Quanergy M8 and MQ8: packets with three returns, and older packets."""
 
 from __future__ import annotations
 
