@@ -163,7 +163,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points_16p(f: Fields) -> Polar:
-    """Return the points of blocks with two firings; rings count the lasers of a block."""
+    """Return the points of blocks with two firings of 16 lasers.
+
+    The ring of a point is the position of its laser in the block.
+    """
     polar = points_of_groups(
         f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, laser_angles(f)
     )

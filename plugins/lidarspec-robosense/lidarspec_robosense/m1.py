@@ -13,11 +13,11 @@ for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept
 `firmware` selects a formula. The 750 000 points per second in the guide do not agree with 630
 packets in a frame, which result in 787 500 points.
 
-From byte 28 on, DIFOP has one of three layouts, and no number that identifies the layout: the
-layout of rs_driver since December 2023 (`difop`), the layout of the driver before, which contains
-the field of view (`difop_fov`), and the layout of the M1P user guide (`difop_guide`). A packet is
-read with the first of these layouts in which the return mode, the synchronisation mode and status,
-and the microseconds have possible values. If no layout fits, the packet is `difop_other`.
+From byte 28 on, DIFOP has one of three layouts: that of rs_driver since December 2023 (`difop`),
+that of earlier editions of the driver, which contains the field of view (`difop_fov`), and that of
+the M1P user guide (`difop_guide`). Packets do not identify their layout. A packet is therefore read
+with the first of these layouts in which the return mode, the synchronisation mode and status, and
+the microseconds have possible values. If no layout fits, the packet is `difop_other`.
 """
 
 from __future__ import annotations
@@ -188,9 +188,9 @@ def packets_per_frame(f: Fields) -> Any:
 
 
 def number_firings(f: Fields, blocks: int) -> Any:
-    """Return the number of the firing of each block in its frame.
+    """Return the number of each block's firing, counted from the start of the frame.
 
-    With dual return, the packets of a pair have the same numbers.
+    With dual return, both packets of a pair have the same numbers.
     """
     group = np.floor((f.pkt_psn - 1) / count_returns(f))
     return group * blocks + f.blocks.index
@@ -276,7 +276,10 @@ def sweep(i: int, temperature: int = 105, *, is_dual: bool = False) -> dict[str,
 
 
 def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
-    """Return the device information with factory settings, or with dual return."""
+    """Return the values of simulated device information, with factory settings.
+
+    `is_dual` selects dual return.
+    """
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     modes = {
         "return_mode": WAVE_MODES["dual" if is_dual else "strongest"],
@@ -295,7 +298,7 @@ def sweep_difop(i: int, *, is_dual: bool = False) -> dict[str, Any]:
 
 
 def change_sweep(simulation: Simulation, **values: Any) -> Simulation:
-    """Return a simulation with other arguments of its sweep."""
+    """Return a simulation whose sweep function is called with these arguments."""
     assert simulation.sweep is not None  # for mypy
     return dataclasses.replace(simulation, sweep=functools.partial(simulation.sweep, **values))
 
@@ -331,11 +334,11 @@ def configure(
     firmware: Literal["current", "2021"] | None = None,
     simulated_returns: Literal["single", "dual"] | None = None,
 ) -> Sensor:
-    """Return the sensor with a temperature in degC, or with other returns of a simulated sensor.
+    """Return the sensor for a known firmware, or with other simulated returns.
 
     Args:
-        firmware: "current" if the byte of the temperature is degC + 80 (M1P user guide, rs_driver),
-            "2021" if it is signed degC (rs_driver of April 2021).
+        firmware: the formula of the temperature: "current" if the sent byte is degC + 80 (M1P user
+            guide, rs_driver), "2021" if it is signed degC (rs_driver of April 2021).
         simulated_returns: the returns that the simulated sensor sends. Real packets contain their
             mode.
     """
@@ -346,19 +349,19 @@ def configure(
     return sensor
 
 
-def in_each_layout(field: str, text: Callable[[Any], str] | None = None) -> Reported:
-    """Return a fact that all known layouts of DIFOP contain."""
+def make_reported(field: str, text: Callable[[Any], str] | None = None) -> Reported:
+    """Return the declaration of a fact that all known layouts of DIFOP contain."""
     return Reported(*(f"{name}.{field}" for name in LAYOUTS), text=text)
 
 
 def describe_raw(values: Any) -> str:
-    """Return measured values whose unit is not documented."""
+    """Return a text with the raw values and a note that their unit is unknown."""
     numbers = ", ".join(map(str, values if isinstance(values, list) else [values]))
     return f"{numbers} (raw, the unit is not documented)"
 
 
 def describe_faults(code: int) -> str:
-    """Return the fault status; its bits are not documented."""
+    """Return a text with the fault code, whose bits are not documented."""
     if code == 0:
         return "none"
     return f"code {code:#04x} (not documented)"
@@ -393,11 +396,11 @@ M1 = Sensor(
     configure=configure,
     info={
         "serial": Reported("difop.serial_number", "difop_fov.serial_number"),
-        "firmware": in_each_layout("pl_firmware"),
-        "ps_firmware": in_each_layout("ps_firmware"),
-        "return_mode": in_each_layout("return_mode"),
-        "sync_mode": in_each_layout("time_sync_mode"),
-        "sync_status": in_each_layout("time_sync_status"),
+        "firmware": make_reported("pl_firmware"),
+        "ps_firmware": make_reported("ps_firmware"),
+        "return_mode": make_reported("return_mode"),
+        "sync_mode": make_reported("time_sync_mode"),
+        "sync_status": make_reported("time_sync_status"),
         "voltages": Reported("difop.voltages", "difop_fov.voltages", text=describe_raw),
         "currents": Reported("difop.currents", "difop_fov.currents", text=describe_raw),
         "battery_voltage": Reported("difop_guide.battery_voltage", text=describe_raw),

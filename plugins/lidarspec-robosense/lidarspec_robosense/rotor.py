@@ -9,8 +9,8 @@ Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hp
 geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
 layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-If a field of view is configured, there is a gap between blocks. The blocks after the gap are then
-measured later than the times of their points say, which is not corrected.
+If a field of view is configured, there is a gap between two blocks of a packet. The points after
+the gap were measured later than their times, which are not corrected.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def make_blocks(
         count: the number of blocks per packet.
         lasers: the number of channels of a firing.
         step: the size of a distance step in metres.
-        firings: 1 for one firing, 2 for two groups of channels.
+        firings: the number of groups of channels in a block, 1 or 2.
         flag: the type of the first bytes of a block.
     """
     channel = Struct("distance" / Scaled(Int16ub, step, "m") * "0: no return", "intensity" / Int8ub)
@@ -125,9 +125,10 @@ SOURCES = ("internal clock", "PPS", "PTP", "gPTP")
 
 
 def make_clock_status(sources: Sequence[str] = SOURCES) -> ClockStatus:
-    """Return the state of the clock in DIFOP, from the mode and the status of synchronization.
+    """Return how the state of the clock is read from DIFOP.
 
-    `sources` has the name of each mode; "" for a mode that does not exist.
+    `sources` has the name of the time source for each mode of synchronization; "" for a mode that
+    does not exist.
 
     Source: RS-LiDAR-M1 and RS-Helios user guides, time synchronization in DIFOP. PPS comes with a
     GPRMC sentence, whose time is UTC.
@@ -259,7 +260,8 @@ def split_angles(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
 def laser_degrees(entry: Any) -> Any:
     """Return the angle of each laser in degrees, on the axis of channels.
 
-    If the sensor is not calibrated, angles are nan, so that points are invalid.
+    `entry` is an array of signs and magnitudes in DIFOP. If the sensor is not calibrated, angles
+    are nan, so that points are invalid.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
@@ -267,15 +269,18 @@ def laser_degrees(entry: Any) -> Any:
 
 
 def laser_angles(f: Fields) -> tuple[Any, Any]:
-    """Return each laser's elevation and clockwise angle from the rotor, in degrees."""
+    """Return the elevation and the horizontal angle of each laser, in degrees.
+
+    Horizontal angles are clockwise from the direction of the rotor.
+    """
     return laser_degrees(f.state.difop.vertical), laser_degrees(f.state.difop.horizontal)
 
 
 def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     """Return the points of blocks with one firing of all lasers.
 
-    With dual return, two blocks are one firing. `late` is the number of blocks of the first firing
-    that are in the previous packet.
+    With dual return, a firing has two blocks. `late` is 1 if the first block of the packet is the
+    second block of a firing, else 0.
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index
@@ -349,13 +354,13 @@ def make_points(
 
 
 def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
-    """Return the seconds from a packet to the next, by the return mode in DIFOP.
+    """Return the seconds from a packet to the next.
 
     Args:
         shots: the number of shots of a packet with single return. With dual return, a packet has
             half as many.
         period: the seconds from shot to shot.
-        dual: the value of the return mode with two returns.
+        dual: the return mode in DIFOP that means dual return.
     """
     return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
 

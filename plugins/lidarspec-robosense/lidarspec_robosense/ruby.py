@@ -158,8 +158,8 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
     """Return the firing time of each laser in seconds.
 
-    There are 16 times, 3.236 us apart, and then the same 16 times again. `counts` has the number of
-    lasers that fire at each of these 32 times. Source:
+    Lasers fire at 16 times, 3.236 us apart. The lasers are listed in two groups. `counts` has the
+    number of lasers of the first group at each time, and then those of the second group. Source:
     rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
@@ -205,8 +205,8 @@ def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = N
         id: the id of the sensor.
         name: the name of the model.
         rotor: its firing times and geometry.
-        relative: the id of the model of the other series.
-        variant: the firing times of an 80V.
+        relative: the id of the corresponding model of the other series.
+        variant: the firing times that are used if packets identify the model as an 80V.
     """
     lasers = len(rotor.delay)
     is_plus_model = "plus" in id

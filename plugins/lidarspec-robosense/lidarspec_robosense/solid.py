@@ -169,12 +169,15 @@ E1_DIFOP = Struct(
 
 
 def plausible(f: Fields, model: Scanner) -> Any:
-    """Return whether the packet number is in the range of a frame with dual return."""
+    """Return whether the packet number is possible.
+
+    Frames with dual return have the highest numbers.
+    """
     return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
 
 
 def last_packet_number(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
-    """Return the last packet number of a frame, by the return mode."""
+    """Return the last packet number of a frame, which depends on the return mode."""
     is_dual = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
     return np.where(is_dual, 2 * model.packets, model.packets) + model.first - 1
 
@@ -184,10 +187,13 @@ def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
     return 1 / (FRAME_RATE_HZ * (last_packet_number(f, model, dual) - model.first + 1))
 
 
-def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Return the counter of a model, which restarts with each frame, and its clock.
+def make_counter_and_clock(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
+    """Return the arguments of `Sensor` for the packet counter and the clock.
+
+    The counter restarts with each frame.
 
     Args:
+        model: the model.
         dual: the return modes with twice as many packets in a frame.
     """
     return {
@@ -304,7 +310,7 @@ MX_DIFOP = Struct(
     "reserved_44" / Bytes(212),
 )
 
-M2_TIMING = make_counter(M2_SCANNER, (DUAL,))
+M2_TIMING = make_counter_and_clock(M2_SCANNER, (DUAL,))
 M2_TIMING["sequence"] = dataclasses.replace(M2_TIMING["sequence"], returns=count_returns)
 
 M2 = dataclasses.replace(
@@ -341,7 +347,7 @@ MX = dataclasses.replace(
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
     points=points_mx,
-    **make_counter(MX_SCANNER),
+    **make_counter_and_clock(MX_SCANNER),
     # with dual return, so that the second radius is simulated too
     simulation=Simulation(partial(sweep, model=MX_SCANNER, mode=DUAL)),
     range_limits=(0.2, 200.0),
@@ -349,7 +355,7 @@ MX = dataclasses.replace(
     source="rs_driver (decoder_RSMX.hpp); not tested with packets of this model",
 )
 
-E1_TIMING = make_counter(E1_SCANNER, (9, 10, 11))
+E1_TIMING = make_counter_and_clock(E1_SCANNER, (9, 10, 11))
 E1_TIMING["clock"] = dataclasses.replace(
     E1_TIMING["clock"], status=make_clock_status(("internal clock", "", "PTP (E2E L2)", "gPTP"))
 )

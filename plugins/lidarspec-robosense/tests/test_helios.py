@@ -45,7 +45,7 @@ def msop(
     resolution: int = 1,
     time: float = 0.0,
 ) -> bytes:
-    """Return a packet by the offsets of the manual's Table 9.
+    """Return an MSOP packet; the offsets are those of the manual's Table 9.
 
     Args:
         azimuths: raw values by block.
@@ -71,7 +71,13 @@ def msop(
 
 
 def difop(angles: Mapping[int, str] | None = None, *, mode: int = 4, rpm: int = 600) -> bytes:
-    """Return a DIFOP packet with angles by the offset of their three bytes, otherwise 0."""
+    """Return a DIFOP packet.
+
+    Args:
+        angles: {offset: the three bytes of an angle in hexadecimal}; all other angles are 0.
+        mode: the return mode.
+        rpm: the rotation speed.
+    """
     data = bytes.fromhex("a5ff005a11115555") + bytes(SIZE - 10) + b"\x0f\xf0"
     data = patch(patch(data, 8, struct.pack(">H", rpm)), 300, bytes([mode]))
     for offset, text in (angles or {}).items():
@@ -188,9 +194,9 @@ def test_firing_times_of_single_return() -> None:
 
 
 def test_dual_return_has_one_firing_a_block() -> None:
-    """Laser 9 fires 26.53 us after the block's first; a block takes 55.56 us.
+    """Laser 9 fires 26.53 us after the first laser; a block takes 55.56 us.
 
-    So its azimuth is 0.2 * 26.53 / 55.56 degrees further.
+    The azimuth of laser 9 is therefore 0.2 * 26.53 / 55.56 degrees further.
     """
     channels = {(3, 8): (400, 5), (3, 24): (800, 6)}
     cloud = decode(SENSOR, [difop(mode=0), msop(steady(9000, 20), channels)]).points()
@@ -253,7 +259,7 @@ def test_lasers_without_calibration_have_no_points() -> None:
 
 
 def test_packets_before_the_device_information_are_nominal() -> None:
-    """Live: no packet knows a DIFOP that is still to come."""
+    """The angles of a DIFOP packet are not used for packets that arrive before it."""
     data = datagrams()
     decoder = SENSOR.decoder()
     stream = PacketStream(SENSOR, "data", decoder.stats)
@@ -322,10 +328,10 @@ def test_packets_taken_out_are_lost_and_late_ones_come_in_their_place() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4))
 def test_published_point_clouds(number: int) -> None:
-    """The clouds are nebula's.
+    """The clouds were published by nebula.
 
-    It truncates azimuths to 0.01 degrees, and computes the step of each packet's last block from
-    the rotation rate.
+    Nebula truncates azimuths to 0.01 degrees, and computes the step of each packet's last block
+    from the rotation rate.
     """
     scan = list(SENSOR.scans(datagrams()))[number].points
     published = np.loadtxt(sorted(capture(FOLDER).glob("*.pcd"))[number], skiprows=11)
@@ -338,9 +344,9 @@ def test_published_point_clouds(number: int) -> None:
 
 
 def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
-    """Return the distance from each published point to our nearest one of its laser.
+    """Return, for each published point, the distance and azimuth of our nearest point.
 
-    Also return its azimuth, clockwise.
+    Only points of the same laser are compared. Azimuths are clockwise in degrees.
     """
     distance, degrees = np.empty(len(published)), np.empty(len(published))
     for laser in range(16):

@@ -24,9 +24,14 @@ FAR_M = 7.5
 
 
 def make_packet(number: int, second: int | None = None) -> bytes:
-    """Return the packet with this counter, 1 to 1260; its two returns are 5 and 7.5 m away.
+    """Return a packet with the first or the second returns of dual return.
 
-    The packet has the second returns if `second` is 1; by default, if its counter is even.
+    The first returns are 5 m away, and the second returns 7.5 m.
+
+    Args:
+        number: the packet counter, 1 to 1260.
+        second: 0 for first returns, 1 for second returns; by default, packets with an even counter
+            have the second returns.
     """
     second = (number - 1) % 2 if second is None else second
     firing = (number - 1) // 2 * 25

@@ -38,7 +38,7 @@ def beginning(data: bytes) -> bytes:
 def with_channel(data: bytes, block: int, channel: int, values: str) -> bytes:
     """Return the packet with other bytes in one channel.
 
-    By the manual's tables, its offset is 32 + 47 * block + 2 + 9 * channel.
+    The offset of the channel is calculated from the manual's tables.
     """
     start, new = 32 + 47 * block + 2 + 9 * channel, bytes.fromhex(values)
     return data[:start] + new + data[start + len(new) :]

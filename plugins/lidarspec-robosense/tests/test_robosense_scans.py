@@ -53,7 +53,7 @@ def frames(count: int, *, last: int = 630) -> list[bytes]:
 
 
 def numbers(scan: ls.Scan) -> list[int]:
-    """Return the packet numbers of a scan, from the radius of their first point."""
+    """Return the packet numbers of a scan, which `packet` sets as first radius."""
     return [round(float(distance) / 0.005) for distance in scan.points.range[::125]]
 
 

@@ -54,7 +54,13 @@ def msop(
 
 
 def difop(*, mode: int = 1, vertical: bytes = b"", horizontal: bytes = b"") -> bytes:
-    """Return device information with angles from the first laser on, otherwise 0."""
+    """Return a DIFOP packet.
+
+    Args:
+        mode: the return mode.
+        vertical, horizontal: the bytes of the angles, from the first laser on; all other angles
+            are 0.
+    """
     data = bytearray(bytes.fromhex("a5ff005a11115555") + bytes(1238) + b"\x0f\xf0")
     data[8:10], data[300] = struct.pack(">H", 600), mode
     data[468 : 468 + len(vertical)], data[564 : 564 + len(horizontal)] = vertical, horizontal
@@ -183,7 +189,8 @@ def test_every_model_is_identified(sensor_id: str) -> None:
 def test_helios_16_and_32_are_distinguished_also_in_dual_return() -> None:
     """Both models have the same type byte.
 
-    16 lasers with two returns have the same rate as 32 with one, but each value occurs twice.
+    With two returns, 16 lasers send as many values as 32 lasers with one return, but the second
+    half of each block repeats the first half.
     """
     small, large = ls.sensor("robosense-helios16p"), ls.sensor("robosense-helios32")
     twice, pairs = [], []
@@ -200,7 +207,7 @@ def test_helios_16_and_32_are_distinguished_also_in_dual_return() -> None:
 
 
 def ruby(azimuths: Sequence[int], distances: Sequence[int], *, returns: int) -> bytes:
-    """Return a packet of three blocks by Table 5-2, with an echo of the first laser."""
+    """Return a packet of three blocks (Table 5-2); only the first laser has echoes."""
     head = (
         bytes.fromhex("55aa055a010200") + bytes([returns]) + bytes(23) + bytes([5, 1]) + bytes(47)
     )
