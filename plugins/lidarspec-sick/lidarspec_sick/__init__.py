@@ -1,5 +1,4 @@
-"""SICK scanners: models with LMDscandata, multiScan and picoScan (compact telegrams),
-microScan3."""
+"""SICK scanners: models with LMDscandata, multiScan, picoScan and microScan3."""
 
 from __future__ import annotations
 

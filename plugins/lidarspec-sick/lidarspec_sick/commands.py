@@ -115,7 +115,7 @@ REQUEST_KINDS = ("sMN", "sRN", "sWN", "sEN")
 def make_message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -> Frame:
     """Return the frame of a message.
 
-    Messages of a scanner in CoLa B have a space after the method, even without content.
+    In CoLa B, a space follows the method, except in requests without content.
 
     Args:
         cola: "A" or "B".

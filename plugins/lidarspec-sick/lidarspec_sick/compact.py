@@ -1,10 +1,11 @@
 """multiScan100 and picoScan100: compact telegrams over UDP with scans or IMU samples.
 
+A telegram is a chain of modules under one CRC. Each module has its own layers, beams and echoes.
+The azimuths are sent for each beam, or are evenly spaced between the azimuths of the first and the
+last beam. Elevation counts downwards. Bit 0 of a beam's property means a reflector.
+
 Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout of versions 3 and 4;
-multiScan136 operating instructions 8027119 for segments and layers. A telegram is a chain of
-modules under one CRC. Each module has its own layers, beams and echoes. The azimuths are sent for
-each beam, or are evenly spaced between the azimuths of the first and the last beam. Elevation
-counts downwards. Bit 0 of a beam's property means a reflector.
+multiScan136 operating instructions 8027119 for segments and layers.
 """
 
 from __future__ import annotations

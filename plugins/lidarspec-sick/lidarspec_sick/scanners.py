@@ -131,10 +131,10 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
 
 
 def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
-    """Return the frames of scans, with one echo and with all echoes, and of messages.
+    """Return the frames of scans, of commands and of replies.
 
-    There are frames for scans in CoLa A and in CoLa B; those in `cola` come first. The frames of
-    messages are only in `cola`.
+    Scans can be received in CoLa A and in CoLa B; those in `cola` come first. Commands and replies
+    are only in `cola`. There are frames for scans with one echo, and with `kind.echoes` echoes.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
@@ -153,8 +153,10 @@ def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
     """Return the scanner with commands in CoLa A or B, and with a number of echoes.
 
-    Scans in CoLa A and in CoLa B are read, with one echo or with `echoes` echoes. If `echoes` is 0,
-    the maximum number of the scanner is used.
+    Args:
+        cola: the version of CoLa for commands. Scans are read in both versions.
+        echoes: the number of echoes of a beam; 0 for the maximum of the scanner. Scans with one
+            echo are read as well.
 
     Raises:
         UsageError: if the scanner has fewer echoes.

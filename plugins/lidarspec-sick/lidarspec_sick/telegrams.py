@@ -1,12 +1,13 @@
 """LMDscandata, the telegram of a scan, in CoLa B (binary) and CoLa A (hexadecimal text).
 
-Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating
-instructions 8023198 (LMS4000), with the values below 16 that are not distances; 8020494 (MRS1000)
-for the layers; sick_scan_xd for the zero direction. A telegram has one layer. It has the channels
-DIST1 to DISTn with 16 bits. If requested, the channels RSSI1 to RSSIn follow, with 16 or 8 bits. If
-there are RSSI channels of both sizes, the intensity is from the 8-bit channels. Telegrams with
-channels of other kinds (ANGL, VANG, QLTY) are not supported. An angle of a third of a degree is
-sent as 0.3333, and is used unchanged.
+A telegram has one layer. It has the channels DIST1 to DISTn with 16 bits. If requested, the
+channels RSSI1 to RSSIn follow, with 16 or 8 bits. If there are RSSI channels of both sizes, the
+intensity is from the 8-bit channels. Telegrams with channels of other kinds (ANGL, VANG, QLTY) are
+not supported. An angle of a third of a degree is sent as 0.3333, and is used unchanged.
+
+Source: SICK Telegram Listing LiDAR sensors 8014631; operating instructions 8023198 (LMS4000) for
+the tables of LMDscandata, which state that values below 16 are not distances; 8020494 (MRS1000) for
+the layers; sick_scan_xd for the zero direction.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def make_channel(
     Args:
         content: the name of the content, as sent.
         values: the type of a sample.
-        first: whether it is the first channel. All other channels have the same number of values.
+        first: whether it is the first channel, whose number of samples applies to all channels.
         name: the name of the field, by default the content in lower case.
     """
     count = this.count if first else this._.dist1.count

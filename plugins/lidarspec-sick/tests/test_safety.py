@@ -21,7 +21,10 @@ MESSAGE = next(bytes.fromhex(one["hex"]) for one in VECTORS if one["sensor"] == 
 
 
 def split(message: bytes, number: int, size: int) -> list[bytes]:
-    """Return the datagrams of a message: 24 bytes as in ParseDatagramHeader, and `size` bytes."""
+    """Return the datagrams of a message, each with up to `size` bytes of it.
+
+    Their header of 24 bytes is that of ParseDatagramHeader.
+    """
     return [
         b"MS3 "
         + struct.pack(">HBB", 0x4D44, 1, 0)
