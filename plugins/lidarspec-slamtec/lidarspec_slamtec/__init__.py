@@ -20,10 +20,11 @@ points of a frame have the time of the frame.
 
 Requests, descriptors, and replies with information and configuration were verified with the
 recorded communication of a live A1. Nodes, express and ultra capsules were verified with bytes that
-were built by the rules of the SDK, and dense, ultra-dense and HQ capsules with the SDK's arithmetic
-by hand. It is not known whether a C1 supports the speed command. According to the SDK's rule for
-model numbers, it would use PWM. An S2L is assumed to have the model numbers of an S2, so these
-models cannot be distinguished. A T1 receives requests and sends its stream over UDP.
+were built by the rules of the SDK, and dense, ultra-dense and HQ capsules with points that were
+calculated by hand with the SDK's formulas. It is not known whether a C1 supports the speed command.
+According to the SDK's rule for model numbers, it would use PWM. An S2L is assumed to have the model
+numbers of an S2, so these models cannot be distinguished. A T1 receives requests and sends its
+stream over UDP.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def configure(
         dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK, or
             "signed" as in the protocol.
         mode: the scan mode that is started when the sensor is opened, instead of a scan of nodes.
-            The option `answer` must be the kind of data frames in this mode.
+            Set the option `answer` to the kind of data frames that this mode sends.
 
     Raises:
         UsageError: if the mode is not a number from 0 to 255.

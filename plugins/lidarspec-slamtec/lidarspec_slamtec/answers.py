@@ -51,7 +51,10 @@ SERIES = {
 
 
 def name_model(series: str, models: tuple[int, ...], low: int) -> str:
-    """Return the name of a series, and of the model if the series has several models."""
+    """Return the name of a model, for example "RPLIDAR S2, S2M1".
+
+    If the series has one model, the result is only the series, for example "RPLIDAR C1".
+    """
     if len(models) > 1:
         return f"RPLIDAR {series}, {series}M{low}"
     return f"RPLIDAR {series}"
@@ -131,7 +134,10 @@ def make_stream_descriptor(kind: int, size: int) -> Frame:
 
 
 def is_config_plausible(f: Fields) -> Any:
-    """Return whether the length agrees with the value's width, if this width is known."""
+    """Return whether a reply has the length that its key requires.
+
+    The length is not checked if the width of the value is not documented.
+    """
     size = take(_VALUE_BYTES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 

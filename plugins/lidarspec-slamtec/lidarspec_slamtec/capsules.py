@@ -1,15 +1,17 @@
 """Capsules, which contain many distances and the angle of the first point.
 
 The angles of the other points are computed with the start angle of the next capsule: point k of N
-is at ``start + (next start - start) * k / N``, minus a compensation. If the next capsule is
-missing, or has the S bit, which marks the first capsule after a start, the points of a capsule have
-no direction. All four kinds of capsules begin with two bytes. Each contains a sync nibble (A or 5)
-and a nibble of the checksum, which is the XOR of all following bytes.
+is at ``start + (next start - start) * k / N``, minus a compensation. The points of a capsule have
+no direction if the next capsule is missing, or if it has the bit S, which marks the first capsule
+after a start.
 
-Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; facts that it lacks are from the vendor's SDK
-(sl_lidar_cmd.h, handler_capsules.cpp): dense and ultra-dense capsules, the angles of ultra
-capsules, and that dtheta is unsigned. The SDK averages adjacent points of an ultra-dense capsule
-that differ by up to 2 mm. This filter is left out.
+All four kinds of capsules begin with two bytes. Each of these bytes has a sync nibble (A or 5) and
+a nibble of the checksum, which is the XOR of all following bytes.
+
+Source: RPLIDAR interface protocol, "EXPRESS_SCAN". Dense and ultra-dense capsules, the angles of
+ultra capsules, and the unsigned dtheta are from the vendor's SDK (sl_lidar_cmd.h,
+handler_capsules.cpp). The SDK averages adjacent points of an ultra-dense capsule that differ by up
+to 2 mm. This filter is left out.
 """
 
 from __future__ import annotations
@@ -81,7 +83,10 @@ def make_start() -> Construct:
 
 
 def make_sample() -> Construct:
-    """Return the struct of a distance and the high bits of its compensation."""
+    """Return the struct of a distance, with the high bits of dtheta.
+
+    dtheta is the compensation of the angle.
+    """
     distance = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
     return ByteSwapped(BitStruct(distance, "dtheta_high" / BitsInteger(2)))
 
@@ -207,19 +212,17 @@ def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
 def compensation(mm: Any) -> Any:
     """Return the degrees to subtract from the angle of an ultra capsule's point.
 
-    Source: handler_capsules.cpp: 7.5 degrees for distances below 50 mm, otherwise 8 degrees minus
-    two terms in 1/65536 rad. The terms depend on 98361 divided by the distance in quarters of a
-    millimetre, rounded down.
+    Source: handler_capsules.cpp.
     """
     ratio = np.floor(98361 / np.maximum(mm * 4, 200))
     return np.where(mm >= 50, 8 - np.rad2deg((ratio * 64 + ratio**3 / 98304) / 65536), 7.5)
 
 
 def ultra_points(f: Fields) -> Polar:
-    """Return 96 points per capsule.
+    """Return 96 points per capsule, three for each cabin.
 
-    A cabin has a major distance, a distance predicted from it, and a distance predicted from the
-    major distance of the next cabin.
+    A cabin contains a distance, `major`. It also contains two differences, `predict1` and
+    `predict2`, from this distance or from the distance of the next cabin.
     """
     code = f.cabins.major
     next_code = following(f.cabins.major)

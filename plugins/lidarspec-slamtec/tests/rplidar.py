@@ -21,7 +21,7 @@ def node(degrees: float, metres: float, *, quality: int = 40, start: bool = Fals
 
 
 def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
-    """Return a capsule with random content that starts at this angle."""
+    """Return a capsule with random content and, except for "hq", this first angle."""
     parsed = A1.parse(A1.example(answer, seed=source.randrange(1 << 30)), frame=answer)
     if answer != "hq":
         parsed.start.angle, parsed.start.sync = round(degrees * 64) % (360 * 64), 0
@@ -37,9 +37,9 @@ def capsules(answer: str, number: int, *, step: float = 17.0, seed: int = 1) -> 
 
 
 def turns(number: int, *, seed: int = 1) -> bytes:
-    """Return nodes of revolutions of 500, with noise and 10 % missing returns.
+    """Return `number` nodes, 500 per revolution; 10 % of them have no return.
 
-    The noise is a few millimetres.
+    The distances have a noise of a few millimetres.
     """
     source, found = random.Random(seed), bytearray()
     for index in range(number):
