@@ -1,7 +1,7 @@
 """u-blox GNSS receivers, for the time and position of lidars.
 
-Source: ZED-F9P Interface Description, UBX-18010854 R04 (protocol version 27), with page numbers.
-M8 receivers (protocol version 15 and later) send the same messages. CFG-MSG and CFG-RATE are
+Source: ZED-F9P Interface Description, UBX-18010854 R04 (protocol version 27), with page numbers. M8
+receivers (protocol version 15 and later) send the same messages. CFG-MSG and CFG-RATE are
 deprecated from protocol version 23.01 on, and still accepted (p. 54 and 74).
 
 A receiver sends UBX and NMEA over the same line. Known errors: in the manual, the example of RMC
@@ -358,7 +358,10 @@ def timeutc_sweep(i: int) -> dict[str, Any]:
 
 
 def pulse_sweep(i: int) -> dict[str, Any]:
-    """Return the simulated announcement of the pulse after second i, in GPS week 2400."""
+    """Return the simulated announcement of the pulse at second i + 1.
+
+    Second 0 is the beginning of GPS week 2400.
+    """
     return {"time_of_week": (i + 1) % WEEK_S, "week": 2400 + int((i + 1) // WEEK_S), "flags.utc": 1}
 
 
