@@ -12,7 +12,7 @@ differs from this module by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32
 Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot
 follows eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder,
 two idle slots follow eight groups, and the first firing is 7 us before the packet's time. This
-module follows velodyne_decoder. The directions of both differ by 0.01 degrees.
+module follows velodyne_decoder. The resulting directions differ by 0.01 degrees.
 """
 
 from __future__ import annotations

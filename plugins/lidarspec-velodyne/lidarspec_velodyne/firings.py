@@ -5,15 +5,14 @@ interpolated to the azimuth of the next block, in proportion to their times. Wit
 consecutive blocks contain the two returns of the same firings and have the same azimuth, so the
 next azimuth is two blocks ahead.
 
-If there is no next block, or if its azimuth is further ahead than the sensor can have rotated, the
-rule for the last block is used. Packets have no counter, so such a step is the only sign of a lost
-packet. A sector that is masked in the sensor's settings causes the same step. The user selects one
-of two rules:
+If a packet was lost, the azimuth of the next block is further ahead than the sensor can have
+rotated. The same is true after a sector that is masked in the sensor's settings. In these cases,
+and if there is no next block, a rule is used that the user selects:
 
 * "previous", the default: the last valid step is used again. ros-drivers and nebula do this for the
   last block of every packet; velodyne_decoder uses the mean step of the packet. For real packets,
-  both methods differ by up to 0.04 degrees.
-* "invalid": these firings have no direction, and their points are not valid.
+  the results differ by up to 0.04 degrees.
+* "invalid": the firings of the block have no direction, and their points are not valid.
 
 Source: ros-drivers/velodyne rawdata.cc (azimuths); velodyne_decoder packet_decoder.cpp and
 calib_db.cpp (firing times, vertical offset of the lasers).
@@ -72,7 +71,7 @@ class Firings:
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """The laser of each slot, counted from the lowest, in the shape of `elevation`."""
+        """The ring of each slot, from the lowest laser up, in the shape of `elevation`."""
         return np.searchsorted(np.unique(self.elevation), self.elevation)
 
     @property
@@ -84,7 +83,7 @@ class Firings:
 def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Polar:
     """Return the points of a packet.
 
-    The sensor rotates clockwise from its forward axis; heights are along the axis of rotation.
+    The sensor rotates clockwise from its forward axis.
     """
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]

@@ -151,7 +151,10 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 
 
 def is_plausible_single(f: Fields) -> Any:
-    """Return whether a packet has single return, and each bank three times."""
+    """Return whether azimuths, banks and return mode are those of single return.
+
+    The blocks of the four banks follow each other, three times.
+    """
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))
@@ -160,7 +163,7 @@ def is_plausible_single(f: Fields) -> Any:
 
 
 def is_plausible_dual(f: Fields) -> Any:
-    """Return whether each of the four banks has two consecutive blocks."""
+    """Return whether azimuths are valid, and each bank has two consecutive blocks."""
     return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 
@@ -192,11 +195,12 @@ CLOCK_STATUS = ClockStatus(
 
 
 def nmea_seconds(f: Fields) -> Any:
-    """Return the seconds since 1970 in the first valid sentence.
+    """Return the time of the first valid sentence, seconds since 1970.
 
-    The result has this value for the packet with the sentence, and nan for all other packets.
+    A sentence is valid only if the clock is locked to the PPS.
 
-    A sentence is only valid if the clock is locked to the PPS.
+    Returns:
+        The time for the packet with this sentence, nan for all other packets, (n,).
     """
     is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
     seconds = np.full(len(is_locked), np.nan)
@@ -223,9 +227,9 @@ def _parse_nmea(nmea: bytes) -> float:
 
 
 def make_sentence(seconds: float) -> dict[str, Any]:
-    """Return the field with the NMEA sentence of a time, seconds since 1970.
+    """Return the field `nmea` with a sentence that contains a time, but no position.
 
-    The GPS receiver sends only the time, no position.
+    `seconds` is the time in seconds since 1970.
     """
     moment = datetime.datetime.fromtimestamp(int(seconds), datetime.UTC)
     text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()

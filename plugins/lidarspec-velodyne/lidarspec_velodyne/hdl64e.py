@@ -98,8 +98,8 @@ class Unit:
     aside: tuple[float, ...] = (0.026, -0.026) * SLOTS
     nominal: bool = True
 
-    def by_block(self, values: Any) -> Any:
-        """Return values of the 64 lasers by block and slot, (blocks, slots)."""
+    def arrange_by_block(self, values: Any) -> Any:
+        """Return values of the 64 lasers in the order of the slots, (blocks, slots)."""
         return np.tile(np.reshape(values, (2, SLOTS)), (BLOCKS // 2, 1))
 
     @property
@@ -204,21 +204,23 @@ def points(f: Fields, unit: Unit) -> Polar:
     is_dual_return = is_dual(f)
     ahead = np.where(is_dual_return, following(azimuth, 4), following(azimuth, 2))
     step = between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * unit.period)
-    clockwise = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.by_block(unit.offset))
-    elevation = np.deg2rad(unit.by_block(unit.vertical))
-    height = unit.by_block(unit.height)
-    aside = unit.by_block(unit.aside)
+    clockwise = np.deg2rad(
+        azimuth + step * (unit.delay / unit.period) - unit.arrange_by_block(unit.offset)
+    )
+    elevation = np.deg2rad(unit.arrange_by_block(unit.vertical))
+    height = unit.arrange_by_block(unit.height)
+    aside = unit.arrange_by_block(unit.aside)
     back = -height * np.sin(elevation)
     cos = np.cos(clockwise)
     sin = np.sin(clockwise)
     distance = f.blocks.channels.distance
     return Polar(
-        range=np.where(distance == 0, 0, distance + unit.by_block(unit.distance)),
+        range=np.where(distance == 0, 0, distance + unit.arrange_by_block(unit.distance)),
         azimuth=-clockwise,
         elevation=elevation,
         intensity=f.blocks.channels.intensity,
         time=np.where(is_dual_return, block // 4, block // 2) * unit.period + unit.delay,
-        ring=unit.by_block(np.argsort(np.argsort(unit.vertical))),
+        ring=unit.arrange_by_block(np.argsort(np.argsort(unit.vertical))),
         return_index=np.where(is_dual_return, block // 2 % 2, 0),
         origin=(back * cos + aside * sin, aside * cos - back * sin, height * np.cos(elevation)),
         nominal=unit.nominal,

@@ -327,7 +327,7 @@ def test_points_are_not_interpolated_across_a_masked_sector() -> None:
 
 @pytest.mark.parametrize("jump_deg", [20, 116, 200, 350])
 def test_a_single_block_after_a_masked_sector_uses_the_rotor_speed(jump_deg: int) -> None:
-    """The last block of the packet follows a gap, and no block follows it."""
+    """The last block of the packet is alone after a gap, so no azimuth follows it."""
     starts = steps(10_000)
     starts[-1] = (starts[-2] + 100 * jump_deg) % 36_000
     cells = {(block, slot): (500, 1) for block in range(12) for slot in range(32)}
