@@ -1,7 +1,7 @@
-"""YDLIDAR's 360 degree lidars over a UART: one packet, eight formats of samples.
+"""YDLIDAR's 360 degree lidars over a UART.
 
-Most models start to measure after a request. Models with one channel cannot receive, and measure
-without a request.
+All models send the same packet, with one of eight formats of samples. Most models start to measure
+after a request. Models with one channel cannot receive, and measure without a request.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
@@ -162,10 +162,11 @@ def make_id(name: str) -> str:
     return "ydlidar-" + name.lower().replace("t-mini", "tmini").replace(" ", "-")
 
 
-def has_state(f: Fields, slowest: float) -> Any:
-    """Return whether the scan frequency is set in a packet other than a zero packet.
+def contains_state(f: Fields, slowest: float) -> Any:
+    """Return whether a packet other than a zero packet contains the device's state.
 
-    In packets that are not zero packets, most models send the frequency 0 (protocol, CT).
+    The state is in the bits of the scan frequency. In these packets, models without a state send
+    the frequency 0 (protocol, CT).
     """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 
@@ -175,7 +176,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
     if other.has_state and not own.has_state:
         return Relative(
             "packets that do not begin a revolution have bits set in CT",
-            partial(has_state, slowest=own.form.slowest),
+            partial(contains_state, slowest=own.form.slowest),
         )
     if own.number and other.number:
         return "info.model"
@@ -183,9 +184,9 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """Return how to recognize other models with samples of the same size, by id.
+    """Return how to recognize the other models with the same sample size, by id.
 
-    These include models of CSPC, which send the same packet.
+    They include models of CSPC, which send the same packet.
     """
     own_model = MODELS[name]
     models = {

@@ -26,7 +26,7 @@ class Model:
         one_channel: whether the model only sends and cannot receive.
         has_state: whether packets other than zero packets contain the state of the device, in the
             bits of the scan frequency.
-        status: the status of the sensor.
+        status: how the model was verified, as in `Sensor`.
     """
 
     form: Form
