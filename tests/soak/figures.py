@@ -193,7 +193,7 @@ def delay(share: float) -> Figure:
             for found in decoder.feed(data[spot : spot + 1]):
                 worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
     return Figure(
-        f"a frame is returned at most {worst_share:.2f} longest frames after its last byte",
+        f"at most {worst_share:.2f} times the bytes of a longest frame must follow",
         worst_share < 1,
     )
 
@@ -233,7 +233,7 @@ def in_any_order(share: float) -> Figure:
             differing.append(name)
     words = (
         f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % duplicated,"
-        " displaced by up to 3 places: "
+        " moved by up to 3 places: "
     )
     return Figure(
         words
@@ -272,7 +272,7 @@ def measure_blocked_rotors(share: float) -> Figure:
             scans = list(sensor.scans(frames if sensor.datagrams else b"".join(frames)))
         packets = len(frames) / max(len(scans), 1)
         told.append(
-            f"{name}: {len(scans)} scans of {len(frames)} packets,"
+            f"{name}: {len(scans)} scans from {len(frames)} packets,"
             f" {sum(scan.complete for scan in scans)} complete"
         )
         kept &= len(scans) > 1 and packets < 500 and not any(scan.complete for scan in scans)
@@ -314,8 +314,8 @@ def slowest(share: float) -> Figure:
     slow = min(rates, key=lambda name: rates[name])
     fat = max(held, key=lambda name: held[name])
     words = (
-        f"{len(rates)} hostile streams: at least {rates[slow]:.2g} times the line's rate ({slow}), "
-        f"at most {held[fat]:.0f} bytes kept for each ({fat})"
+        f"{len(rates)} hostile streams: at least {rates[slow]:.2g} times as fast as the line"
+        f" ({slow}), at most {held[fat]:.0f} bytes kept for each byte ({fat})"
     )
     return Figure(words, rates[slow] >= 10 and held[fat] < 64)
 

@@ -65,7 +65,7 @@ EVERY = (
     ),
     Promise(
         "P6",
-        "a frame is returned before a longest frame more could arrive",
+        "to return a frame, fewer bytes must follow it than a longest frame has",
         (LIMITS,),
         "",
         figures.delay,
@@ -93,7 +93,8 @@ EVERY = (
         "P10",
         "devices survive unplugging",
         (f"{DEVICE}",),
-        "unplugged 100 times: no frame spliced, no descriptor or thread left",
+        "unplugged 100 times: no frame joins bytes from before and after; no descriptor or thread"
+        " left",
     ),
     Promise(
         "P11",
@@ -129,7 +130,7 @@ EVERY = (
         "P16",
         "clocks are unwrapped",
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
-        "100 turns of 30 s, an hour and 16 bits, with late packets: exact",
+        "clocks of 30 s, an hour and 16 bits, 100 wraps each, with late packets: exact",
     ),
     Promise(
         "P17",
@@ -142,12 +143,12 @@ EVERY = (
         "P18",
         "decoders are independent",
         ("tests/framing/test_framing.py",),
-        "in turns and in 8 threads: as alone",
+        "decoders that run in turns or in 8 threads give the same results as one alone",
     ),
     Promise("P19", "a scan always ends", (SCANS,), "", figures.measure_blocked_rotors),
     Promise(
         "P20",
-        "streams are decoded at 10 times the line rate or faster; under 64 bytes kept per byte",
+        "decoding is 10 times as fast as the line, and keeps less than 64 bytes for each byte",
         (RULE,),
         "",
         figures.slowest,
