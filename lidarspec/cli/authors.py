@@ -166,8 +166,8 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
 @click.option(
     "--vectors",
     metavar="FILE",
-    help="File with example frames and their expected values; default: vectors.json beside the"
-    " modules.",
+    help="File with example frames and their expected values. [default: vectors.json beside the"
+    " module, in its project folder, or in tests]",
 )
 @click.option(
     "-v",

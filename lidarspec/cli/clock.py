@@ -82,7 +82,7 @@ class SourceClock:
     "-t",
     "--duration",
     type=DURATION,
-    help=f"Stop after this time; default: {DEFAULT_DURATION_S:g}s, and all of a file.",
+    help=f"Stop after this time. [default: {DEFAULT_DURATION_S:g}s; for a file, at its end]",
 )
 @click.option(
     "--max-drift",
@@ -204,4 +204,4 @@ def _print_report(
     for label, text in iter_clock_rows(report):
         say(f"  {label:<8}  {text}")
         if label == "offset" and not math.isnan(mutual_s):
-            say(f"  {'':<8}  {mutual_s * 1e3:+.2f} ms to the first source")
+            say(f"  {'':<8}  {mutual_s * 1e3:+.2f} ms from the first source")

@@ -530,7 +530,7 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
         return
     if is_live(source) or source == "-":
         raise UsageError(
-            f"--packets requires to read IN twice, but {source} can be read only once: record it"
+            f"--packets requires reading IN twice, but {source} can be read only once: record it"
             " first"
         )
     with contextlib.closing(open_transport(source)) as opened:

@@ -243,7 +243,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
         order = ""
     name = f" ({match.name})" if match.name else ""
     if match.evidence_bits >= WEAK_BITS:
-        chance = f"1 in {match.odds} by chance"
+        chance = f"probability of a coincidence: 1 in {match.odds}"
     else:
         chance = "may be coincidence"
     lines = [

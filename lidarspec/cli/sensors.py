@@ -126,7 +126,7 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="Show how points are computed, and for what the slow reference evaluator is used.",
+    help="Show how points are computed, and which values need the slow reference evaluator.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:

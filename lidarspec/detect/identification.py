@@ -494,21 +494,18 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     frames = [item.data for item in matches[0].found if item.frame == name]
     ids = " or ".join(score.sensor.id for score in matches)
     text = (
-        f"the constants and lengths of {len(frames)} {name} frames are those of {ids}, but all"
-        " their checksums are wrong"
+        f"{len(frames)} {name} frames have the constants and lengths of {ids}, but all have wrong"
+        " checksums"
     )
     match = next(iter(search(frames, quick=True)), None)
     if match is None:
         return f"{text}; no other checksum algorithm was found"
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
-    where = (
-        f"{match.algorithm.describe()} in {match.place} is correct in {match.right} of"
-        f" {match.total} frames"
-    )
     return (
-        f"{text}; {where}, if it covers {covered} of the {length - match.place.size} other bytes"
-        f" ({match.span.describe(match.place, length)})"
+        f"{text}. Another checksum, {match.algorithm.describe()}, matches {match.place} in"
+        f" {match.right} of {match.total} frames. It covers {covered} of the"
+        f" {length - match.place.size} other bytes ({match.span.describe(match.place, length)})"
     )
 
 

@@ -161,8 +161,8 @@ def find_device(source: str | Path) -> NamedDevice | None:
         raise refusal
     if device.shadowed_file:
         warnings.warn(
-            f"{word}: using the device of {device.file}; the device of {device.shadowed_file}"
-            " is ignored",
+            f"{word}: using the device that {device.file} defines, and ignoring the one in"
+            f" {device.shadowed_file}",
             stacklevel=2,
         )
     return device

@@ -530,7 +530,7 @@ class Session:
             try:
                 request.data = self.sensor.command(request.name, **request.arguments, **provided)
             except UsageError as error:
-                raise CommandError(f"{error}; the sensor has reported this value") from None
+                raise CommandError(f"the sensor reported an invalid value: {error}") from None
 
     def _get_fields(self, frame: str) -> Mapping[str, FieldInfo]:
         return get_codec(self.sensor.frames[frame]).schema.fields

@@ -48,8 +48,7 @@ MIN_VALID_SHARE = 0.95
 #: nibbles.
 NIBBLE_TRIALS = 8
 ANYWHERE_NOTE = (
-    "an XOR of a whole frame fits at several offsets; of these, the offset was chosen whose byte"
-    " varies most"
+    "an XOR over the whole frame fits at several offsets: the byte that varies most was chosen"
 )
 #: Values of `WordXor.head` to try. The next constant contains the values of `WordXor.groups` to
 #: try.

@@ -207,8 +207,8 @@ def add_to_distribution(
             vectors = "[]"
     if f'name = "{names.distribution}"\n' not in project or _ENTRY_POINTS not in project:
         raise UsageError(
-            f"{folder / 'pyproject.toml'} is not the project of {names.distribution},"
-            " or has no table of the entry points lidarspec.sensors"
+            f"{folder / 'pyproject.toml'} does not define the distribution"
+            f" {names.distribution}, or has no table {_ENTRY_POINTS.strip()}"
         )
     module = names.id.partition("-")[2].replace("-", "_")
     if not module.isidentifier():

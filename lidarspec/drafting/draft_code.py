@@ -383,7 +383,7 @@ def _make_checksum_field(draft: Draft, checksum: ChecksumMatch, start: int) -> D
     if checksum.evidence_bits < WEAK_EVIDENCE_BITS:
         chance = "may be coincidence: check with more frames"
     else:
-        chance = f"1 in {checksum.odds} by chance"
+        chance = f"probability of a coincidence: 1 in {checksum.odds}"
     evidence = [
         f"correct in {checksum.right} of {checksum.total} frames, {chance}",
         *checksum.notes,

@@ -91,9 +91,11 @@ class CoveredSpan:
         if self.part == "before":
             return f"the bytes from {self.head} up to the checksum"
         if self.part == "behind":
-            return f"all bytes from {self.head} after the checksum" + (
-                f" except the last {self.tail}" if self.tail else ""
+            omitted = " and ".join(
+                [f"the first {self.head}"] * (self.head > 0)
+                + [f"the last {self.tail}"] * (self.tail > 0)
             )
+            return "all bytes after the checksum" + (f", except {omitted}" if omitted else "")
         return f"all other bytes except the first {self.head}" + (
             f" and the last {self.tail}" if self.tail else ""
         )
@@ -141,8 +143,8 @@ class ChecksumMatch:
         """All remarks for the user."""
         if self.has_constant:
             constant = (
-                "the checksum includes a constant; this may be a start value, or depend on bytes"
-                " that are not covered"
+                "the checksum includes a constant, which may be a start value or the contribution"
+                " of other bytes"
             )
             return (constant, *self.notes)
         return self.notes

@@ -51,11 +51,11 @@ def describe_offset(report: ClockReport) -> str:
         reason = "the clock starts at an arbitrary time"
         if report.epoch in DATED_EPOCHS:
             reason = "the clock has no valid date"
-        return f"{report.offset_s:+.3f} s to the host; {reason}"
+        return f"{report.offset_s:+.3f} s from the host's clock; {reason}"
     text = f"{report.error_s * 1e3:+.2f} ms"
     if abs(report.error_s) >= 1:
         text = f"{report.error_s:+.3f} s"
-    return f"{text} to the host"
+    return f"{text} from the host's clock"
 
 
 def describe_clock(report: ClockReport) -> str:

@@ -189,7 +189,8 @@ def _iter_frame_section(name: str, frame: Frame) -> Iterator[str]:
     size = frame_size(frame)
     remarks = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
     remarks += [f"expected after a `{frame.after}` frame"] * (frame.after is not None)
-    remarks += [f"accepted only if {frame.confirm} or more follow each other"] * (frame.confirm > 1)
+    if frame.confirm > 1:
+        remarks.append(f"accepted only in sequences of at least {frame.confirm} frames")
     remarks += ["checked for plausible values"] * (frame.plausible is not None)
     yield "; ".join(remarks) + "."
     rows = [

@@ -211,8 +211,8 @@ class Column(NDArrayOperatorsMixin):
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
             raise SpecError(
-                f"a column inside {len(own)} nested arrays cannot be moved to {axes}: name as many"
-                " arrays"
+                f"cannot move a column from {len(own)} nested arrays to {', '.join(axes)}: name at"
+                f" least {len(own)} arrays"
             )
         names = {schema.array_depths[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
@@ -618,13 +618,16 @@ def _find_axis(
         if found:
             names = [" x ".join(names) for names in found.values()]
             reason = (
-                f"has the length of several arrays of the frame, {' and '.join(names)}: choose"
-                f" the array, for example with along({found[max(found)][-1]!r}, ...)"
+                f"fits several arrays of the frame, {' and '.join(names)}: choose the array, for"
+                f" example with along({found[max(found)][-1]!r}, ...)"
             )
             break
     else:
         arrays = ", ".join(f"{axis} {length}" for (_, length), axis in whole.items())
-        reason = f"has the length of no array of the frame ({arrays or 'it has no arrays'})"
+        if arrays:
+            reason = f"fits no array of the frame; the arrays have the lengths {arrays}"
+        else:
+            reason = "fits no array, because the frame has no arrays"
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
@@ -658,9 +661,9 @@ def align_points(
         else:
             where = "along another array"
         raise SpecError(
-            f"the points vary {where}, but no field in them does"
-            f" ({_describe_lengths(named, axes)}); use along(...) to set the array along which"
-            " plain numbers vary",
+            f"the points vary {where}, but they use no field of that array"
+            f" ({_describe_lengths(named, axes)}): use along(...) to assign plain numbers to an"
+            " array",
             rule="LS214",
         )
     return arrays, axes, ready, shape

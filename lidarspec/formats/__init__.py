@@ -255,8 +255,8 @@ def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Itera
     ):
         if name in started:
             raise UsageError(
-                f"{name} would be written twice, because the scans of two times have this name; use"
-                " %F, %H, %M and %S in the name"
+                f"{name} would be written twice, because scans of different times have this name:"
+                " use %F, %H, %M and %S in the name"
             )
         started.add(name)
         with system_errors(path):

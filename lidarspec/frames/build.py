@@ -112,7 +112,10 @@ def _merge_values(
         try:
             put_value(merged, split_path(name), new)
         except (AttributeError, TypeError, ValueError):
-            raise UsageError(f"{place}: {name} does not lead to a field of the values") from None
+            raise UsageError(
+                f"{place}: {name} cannot be set in the given values:"
+                " they have no such field, or its array needs an index, as in points[0].distance"
+            ) from None
     return merged
 
 

@@ -147,8 +147,8 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
         is_integer = slot.info.kind == "int" and not slot.info.scaled
         if not is_integer or not low <= declared.kind.low <= declared.kind.high <= high:
             raise SpecError(
-                f"Choice cannot set {declared.path!r}: it requires an integer without a scale, that"
-                " holds each of its numbers",
+                f"Choice cannot set {declared.path!r}: the field must be an integer without a"
+                " scale, with room for all numbers of the Choice",
                 path=place,
                 sensor=sensor.id,
             )

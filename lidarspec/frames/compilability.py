@@ -42,7 +42,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
         case tree.Blob() if in_array and node.ending is not None:
             raise NotCompilableError(
                 node.info.path,
-                "the elements of the array end by their content: use an array of structs",
+                "the content of each element determines its end: use an array of structs",
             )
         case tree.PartSequence() if in_array:
             raise NotCompilableError(path, "it is a sequence of parts inside an array")
@@ -85,7 +85,9 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
             path = _find_measured(part)
             if path and (path in names or (part is alternative and not is_only_one)):
                 raise NotCompilableError(
-                    path, "its size is in its content, and another case has a different field"
+                    path,
+                    "its content determines its size, but another case of the same If or"
+                    " Switch has a different field with this name",
                 )
 
 
@@ -144,7 +146,8 @@ def check_control(info: tree.FieldInfo) -> None:
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,
-            "elements of one array have different layouts: declare it as Parts(struct, count)",
+            "elements of one array have different layouts: declare the array as"
+            " Parts(struct, count)",
         )
     if info.axes or info.kind != "int":
         raise NotCompilableError(

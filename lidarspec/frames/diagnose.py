@@ -76,7 +76,7 @@ class Fault:
         if self.kind == CONDITION:
             return f"{self.path}: the condition is false"
         if self.kind == LENGTH and self.got is None:
-            return f"{self.path}: expected a frame {self.expected}"
+            return f"{self.path}: expected {self.expected}"
         if self.kind == COUNT:
             return f"{self.path}: invalid count or length {self.got}"
         return f"{self.path} at byte {offset}: {self.kind} {self.got}, expected {self.expected}"
@@ -179,7 +179,8 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    return Fault(LENGTH, part.prefix, part.start, "whose parts fill the bytes for parts", None, end)
+    expected = "parts that end where the bytes for parts end"
+    return Fault(LENGTH, part.prefix, part.start, expected, None, end)
 
 
 def _iter_length_faults(
@@ -298,7 +299,7 @@ def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPa
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):
-        return Fault(LENGTH, path, end, "that consists of declared kinds of parts", None, end)
+        return Fault(LENGTH, path, end, "only parts of declared kinds", None, end)
     length = next((each for each in examined.fields() if each.path == path), None)
     if length is not None and length.info.held:
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)

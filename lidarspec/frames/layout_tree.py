@@ -1129,7 +1129,8 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
         endings = make_schema(frame.tree).endings
         if frame.wire is not None and endings:
             raise NotCompilableError(
-                next(iter(endings)), "bytes up to a terminator, in a frame with a wire form"
+                next(iter(endings)),
+                "a frame with a wire form cannot contain bytes up to a terminator",
             )
         return HeaderTree(frame.tree, frame.max_struct_bytes)
     except NotCompilableError as reason:

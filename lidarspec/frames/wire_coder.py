@@ -284,7 +284,7 @@ def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[st
     if is_text:
         expected = f"{size} characters of text"
     else:
-        expected = f"a number of {size} bytes"
+        expected = f"a {size}-byte number"
     return path, offset, expected
 
 

@@ -293,7 +293,7 @@ def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     else:
         labels = {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
-    return [*cases, (f"if {key} is another value", node.default)]
+    return [*cases, (f"for all other values of {key}", node.default)]
 
 
 def describe_end(node: tree.PartSequence) -> str:
@@ -312,8 +312,8 @@ def describe_end(node: tree.PartSequence) -> str:
         )
     )
     return (
-        f"the first part has {format_formula(node.size)} bytes; {following} of each part is the"
-        " size of the next part; it is 0 in the last part"
+        f"the first part has {format_formula(node.size)} bytes, and {following} of each part is"
+        " the size of the next part, or 0 in the last part"
     )
 
 

@@ -225,8 +225,8 @@ def pack_record(
         )
     except struct.error:
         raise UsageError(
-            f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver} exceeds the"
-            " limits of the format"
+            f"the recording cannot store {len(data)} bytes from {sender} to {receiver} with the"
+            f" time {at} ns: a value exceeds the limits of the format"
         ) from None
     body = b"".join((head, addresses, data))
     return body + _CRC.pack(zlib.crc32(body))

@@ -227,6 +227,6 @@ def describe_sector(sector: Sector) -> str:
     if sector.contains(0.0):
         angles.reverse()
     return (
-        f"no revolution has points from about {angles[0]:.0f} to {angles[1]:.0f} degrees; this"
-        " sector is assumed to be masked: it is not counted as loss, and scans are cut in it"
+        f"no revolution has points from about {angles[0]:.0f} to {angles[1]:.0f} degrees. The"
+        " sector is assumed to be masked: it does not count as loss, and scans begin in it"
     )

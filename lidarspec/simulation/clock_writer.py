@@ -260,7 +260,7 @@ class ClockWriter:
             base = np.datetime64(self.read(table).item() // DAY_NS, "D")
             self._date = _DateFields(*paths, base, (year, month, day))
         elif date:
-            raise self._make_error("not all fields of its date were found")
+            raise self._make_error("some fields of its date were not found")
         self._set_fields(linear)
 
     def _set_fields(self, fields: list[_TimeField]) -> None:

@@ -338,7 +338,7 @@ class Checksummed(layer.SealedStruct):
                 "",
                 0,
                 "a checksum algorithm",
-                "none; a lidarspec_checksum hook must provide it",
+                "none: implement the hook lidarspec_checksum, or pass algorithm= to Checksummed",
                 "checksum",
             )
         return self.algorithm(
@@ -434,8 +434,8 @@ class Parts(layer.Partition):
             following is None
         ):
             raise SpecError(
-                "Parts requires count=, or within=, or size= with following=; only one of them"
-                " may determine the last part"
+                "Parts requires exactly one way to find the last part: count=, or within=, or"
+                " size= together with following="
             )
         if isinstance(kinds, Mapping):
             self.cases = dict(kinds)

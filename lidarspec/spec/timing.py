@@ -41,7 +41,7 @@ EPOCHS = MappingProxyType(
         "boot": "time since power-up",
         "utc": "UTC since 1970",
         "tai": "TAI since 1970, as PTP grandmasters distribute it",
-        "gps": "GPS time, counted from 1970",
+        "gps": "GPS time, in seconds since 1970",
         "hour": "UTC since the last full hour",
     }
 )

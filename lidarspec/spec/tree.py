@@ -1131,7 +1131,7 @@ class Scope:
         self.asked += [part] if isinstance(part, Ref) else part.refs
         if name in self.ambiguous:
             raise UntraceableExpressionError(
-                f"an expression uses {name!r}, which has several forms"
+                f"an expression uses {name!r}, which is declared differently in several branches"
             )
         if isinstance(part, Value):
             return part.read()
@@ -1210,7 +1210,7 @@ class OuterScope(Scope):
 
 
 #: The reason why a number that has a name in an Enum is never equal to a parsed value.
-NAME_IS_COMPARED = "construct compares the name of a code"
+NAME_IS_COMPARED = "construct compares the name of an Enum value, not its number"
 
 
 class UntraceableExpressionError(Exception):
@@ -1248,7 +1248,9 @@ class Symbol:
             path = f"{known.path}[{key}]"
             info = get_element(known.info, path, {known.info.axes[0]: key})
             return Symbol(Ref(path, info or known.info))
-        raise UntraceableExpressionError("an expression uses an element of an array, or a byte")
+        raise UntraceableExpressionError(
+            "an expression uses an element of an array, or a byte of a field"
+        )
 
 
 def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:

@@ -354,8 +354,8 @@ def _refuse_whole_turns(turn: Array, full: float) -> None:
             f" from its start by a multiple of a revolution ({full:g})"
         )
         raise SpecError(
-            f"{reason}. Pass one revolution in the unit of the angles as full=; use steps(count)"
-            " for the indices of the samples in a packet",
+            f"{reason}. Pass one revolution in the unit of the angles as full=, for example 360"
+            " for degrees. If the result is the index of each sample, use steps(count) instead",
             rule="LS215",
         )
 

@@ -826,8 +826,8 @@ class Echoes:
         room = self.most * self.size
         if len(characters) % room:
             raise SpecError(
-                f"the characters after the head must be a multiple of {room} ({self.most} echoes"
-                f" of {self.size} characters), got {len(characters)} characters",
+                f"the number of characters after the head must be a multiple of {room}"
+                f" ({self.most} echoes of {self.size} characters), got {len(characters)}",
                 path="wire",
             )
         echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
@@ -995,7 +995,7 @@ class Lines:
             )
         if self.numbers is not None and self.numbers.echoes is not None and not self.head:
             raise SpecError(
-                "steps with echoes require lines with a head",
+                "numbers with echoes require a head: pass head= to Lines",
                 path="wire",
             )
 

@@ -210,13 +210,10 @@ def _check_learned_options(subject: SensorUnderTest, name: str, reply: Reply) ->
             sensor.configure(**values)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
-            which = "with"
+            which = "that answers= of the Simulation provides"
         else:
-            which = "without"
-        what = (
-            f"no options can be read from the reply, which was simulated {which} answers= of the"
-            f" Simulation: {error}"
-        )
+            which = "that was simulated without answers="
+        what = f"the options in the reply {which} cannot be read: {error}"
         raise ViolationError("LS604", what, f"commands.{name}") from error
 
 

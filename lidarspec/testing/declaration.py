@@ -483,7 +483,8 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        yield "LS204", f"{share:.1%} of the offsets in its content match its constant bytes", name
+        what = f"its constant bytes also occur at {share:.1%} of the offsets in its content"
+        yield "LS204", what, name
 
 
 def _check_strength(
@@ -593,7 +594,7 @@ def _check_range_limit(subject: SensorUnderTest) -> Findings:
         declared = "{:g} .. {:g}".format(*limits)
         held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
         subject.picture[f"{name}: range"] = (
-            f"{held[0]:.4g} .. {held[1]:.6g} m can be represented, and range_limits are"
+            f"the field can represent {held[0]:.4g} .. {held[1]:.6g} m; range_limits are"
             f" {declared} m"
         )
         reach.append((held[1], f"{name}.{info.path}"))

@@ -451,7 +451,7 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
         if one_way < MIN_ONE_WAY_SHARE:
             message = (
                 f"only {one_way:.0%} of the steps of the azimuth have the same direction, but a"
-                " scan ends where it wraps"
+                " scan ends where the azimuth wraps"
             )
             require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
         elif back.any():

@@ -101,7 +101,7 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     ),
     "units": ("an object of numbers", lambda value: _is_table(value, _is_number)),
     "points": (
-        "an object that maps the numbers of points to objects of columns with numbers",
+        'an object of points, such as {"0": {"x": 1.5, "ring": 3}}',
         _are_points,
     ),
 }
@@ -222,12 +222,12 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     ]
     ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
     if len(ranges):
-        seen = f"{ranges.min():.4g} .. {ranges.max():.4g} m"
+        seen = f"ranges {ranges.min():.4g} .. {ranges.max():.4g} m"
     else:
         seen = "no returns"
     number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
     subject.picture[f"{name}: vectors"] = (
-        f"{seen} in {len(vectors)} vectors, with x and y in {number}"
+        f"{seen} in {len(vectors)} vectors; the points are in {number}"
     )
     assert subject.sensor.range_limits is not None  # every sensor with points has them
     far = subject.sensor.range_limits[1]

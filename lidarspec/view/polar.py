@@ -38,7 +38,9 @@ def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppear
     side, scale = _draw_from_side(
         cloud, width, max(height - 1 - above, 1), look, _find_scale(width, above, look.reach)
     )
-    title = "─ from the right, forward is right" + (f", heights x{scale} " if scale > 1 else " ")
+    title = "─ seen from the right, forward is right" + (
+        f", heights x{scale} " if scale > 1 else " "
+    )
     whole.write(above, 0, title.ljust(width, "─"), FAINT)
     whole.write(above, 2, title[2:].rstrip("─ "), LABEL)
     whole.paste(above + 1, 0, side)

@@ -188,7 +188,7 @@ class _ViewDrawer:
             f"<g {_style_of('text')}>{''.join(labels.parts)}</g>",
             f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_style_of("head")}/>',
         ]
-        return _View("from above, forward is up", parts, top, bottom - top, dots)
+        return _View("seen from above, forward is up", parts, top, bottom - top, dots)
 
     def draw_from_side(self) -> _View:
         """Draw height lines, points and the sensor, from the side with forward right."""
@@ -215,7 +215,9 @@ class _ViewDrawer:
         labels = _Labels(side, 0, height)
         for mark in marks:
             labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
-        title = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
+        title = (
+            f"seen from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
+        )
         dots, paths = self._draw_dots(
             across + self.cloud.x * scale, level - self.cloud.z * steep, height
         )

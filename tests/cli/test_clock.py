@@ -67,7 +67,7 @@ def test_sources_are_compared_with_the_first(tmp_path: Path) -> None:
     assert [report["source"] for report in reports] == [str(first), str(second)]
     assert reports[0]["to_first_s"] is None
     assert reports[1]["to_first_s"] == pytest.approx(2e-3, abs=1e-6)
-    assert "+2.00 ms to the first source" in ran("clock", first, second).stdout
+    assert "+2.00 ms from the first source" in ran("clock", first, second).stdout
 
 
 def test_a_live_source_ends_beside_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

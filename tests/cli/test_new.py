@@ -261,7 +261,7 @@ def test_a_second_model_joins_a_distribution(tmp_path: Path) -> None:
     assert "ACME Robotics X1 Pro" in run(folder, "lidarspec", "show", "acme-x1")
     assert "exists already" in ran("new", "acme-2d-x", *family, code=2).stderr
     assert (
-        "is not the project of lidarspec-other"
+        "does not define the distribution lidarspec-other"
         in ran(
             "new",
             "acme-x3",

@@ -136,5 +136,5 @@ def test_a_path_that_the_frame_does_not_have_is_refused() -> None:
     for path in ("flags.n.q", "numbers.q", "flags v", "flags..n", ""):
         with pytest.raises(UnknownField):
             ours.build("data", value, **{path: 7})
-    with pytest.raises(UsageError, match=r"rows\.x does not lead"):
+    with pytest.raises(UsageError, match=r"rows\.x cannot be set"):
         ours.build("data", value, **{"rows.x": 7})

@@ -489,10 +489,15 @@ PLAIN: dict[str, Case] = {
         reason="a PrefixedArray or FocusedSeq must be a named",
     ),
     "VarInt in an array": case(
-        "a" / Array(2, VarInt), "b" / Int8ub, frames="8101020c 01020c", reason="by their content"
+        "a" / Array(2, VarInt),
+        "b" / Int8ub,
+        frames="8101020c 01020c",
+        reason="content of each element",
     ),
     "CString in an array": case(
-        "a" / Array(2, CString("utf8")), frames="61620000 00c3a900", reason="by their content"
+        "a" / Array(2, CString("utf8")),
+        frames="61620000 00c3a900",
+        reason="content of each element",
     ),
     "NullTerminated that keeps its end": case(
         "a" / NullTerminated(GreedyBytes, require=False),
@@ -532,7 +537,7 @@ PLAIN: dict[str, Case] = {
     "If in elements of elements": case(
         "r" / Array(2, Array(1, Struct("k" / Int8ub, "v" / If(this.k, Int8ub)))),
         frames="000102 0000",
-        reason="declare it as Parts(struct, count)",
+        reason="declare the array as Parts(struct, count)",
     ),
     "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
     "GreedyRange": case(
@@ -758,7 +763,7 @@ REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
         "ExprAdapter changes 128 to 0",
     ),
     "Optional": (lambda: construct.Optional(Byte), "use If or Switch"),
-    "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array inside it"),
+    "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array without Slicing"),
     "FocusedSeq of two": (lambda: FocusedSeq("v", "k" / Byte, "v" / Byte), "loses 'k'"),
     "ProcessXor before others": (
         lambda: Struct("x" / ProcessXor(1, GreedyBytes), "y" / Byte),

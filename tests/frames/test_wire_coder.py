@@ -312,7 +312,7 @@ def test_a_fault_has_its_place_on_the_wire() -> None:
     assert (fault.value.path, fault.value.offset, fault.value.expected) == (
         "b",
         5,
-        "a number of 2 bytes",
+        "a 2-byte number",
     )
     with pytest.raises(WireError) as fault:
         ESCAPED.parse(ESCAPED.example("data")[:-3] + b"\x00\x00\x7e")
@@ -341,7 +341,7 @@ def test_declarations_that_cannot_be_are_refused() -> None:
     with pytest.raises(SpecError, match="head"):
         Lines(64) | SixBits(echoes=Echoes(3, 3))
     struct = Struct("kind" / Const(b"ND"), "echoes" / Array(2, Int24ub))
-    with pytest.raises(SpecError, match="6 characters"):
+    with pytest.raises(SpecError, match="got 6"):
         sensor(struct, Lines(64, head=(2,)) | SixBits(echoes=Echoes(3, 3))).example("data")
     with pytest.raises(SpecError, match="differ"):
         Escaped(0x7E, 0x5E)

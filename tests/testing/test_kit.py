@@ -563,7 +563,7 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     )
     (empty,) = finding(learning, page)
     assert empty.startswith(
-        "LS604 commands.ask: no options can be read from the reply, which was simulated"
+        "LS604 commands.ask: the options in the reply that was simulated without answers="
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
@@ -650,8 +650,8 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
         ),
         ('[{"units": {"a": "1"}}]', "units: expected an object of numbers"),
         ('[{"units": {"a": NaN}}]', "units: expected an object of numbers"),
-        ('[{"points": {"a": {}}}]', "points: expected an object that maps the numbers of points"),
-        ('[{"points": {"0": [1]}}]', "points: expected an object that maps the numbers of points"),
+        ('[{"points": {"a": {}}}]', "points: expected an object of points"),
+        ('[{"points": {"0": [1]}}]', "points: expected an object of points"),
         ('[{"args": 1}]', "args: expected an object of numbers and strings"),
     ],
 )

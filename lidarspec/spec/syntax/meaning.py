@@ -592,8 +592,8 @@ class _Builder:
             return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
             reason = (
-                "the elements have different sizes, and fill a length: use Parts(element,"
-                " within=...)"
+                "the number of elements is unknown, because they differ in size: use"
+                " Parts(element, within=...)"
             )
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.bytes_left, size), element)
@@ -1105,9 +1105,9 @@ _OPAQUE_REASONS = {
     "VarInt": _VARIABLE_REASON.format("VarInt"),
     "ZigZag": _VARIABLE_REASON.format("ZigZag"),
     "FocusedSeq": (
-        "a PrefixedArray or FocusedSeq must be a named member of a Struct, and its parts other than"
-        " the value must have a fixed size and use no fields, except for the count of an array:"
-        " Struct('points' / PrefixedArray(...))"
+        "a PrefixedArray or FocusedSeq must be a named member of a Struct:"
+        " Struct('points' / PrefixedArray(...)). Its parts, except the value, must have a fixed"
+        " size. Only the count of an array may use fields"
     ),
     "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",

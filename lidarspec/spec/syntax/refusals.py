@@ -58,8 +58,11 @@ _REFUSED: dict[type, tuple[str, str]] = {
             " Struct: Struct('part' / Aligned(4, ...))"
         ),
     ),
-    construct.Slicing: ("LS106", "Slicing loses the other elements: use the Array inside it"),
-    construct.Indexing: ("LS106", "Indexing loses the other elements: use the Array inside it"),
+    construct.Slicing: (
+        "LS106",
+        "Slicing loses elements of its array: use the Array without Slicing",
+    ),
+    construct.Indexing: ("LS106", "Indexing keeps one element and loses the others: use the Array"),
     construct.Pointer: (
         "LS112",
         "Pointer reads outside the frame: declare fields in the order of the wire",
@@ -288,7 +291,9 @@ def _check_measures(
     )
     if is_number and measures_by_path.setdefault(path, measure) != measure:
         raise SpecError(
-            "its branches have different scales or units: use a different name for each", path=path
+            "its branches have different scales or units: give the field another name in each"
+            " branch",
+            path=path,
         )
     for child in children(con):
         if not isinstance(con, Struct) or child.name is not None:

@@ -106,8 +106,8 @@ def make_ack(header: bytes) -> Checksummed:
             "header" / Const(header),
             "mode"
             / Enum(Int8ul, **{name: mode ^ 0xA0 for name, mode in MODES.items()})
-            * "mode of the command ^ A0",
-            "length" / Const(7, Int8ul) * "bytes of data: firmware and reserved",
+            * "mode of the command, XOR A0",
+            "length" / Const(7, Int8ul) * "number of data bytes: firmware and reserved",
             "firmware" / Int8ul * "in the reply to start: 3 is V3.0",
             "reserved" / Bytes(6),
             "checksum" / Int8ul,
@@ -120,7 +120,7 @@ def make_ack(header: bytes) -> Checksummed:
 INFO = Checksummed(
     Struct(
         "header" / Const(b"\xa5\x5a"),
-        "length" / Const(20, Int16ul) * "bytes of data after the type",
+        "length" / Const(20, Int16ul) * "number of data bytes after the type",
         "sum" / Int16ul,
         "type" / Const(0x01, Int8ul) * "device information",
         "model" / Bytes(12) * "ASCII, terminated by 00",
@@ -458,7 +458,7 @@ def reports_firmware(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits above the lowest one of the third byte, which are not a constant firmware",
+    "bits 1 to 7 of the third byte are set, but do not contain a constant firmware number",
     has_bits_beside_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
@@ -525,8 +525,8 @@ M1C1_MINI = Sensor(
     },
     status="vectors",
     source=(
-        "CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC"
-        " from the vendor's SDK"
+        "CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; vendor's SDK (baud"
+        " rate, command FC)"
     ),
 )
 

@@ -132,7 +132,7 @@ def make_packet(
         *version,
         "status_version"
         / Int8ul
-        * "version of the tail, which differs between models with the same protocol version",
+        * "version of the tail; models with the same protocol version can have different tails",
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
@@ -171,13 +171,13 @@ def plausible(f: Fields) -> Any:
 
 #: Findings of `lidarspec check` that apply to these packets.
 UNSEEN = (
-    "not tested with packets of this model: the bytes covered by its CRCs are unknown, so they"
-    " are not checked"
+    "not tested with packets of this model; its CRCs are not checked, because it is unknown which"
+    " bytes they cover"
 )
 ACKNOWLEDGED = {
     "LS205": (
-        "in a captured stream, no CRC covered the header, the version of the safety part and the"
-        " signature"
+        "according to a captured stream, the CRCs do not cover the header, the version of the"
+        " safety part or the signature"
     )
 }
 

@@ -246,7 +246,7 @@ M10_GPS_DATA = Frame(Struct(*M10_FIELDS, *TIME, "end" / END), data=True, plausib
 M10P_DATA = Frame(
     Struct(
         "header" / START,
-        "length" / Int16ub * "bytes of the packet",
+        "length" / Int16ub * "number of bytes of the packet",
         "start_angle" / ANGLE,
         "period" / PERIOD,
         "samples" / Array((this.length - 20) // 2, SAMPLE),

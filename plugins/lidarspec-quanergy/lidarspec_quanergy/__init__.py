@@ -64,7 +64,7 @@ def make_header(kind: int, size: int) -> tuple[Construct, ...]:
     """Return the header fields of a packet with this kind and total size in bytes."""
     return (
         "signature" / Const(b"\x75\xbd\x7e\x97"),
-        "size" / Const(size, Int32ub) * "bytes of the packet",
+        "size" / Const(size, Int32ub) * "number of bytes of the packet",
         "seconds" / Scaled(Int32ub, 1, "s") * "time since 1970",
         "nanoseconds" / Scaled(Int32ub, 1e-9, "s"),
         "version" / Bytes(3),

@@ -239,7 +239,8 @@ HELIOS_16P = Sensor(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios32": Relative(
-            "pairs of blocks with one azimuth; or one packet every 0.67 ms", has_block_pairs
+            "pairs of blocks have the same azimuth, or one packet arrives every 0.67 ms",
+            has_block_pairs,
         ),
     },
     source=(
@@ -266,7 +267,8 @@ HELIOS_32 = dataclasses.replace(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(
-            "equal halves of blocks; or one packet every 1.33 ms", has_equal_halves
+            "both halves of a block are equal, or one packet arrives every 1.33 ms",
+            has_equal_halves,
         ),
     },
     status="manual",

@@ -156,7 +156,7 @@ E1_DIFOP = Struct(
     "frame_rate" / Scaled(Int8ub, 1, "Hz"),
     "return_mode"
     / Enum(Int8ub, farthest=0, strongest=4, nearest=7, second_strongest=8)
-    * "9 to 11: dual return, two of these returns",
+    * "9 to 11: dual return",
     "time_sync_mode" / Enum(Int8ub, **{"internal": 0, "E2E L2": 2, "gPTP": 3}),
     "time_sync_status" / Enum(Int8ub, failed=0, success=1, timeout=2),
     *TIME,

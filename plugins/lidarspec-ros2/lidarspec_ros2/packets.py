@@ -87,7 +87,9 @@ class PacketTransport(LiveTransport):
         """Do nothing, because a topic does not disappear."""
 
     def write(self, data: bytes) -> None:
-        raise SourceError(f"cannot send to {self.label}: it is a topic of packets")
+        raise SourceError(
+            f"cannot send to {self.label}: it is a ROS topic, from which packets can only be read"
+        )
 
     def close(self) -> None:
         self.closed = True

@@ -129,10 +129,10 @@ def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
-        f"Fast DDS uses its default transports, which lose clouds of {size} with best effort,"
-        f" because {SHARED_MEMORY_DIR} has only {format_megabytes(free)} of the required"
-        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} free; in a container, use docker run"
-        " --shm-size=512m or --ipc=host, or publish with qos:=reliable"
+        f"{SHARED_MEMORY_DIR} has only {format_megabytes(free)} free, but"
+        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} are required: Fast DDS uses its"
+        f" default transports, and clouds of {size} may be lost with best effort. Set"
+        " qos:=reliable, or, in a container, use docker run --shm-size=512m or --ipc=host"
     )
     return SharedMemory(warning=warning)
 

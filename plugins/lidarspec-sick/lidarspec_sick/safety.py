@@ -76,7 +76,7 @@ DATAGRAM = Struct(
     "protocol" / Int16ub,
     "major" / Int8ub,
     "minor" / Int8ub,
-    "total_length" / Int32ul * "bytes of the message",
+    "total_length" / Int32ul * "number of bytes of the message",
     "identification" / Int32ul * "message counter",
     "fragment_offset" / Int32ul * "offset of this datagram in the message, in bytes",
     "reserved" / Bytes(4),

@@ -53,7 +53,7 @@ def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Fr
     """Return the frame of CoLa B: four bytes 02, a length, the content, and its XOR."""
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
-        "length" / SizeOf(Int32ub, plus=-9) * "bytes of the content",
+        "length" / SizeOf(Int32ub, plus=-9) * "number of bytes of the content",
         *parts,
         "checksum" / Int8ub,
     )

@@ -186,7 +186,7 @@ def make_rplidar(
         turn=turn,
         relatives={
             f"slamtec-rplidar-{other.lower()}": (
-                "no document describes a difference between the data; the label names the model"
+                "no document describes a difference in the data; the label names the model"
                 if {name, other} == {*SAME_MODEL_NUMBER}
                 else "info.model"
             )

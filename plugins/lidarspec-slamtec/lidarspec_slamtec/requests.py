@@ -68,7 +68,7 @@ PLAIN = Struct(
 )
 PAYLOAD = make_request(
     "cmd" / Enum(Int8ul, **PAYLOAD_CODES) * "code of the command, 80 or more",
-    "size" / Int8ul * "bytes of the payload",
+    "size" / Int8ul * "number of bytes of the payload",
     "payload" / Bytes(this.size),
 )
 

@@ -70,7 +70,7 @@ def make_ubx(message: bytes, size: int, *fields: Construct) -> Construct:
         Struct(
             "sync" / Const(SYNC),
             "message" / Const(message) * "class and id",
-            "length" / Const(size, Int16ul) * "bytes of the payload",
+            "length" / Const(size, Int16ul) * "number of bytes of the payload",
             *fields,
             "checksum" / Int16ul,
         ),

@@ -120,8 +120,8 @@ class Connections:
         if not self._has_reported:
             self._has_reported = True
             self._report(
-                f"there are more than {MAX_CONNECTIONS} connections; those without the token are"
-                " closed first"
+                f"there are more than {MAX_CONNECTIONS} connections; connections without the"
+                " token are closed first"
             )
 
     def _close_waiting(self, client: Client) -> None:

@@ -60,7 +60,9 @@ def test_idle_connections_make_way_for_a_page(station: Station) -> None:
             for page in (before, after):
                 assert page.scan()[1]["x"].size
     told = [text for text in station.said if not text.startswith("page ")]
-    assert told == ["there are more than 8 connections; those without the token are closed first"]
+    assert told == [
+        "there are more than 8 connections; connections without the token are closed first"
+    ]
 
 
 def test_pages_do_not_make_way(station: Station) -> None:
