@@ -45,10 +45,11 @@ class ArrivalOrder:
     def push(
         self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
     ) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet in the stream, (n,), and the breaks before packets, (n,).
+        """Return the index of each packet in the stream, and the breaks before packets.
 
-        The index also counts lost packets. There is a break before a packet if packets are lost
-        before it, or if `batch` has a break there because of skipped bytes.
+        Both have the shape (n,). The index also counts lost packets. There is a break before a
+        packet if packets are lost before it, or if `batch` has a break there because of skipped
+        bytes.
 
         Args:
             batch: the packets.
@@ -64,7 +65,7 @@ class ArrivalOrder:
             rows = skipped_rows
             missing = skipped_packets
         else:
-            rows, missing = self._read_clock(
+            rows, missing = self._find_gaps(
                 self._clock, batch, times, skipped_rows, skipped_packets
             )
         if not missing.any():
@@ -75,7 +76,7 @@ class ArrivalOrder:
         return partial(_make_index_with_gaps, first, count, rows, missing), batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clocks of the last and next packet, because input was lost."""
+        """Forget the last clock reading, because input was lost."""
         self._time = None
 
     def _count_skipped(
@@ -99,7 +100,7 @@ class ArrivalOrder:
         self._largest = max(self._largest, int(sizes.max()) if size is None else size)
         return rows, packets
 
-    def _read_clock(
+    def _find_gaps(
         self,
         clock: Clock,
         batch: Batch,
@@ -107,9 +108,16 @@ class ArrivalOrder:
         skipped_rows: NDArray[np.intp],
         skipped_packets: NDArray[np.int64],
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows that may follow a gap, and the number of packets missing there.
+        """Return the rows after possible gaps, and the number of packets missing in each.
 
-        The missing packets are also added to `Counters.lost`, unless the clock was set.
+        The missing packets are added to `Counters.lost`, unless the clock was set.
+
+        Args:
+            clock: the clock of the packets.
+            batch: the packets.
+            times: times by this clock, (n,) ns.
+            skipped_rows: the rows after skipped bytes, (k,).
+            skipped_packets: the number of packets that the skipped bytes may have contained, (k,).
         """
         steps = np.diff(times, prepend=times.item(0) - 1 if self._time is None else self._time)
         self._time = times.item(-1)

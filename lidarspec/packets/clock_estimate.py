@@ -5,8 +5,8 @@ arrival time, by the host's clock, has the correct rate, but is late by some mil
 vary from packet to packet with the line and the operating system. A packet is never early.
 
 In this module, the delay of a packet is its arrival time minus the sensor's time. Over the sensor's
-time, all delays lie above a line, and many lie close to it. This is the line of packets that arrive
-at once. Its height is the offset between the clocks, and its slope is the drift.
+time, all delays lie above a line, and many lie close to it. This line is the shortest delay that a
+packet can have. Its height is the offset between the clocks, and its slope is the drift.
 
 The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
 computes their lower convex hull. The line continues the edge of the hull at the middle of the
@@ -57,7 +57,7 @@ MIN_LATE_SPREADS = 4  # minimum of lateness divided by spread, if they are only 
 
 
 class ClockSample(NamedTuple):
-    """A time of the sensor, and the delay until its arrival, ns."""
+    """The time of a packet by the sensor's clock, and the delay of the packet, ns."""
 
     device: int
     delay: int
@@ -69,11 +69,11 @@ class ClockSample(NamedTuple):
 
 
 class ClockLine(NamedTuple):
-    """The line of packets that arrive at once: a point on it, and its slope.
+    """The shortest delay of packets as a linear function of the sensor's time.
 
     Attributes:
-        device: a time of the sensor, ns.
-        delay: the delay of the line at this time, ns.
+        device: any time by the sensor's clock, ns.
+        delay: the shortest delay at this time, ns.
         slope: the change of the delay divided by the change of the sensor's time.
     """
 
@@ -137,12 +137,12 @@ class DeviceClock:
 
     @property
     def is_uncertain(self) -> bool:
-        """Whether the newest packets deviate from the line, so that the clock may have been set."""
+        """Whether the newest packets suggest that the clock was set."""
         return bool(self._outliers)
 
     @property
     def is_settled(self) -> bool:
-        """Whether the line is reliable: ten seconds after the start or a change of the clock."""
+        """Whether ten seconds have passed since the start or a jump of the clock."""
         return len(self._min_delays) >= SETTLED_PARTS
 
     def delays_above_line(self, device: Times, host: Times) -> NDArray[np.float64]:
@@ -156,7 +156,7 @@ class DeviceClock:
         return host - device - expected
 
     def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> list[ClockJump]:
-        """Update the conversion with packets, and return the changes of the clock among them.
+        """Update the conversion with packets, and return the jumps of the clock.
 
         Args:
             device_ns, host_ns: the times of the packets by the sensor's clock, and their arrival
@@ -173,12 +173,12 @@ class DeviceClock:
         return jumps
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
-        """Return the time of a scan by the host's clock, later than all earlier stamps.
+        """Return the time of a scan by the host's clock, ns.
 
-        This also updates the conversion.
+        The time is later than all earlier stamps. The scan updates the conversion.
 
         Args:
-            device_ns: the time of the first point of the next scan.
+            device_ns: the time of the scan's first point by the sensor's clock, ns.
             host_ns: the arrival time of the packet with this point, ns.
         """
         self.observe(device_ns, host_ns)
@@ -193,12 +193,11 @@ class DeviceClock:
     def stamp_packets(self, device: Times, host: Times) -> Times:
         """Return the times of packets by the host's clock, (n,) ns.
 
-        Each time is later than all earlier stamps. The conversion is updated once for each quarter
-        of a second. While the clock does not run evenly, it is updated with each packet, as `stamp`
-        does.
+        Each time is later than all earlier stamps. The packets update the conversion.
 
         Args:
-            device, host: as for `observe`.
+            device: the times of the packets by the sensor's clock, (n,) ns.
+            host: the arrival times of the packets, (n,) ns.
         """
         stamps = np.empty(len(device), np.int64)
         for part in split_runs(device // PART_NS):
@@ -210,7 +209,7 @@ class DeviceClock:
         return stamps
 
     def _is_regular(self, device: Times, host: Times) -> bool:
-        """Return whether packets are in order, and the line is reliable and close to them."""
+        """Return whether packets are in order and close to a reliable line."""
         if self._last_stamped is None or self._outliers or not self.is_settled or not len(device):
             return False
         if (np.diff(device, prepend=self._last_stamped.device) <= 0).any():
@@ -219,9 +218,10 @@ class DeviceClock:
         return bool(-EARLY_LIMIT_NS < lowest < LATE_LIMIT_NS)
 
     def _stamp_part(self, device: Times, host: Times) -> Times:
-        """Return the host's times of the packets of a quarter of a second, (n,) ns.
+        """Return the times of regular packets by the host's clock, (n,) ns.
 
-        The delay changes evenly from the delay of the previous packet to the delay of the last one.
+        The packets are from one quarter of a second. Their delays are interpolated between the
+        delays of the previous packet and of the last packet.
         """
         before = self._last_stamped
         assert before is not None
@@ -240,9 +240,9 @@ class DeviceClock:
         return stamps
 
     def _slewed_delay(self, device: int) -> int:
-        """Return the delay of the stamp at a time of the sensor, ns.
+        """Return the delay to add to a time of the sensor to get its stamp, ns.
 
-        If the line has changed, the delays of successive stamps approach it smoothly.
+        If the line has changed, the delay approaches it smoothly.
         """
         if self._last_stamped is None:
             return self._line.delay_at(device)
@@ -281,7 +281,7 @@ class DeviceClock:
         return None
 
     def _forget_offset(self) -> None:
-        """Forget all samples, but not the drift."""
+        """Forget the offset of the clock, but not the drift."""
         self._min_delays.clear()
         self._outliers.clear()
         self._last_stamped = None
@@ -313,9 +313,9 @@ class DeviceClock:
         )
 
     def _restart_at_outliers(self) -> ClockJump:
-        """Restart with the newest outliers, because the clock was set; keep the drift.
+        """Restart the estimate with the newest outliers, and return the clock's jump.
 
-        Returns the jump of the clock.
+        The drift is kept.
         """
         outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
         self.jumps += 1
@@ -348,10 +348,9 @@ class DeviceClock:
 
 
 def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
-    """Fit a line below the samples, and return it.
+    """Fit a line below the samples, as high as possible, and return it.
 
-    The slope is `slope_before`, limited to the slopes of the hull shortly before and after the
-    middle of the samples. The line is as high as possible with this slope.
+    The line keeps the slope `slope_before`, unless the lower hull of the samples contradicts it.
 
     Args:
         samples: one or more samples in order.

@@ -14,7 +14,7 @@ from lidarspec.spec.timing import DAY_S
 
 
 class FindingType(NamedTuple):
-    """The texts of a code, with attributes of `ClockFinding` in braces.
+    """A kind of finding. In its texts, braces name attributes of `ClockFinding`.
 
     Attributes:
         text: what was found.

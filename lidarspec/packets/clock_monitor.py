@@ -219,7 +219,7 @@ class ClockMonitor:
         return -self._estimate.offset_ns / 1e9
 
     def _find_jitter_ms(self) -> float:
-        """Return the delay that few of the newest packets exceed, ms."""
+        """Return the 95th percentile of the delays of the newest packets, ms."""
         return float(np.percentile(self._delays, JITTER_PERCENTILE)) / 1e6
 
     @property
@@ -392,7 +392,10 @@ def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
 
 
 def _is_at_month_end(host_ns: int) -> bool:
-    """Return whether a time is near the end of a month in UTC, when leap seconds are inserted."""
+    """Return whether a leap second may be inserted near a time.
+
+    Leap seconds are inserted at the end of a month in UTC.
+    """
     moment = np.datetime64(host_ns, "ns")
     nearest_day = (moment + np.timedelta64(DAY_S // 2, "s")).astype("datetime64[D]")
     is_first = nearest_day == nearest_day.astype("datetime64[M]")

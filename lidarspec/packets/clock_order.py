@@ -156,9 +156,7 @@ class ClockOrder:
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Store consecutive packets as the newest packets.
-
-        Returns the index of the first of them in the packets received so far.
+        """Store consecutive packets, and return the index of the first of them.
 
         Args:
             start: the row of the first packet.
@@ -179,9 +177,10 @@ class ClockOrder:
         return first
 
     def _place(self, batch: Batch, row: int, time: int, pace: float) -> RecentPacket:
-        """Return the order and index of a packet that does not directly follow the newest.
+        """Store a packet that does not directly follow the newest packet, and return it.
 
-        This also updates the counters of lost, late and duplicate packets.
+        For a duplicate, returns the packet that was stored first. The counters of lost, late and
+        duplicate packets are updated.
         """
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
@@ -233,22 +232,22 @@ class ClockOrder:
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock returns to its value before the last leap."""
+        """Return whether the clock is back at about its value before the last leap."""
         assert self._leap is not None
         reach = self._max_places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock goes back further than a late packet explains."""
+        """Return whether the clock goes back too far for a late packet."""
         if pace > 0:
             return passed < -self._max_places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
     def _restart(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
-        """Begin with the first packet, or begin again after the clock was set.
+        """Store the first packet of the stream, or the first one after the clock was set.
 
-        After the clock was set, the index leaves out one number.
+        If the clock was set, one index is left out.
         """
         before = self._newest
         if before is None:
@@ -271,10 +270,10 @@ class ClockOrder:
     def _insert(
         self, position: int, row: int, time: int, pace: float, checksum: int
     ) -> RecentPacket:
-        """Insert a late packet, and correct the number of lost packets on both sides.
+        """Store a late packet, and correct the number of packets missing around it.
 
         Args:
-            position: the position in `_neighbours` of the next packet by time.
+            position: the position at which to insert the packet into `_neighbours`.
         """
         self._stats.late += 1
         after = self._neighbours[position]
@@ -299,7 +298,7 @@ class ClockOrder:
         return placed
 
     def _trim(self) -> None:
-        """Remove stored packets that are too old to have late neighbours."""
+        """Remove the oldest stored packets and checksums if there are too many."""
         if len(self._neighbours) > MAX_PLACES_LATE:
             del self._neighbours[:-MAX_PLACES_LATE]
         for neighbour in reversed(self._neighbours[:-REMEMBERED_CHECKSUMS]):

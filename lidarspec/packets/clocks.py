@@ -164,9 +164,10 @@ class ClockEpoch:
         return np.where(np.arange(len(times)) < first, 0, self.ns)
 
     def _find_offset(self, reference: ClockReference, reading: int, time: int, host: int) -> int:
-        """Return the offset to add to times, from the reference and one packet.
+        """Return the offset from unwrapped times to times since 1970, ns.
 
         Args:
+            reference: the date of a clock reading.
             reading: the clock reading of the packet, ns.
             time: the unwrapped time of the packet, ns.
             host: the arrival time of the packet, ns; 0 if unknown.
@@ -208,7 +209,7 @@ def reference_readings(sensor: SensorDescription, table: Table) -> Times:
 def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     """Return the clock reading of each packet, (n,) int64 ns, not unwrapped.
 
-    If the parts of a frame have the clock, this is the reading of the first part. A frame without
+    If the clock is in the parts of a frame, the reading is that of the first part. A frame without
     parts gets the reading of the previous frame.
     """
     which, readings = read_clock(sensor, batch)
@@ -220,9 +221,8 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
     """Return the rows of packets that have a clock reading, and the readings in ns.
 
-    The rows are None if all packets have a reading. If the parts of a frame have the clock, this is
-    the reading of the first part. A frame whose header leaves out a field of the clock has no
-    reading.
+    The rows are None if all packets have a reading. A frame has no reading if it lacks a field of
+    the clock. If the clock is in the parts of a frame, the reading is that of the first part.
     """
     assert sensor.clock is not None
     fields = clock_fields(sensor.clock)
@@ -252,7 +252,7 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
         times: the times of these packets, (k,).
-        before: the times that packets before the first of these rows get, (n,).
+        before: the times for the packets before the first packet that has a time, (n,).
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
@@ -317,8 +317,8 @@ def part_times(
         place: the axis and the kind of the parts.
         table: the parts.
         which: the row of the frame of each part, (k,).
-        times: the time of the frame of each part, (k,). If parts have the clock, it is the time of
-            the first part.
+        times: for each part, the time of its frame, (k,). If the clock is in the parts, this is the
+            time of the first part.
     """
     if not len(which) or sensor.clock is None or not _has_fields_in_parts(sensor.clock, place):
         return times
@@ -349,7 +349,7 @@ def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table)
 
 @lru_cache(maxsize=256)
 def to_exact_ns(seconds: float) -> int:
-    """Return seconds as nanoseconds, exact for the number's shortest decimal form."""
+    """Return seconds in ns; a float counts as the decimal number that Python prints."""
     return int(to_exact(seconds) * 10**9)
 
 
@@ -366,11 +366,10 @@ def clock_fields(clock: Clock) -> tuple[str, ...]:
 def clock_terms(
     fields: tuple[str, ...], schema: Schema, sensor: str
 ) -> list[tuple[str, Any, Any, int]]:
-    """Return the fields that add up to a clock.
+    """Return (path, step, zero, limit) of each field whose sum is the clock.
 
-    Each item is a tuple: the path of the field, the nanoseconds of a raw step of 1, the nanoseconds
-    of the raw value 0, and the largest raw value that cannot overflow (0 if the nanoseconds are
-    fractions).
+    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. Raw values up to `limit`
+    cannot overflow; `limit` is 0 if `step` or `zero` is a fraction.
 
     Raises:
         SpecError: if a field has no unit of time, or does not have one value in each packet.
@@ -398,9 +397,9 @@ def clock_terms(
 
 
 def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Return the nanoseconds of a raw step of 1, and of the raw value 0, of a field.
+    """Return the ns per raw step of a field, and the ns at its raw value 0.
 
-    They are integers if both are whole, else fractions. Returns None if the unit is not a unit of
+    The results are ints if both are whole, else fractions. Returns None if `unit` is not a unit of
     time.
     """
     per_unit = factor(unit, "s")

@@ -196,7 +196,7 @@ class CounterOrder:
         return index, batch.breaks
 
     def forget(self) -> None:
-        """Do not compare the clocks of the last and next packet, because input was lost."""
+        """Forget the last clock reading and the masked sector, because input was lost."""
         self._time = None
         self._arrived = None
         self._gaps.forget()
@@ -326,13 +326,13 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Correct the counter value of a packet that disagrees with the clock.
+        """Return the place and the counter of a packet if counter and clock disagree.
 
-        If two consecutive values disagree with the clock but agree with each other, the counter was
-        reset.
+        The place follows from the clock, and the counter from the place. If this counter agrees
+        with the previous one that contradicted the clock, it was reset, and is kept.
 
         Returns:
-            How many places the packet is ahead of the newest, and the corrected counter value.
+            How many places the packet is ahead of the newest packet, and the counter.
         """
         ahead = max(round(by_clock), 1)
         suspect = self._suspect
@@ -376,7 +376,7 @@ class CounterOrder:
         return self._index, is_break
 
     def _store_jump(self, loss: CountedLoss | None) -> None:
-        """Store a jump of the counter, unless a clock can show that the value is corrupt."""
+        """Store a jump of the counter, unless a clock checks the counter."""
         if self._clock is None and self._number is not None:
             self._jump = CounterJump(self._number, loss)
 
@@ -413,7 +413,7 @@ class CounterOrder:
     def _restart(self, number: int | None) -> None:
         """Begin with the first packet, or begin again after the sensor restarted.
 
-        This counts no loss. After a restart, the index leaves out one number.
+        No loss is counted. After a restart, one index is left out.
         """
         if self._index < 0 and number is not None:
             self._index = (number - self._rule.first) % self._period % MAX_INDEX_STEP
@@ -449,7 +449,7 @@ class CounterOrder:
 
 
 def _is_consistent(ahead: int, by_clock: float) -> bool:
-    """Return whether counter and clock show about the same number of packets."""
+    """Return whether the counter and the clock advance by about as many packets."""
     is_near = abs(ahead - by_clock) <= 1 + abs(by_clock) / 8
     return is_near and (ahead > 0) == (by_clock > 0.5)
 

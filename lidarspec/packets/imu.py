@@ -78,7 +78,7 @@ class ImuSamples:
 
 
 def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Return the samples of several batches as one value; empty if there are no batches."""
+    """Return the samples of several batches as one batch, which may be empty."""
     if len(parts) != 1:
         parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
     names = ("time_ns", "angular_velocity", "linear_acceleration")

@@ -128,7 +128,7 @@ class AngleReader:
     def angles(self, table: Table) -> Angles | None:
         """Return the angle at which each packet begins, (n,), in turns.
 
-        Returns None if the packets do not contain the field.
+        Returns None if this angle cannot be read.
         """
         if self.is_available:
             info = table.schema.fields.get(self._path)
@@ -216,13 +216,13 @@ class SectorFinder:
         return []
 
     def has_unseen_gaps(self, step: float) -> bool:
-        """Return whether any gap may still turn out to be at a masked sector."""
+        """Return whether any stored gap may be at a masked sector."""
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet has begun in a sector, apart from its edges.
+        """Return whether no packet has begun between the edges of a sector.
 
-        False if the sector is so narrow that packets need not begin in it.
+        Returns False if the sector is too narrow to tell.
         """
         edge = EDGE_STEPS * step + 1 / ANGLE_BINS
         inner = sector.width - 2 * edge
@@ -279,7 +279,7 @@ class MaskedGaps:
             self._finder = SectorFinder(direction) if direction else None
 
     def _record_angles_before(self, row: int) -> None:
-        """Record the angles of the current packets before a row as not masked."""
+        """Record that the angles of the current packets before a row are not masked."""
         if self._finder is not None and self._angles is not None:
             self._finder.add_angles(self._angles[self._first_unnoted : row])
         self._first_unnoted = row
@@ -317,16 +317,16 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def revoke_losses(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """Compare a loss with earlier losses, and mark all of them as masked if it recurs.
+        """If a loss recurs at the same angles, count all these losses as masked.
 
         Args:
             row: the row of the packet after the loss.
             start: the angle of the packet before the loss, in turns.
             stop: the angle of the packet after the loss, in turns.
-            loss: the counts of the loss, which are changed if it recurs.
+            loss: the counts of the loss; changed if the loss is masked.
 
         Returns:
-            The number of packets that were counted as lost, but are masked.
+            The number of packets that no longer count as lost.
         """
         finder = self._finder
         if finder is None or finder.sector is not None or math.isnan(start) or math.isnan(stop):

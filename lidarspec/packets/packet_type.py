@@ -99,11 +99,11 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 
 
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
-    """Return the clock of the frames of a type; None without a clock.
+    """Return the clock of a frame type; None if it has no clock.
 
-    A frame type that declares a clock uses this clock. Other frame types use the clock of the
-    sensor if they have the fields of this clock, and are data frames, IMU frames, or frames of a
-    sensor without points.
+    A frame type uses the clock that it declares. If it declares none, it uses the clock of the
+    sensor, but only if it has the fields of this clock. Frames that have neither points nor IMU
+    data use the clock of the sensor only if the sensor has no points.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
@@ -124,8 +124,8 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of a frame type have a field.
 
-    Also returns True if none of the main frame types has the field. The error is then reported when
-    the field is read.
+    If no frame type with packets has the field, returns True, so that reading the field raises an
+    error.
     """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [

@@ -99,9 +99,10 @@ class Packets:
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """The sort key of each packet, (n,), equal for duplicates.
+        """The sort key of each packet, (n,); duplicates have the same key.
 
-        The key is the index. For datagrams with a clock and no counter, it is a time in ns.
+        For datagrams with a clock and no counter, the key is a time in ns. For all other packets,
+        it is the index.
         """
         if self._order is None:
             return self.index
@@ -263,9 +264,9 @@ class Packets:
         return {**columns, "order": order, "masked": masked}
 
     def parts(self, path: str) -> Packets:
-        """Return the parts of all packets (frames within frames), in stream order, as packets.
+        """Return the parts of all packets, in stream order, as packets.
 
-        Parts have the times, indices and state of their frames.
+        Parts are frames within frames. They have the times, indices and state of their frames.
 
         Args:
             path: the path of the parts, such as "blocks"; with several kinds of parts, path and
@@ -317,7 +318,7 @@ class Packets:
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
         """The frames that contain the packets, and the row of each packet's frame, (n,).
 
-        If the packets are not parts, these are the packets themselves.
+        If the packets are whole frames, returns their own table, and a slice of all rows.
         """
         table, which = self.state.get(AROUND, (None, slice(None)))
         if table is None:
@@ -415,10 +416,10 @@ def _nested_dtype(
 
 
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms that a name has in the branches of the struct.
+    """Return the forms that a name has in the branches of a struct.
 
-    A form is a pair: whether the name is a value and not a struct, and the number of array axes
-    that the name itself adds.
+    A form is a pair: whether the name is a value, not a struct; and the number of arrays of this
+    name, one in another.
     """
     parts = [
         (path, info)

@@ -97,7 +97,7 @@ class Reorder:
         return [self._mark_breaks(packets, before)]
 
     def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
-        """Sort packets into the held packets, and release all that have no gap before them.
+        """Sort packets, release those before the first gap, and hold the others.
 
         Args:
             packets: the held packets, followed by the packets that arrived after them.
@@ -164,6 +164,6 @@ class Reorder:
 
 
 def _shows_gaps(packets: Packets) -> bool:
-    """Return whether the index of packets has a gap where a packet is missing."""
+    """Return whether a missing packet leaves a gap in the index."""
     clock = packets.sensor.clock
     return not packets.is_clocked or (clock is not None and clock.pace is not None)

@@ -1,9 +1,9 @@
-"""Returns of one firing in consecutive packets (`PacketCounter.returns`), and in one packet.
+"""Find the returns of each firing, in consecutive packets or in one packet.
 
-Some sensors send each return of their firings in a packet of its own. These packets form a group
-with consecutive counters. A group is incomplete if some of its packets are lost. The firings in its
-other packets then lack a return. `GroupCounter` counts incomplete groups, and `arrange_returns`
-puts the returns of each firing next to each other.
+Some sensors send each return of their firings in a packet of its own (`PacketCounter.returns`).
+These packets form a group with consecutive counters. A group is incomplete if some of its packets
+are lost; its firings then lack a return. `GroupCounter` counts incomplete groups, and
+`arrange_returns` puts the returns of each firing next to each other.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ MAX_PLACES_LATE = 64
 def read_groups(
     rule: PacketCounter, batch: Batch, index: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return each packet's group and position in it, and the size of the group, (n,).
+    """Return each packet's group, its position in the group, and the group's size.
 
-    A group is identified by the index of its first packet.
+    Each result has the shape (n,). A group is identified by the index of its first packet.
 
     Args:
         index: the index of each packet, (n,).
@@ -98,7 +98,7 @@ class GroupCounter:
         self._count_ended()
 
     def _add(self, group: int, place: int, size: int) -> None:
-        """Add a packet to a group that has not been complete so far."""
+        """Add a packet to its group, and forget the group if it is complete now."""
         assert self._first is not None
         if group < self._first:
             return  # the stream began within the group
@@ -167,9 +167,9 @@ def _place_by_return_index(
     members: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     numbers: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return `members` with positions by return index, not by counter.
+    """Return `members`, with the return index of each packet as its position.
 
-    The positions of a group stay the same if the return index does not distinguish its packets.
+    A group keeps its positions if the return index does not distinguish its packets.
 
     Args:
         members: for each packet, its group, its position in the group, and the size of the group,
@@ -212,16 +212,13 @@ def _join_packets(
 
 
 def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
-    """Return the indices of points with the returns of a packet along a new last axis.
+    """Return indices of points, with the returns of a firing along the last axis.
 
-    The axis along which the return index varies is divided among the returns.
+    Returns None if the return indices differ between packets, if the returns have different numbers
+    of points, or if the return index varies along several axes.
 
     Args:
         numbers: the return index of each point, (n, ...).
-
-    Returns:
-        None unless all packets have equally many points of each return, in the same places, and the
-        return index varies along one axis.
     """
     if not len(numbers) or (numbers != numbers[0]).any():
         return None

@@ -103,7 +103,7 @@ class PacketStream:
         Args:
             batches: frames of all types, in stream order.
             whole: whether the frames are the whole input. If so, packets before the first frame of
-                a type that they need as their state use this frame.
+                another type use this frame as their state.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join_columns([self._read_columns(part) for part in parts])
@@ -151,9 +151,9 @@ class PacketStream:
     def _find_losses(
         self, batch: Batch, time: Integers | None, skipped: Integers
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
-        """Return the index, the breaks and the order of packets, (n,) each.
+        """Return the index of packets, the breaks before them, and their order, (n,) each.
 
-        This also counts lost, late and duplicate packets. The order is None if the packets are not
+        Lost, late and duplicate packets are counted. The order is None unless the packets are
         ordered by their clock. If the plugin raises, the packets keep the order of arrival.
         """
         fallback = (range(len(batch)), batch.breaks)
@@ -197,7 +197,9 @@ class PacketStream:
         A packet without a clock reading gets the time of the last packet with a reading.
 
         Args:
+            batch: the packets.
             host: arrival times, (n,) ns; 0 if unknown.
+            whole: whether the packets are the whole input.
         """
         assert self._clock is not None
         which, readings = read_clock(self._type.timed_sensor, batch)
@@ -267,10 +269,10 @@ class PacketStream:
     def _find_states(
         self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return the frames of each type that packets need as their state.
+        """Return the frames that packets need as their state, by frame type.
 
-        The frames of a type come with the row of each packet's frame, which is the last frame of
-        this type before the packet.
+        For each type, the result has the frames, and an array (n,) with the row of the last frame
+        before each packet.
         """
         others = self._select_others(parts)
         return {
@@ -303,13 +305,13 @@ class PacketStream:
     def _find_state(
         self, name: str, others: Sequence[OtherFrames], *, packet_count: int, whole: bool
     ) -> StateOf:
-        """Return the frames of another type, and the row of each packet's frame, (n,).
+        """Return the frames of a type, and the row of the last frame before each packet.
 
-        The newest frame is stored for the next packets.
+        The row is -1 if there is no earlier frame. The newest frame is stored for the next packets.
 
         Args:
-            name: the frame type, which packets need as their state.
-            others: its frames in this input.
+            name: the frame type.
+            others: the new frames of this type.
         """
         last_frame = self._last_frames.get(name)
         if not others:
@@ -477,7 +479,7 @@ class _Columns(NamedTuple):
 
     Attributes:
         table: the raw columns.
-        offset: offsets in the input; a range if the frames are consecutive and of one size.
+        offset: offsets in the input; a `range` if the frames are consecutive and of one size.
         at: arrival times, ns; -1 if unknown.
         skipped: number of bytes outside frames before each frame.
     """

@@ -83,12 +83,12 @@ class UtcSource:
 
 @dataclass(frozen=True)
 class UtcChange:
-    """A change of the source of UTC.
+    """A source of UTC, and the time from which on it is used.
 
     Attributes:
-        utc_ns: the UTC at which the source begins to apply, ns since 1970.
-        source: the new source.
-        is_first: whether it is the first source, and not a change.
+        utc_ns: the UTC from which on the source is used, ns since 1970.
+        source: the source.
+        is_first: whether no other source was used before.
     """
 
     utc_ns: int
@@ -143,10 +143,11 @@ class UtcTimes:
         return texts
 
     def observe(self, times: Times, host: Times) -> None:
-        """Update the relation of the clocks with packets.
+        """Update the estimated offset between the clocks of sensor and host.
 
         Args:
-            times, host: times by the sensor's clock and arrival times, (n,) ns; 0 if unknown.
+            times: the times of packets by the sensor's clock, (n,) ns.
+            host: the arrival times of the packets, (n,) ns; 0 if unknown.
         """
         is_known = host > 0
         if is_known.any():
@@ -217,7 +218,7 @@ class UtcTimes:
         return times + hours * HOUR_NS
 
     def _find_source(self, time_ns: int, status: float) -> UtcSource:
-        """Return the source of UTC at a time of the sensor's clock, and in a clock status."""
+        """Return the source of UTC for a time and a status of the sensor's clock."""
         clock = self._clock
         if clock is None:
             raise self._explain_no_clock()
@@ -236,7 +237,7 @@ class UtcTimes:
         return UtcSource(kind, epoch, state.locked, state.meaning)
 
     def _subtract_scale(self, times: Times, epoch: str) -> Times:
-        """Return the UTC of times in another time scale, (n,) ns."""
+        """Convert times from the time scale `epoch` to UTC, (n,) ns."""
         if epoch == "utc":
             return times
         table = read_leap_seconds()
