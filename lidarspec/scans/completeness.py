@@ -87,7 +87,7 @@ class PacketCounts:
         return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
 
     def part(self, start: int, stop: int) -> PacketCounts:
-        """Return the counts of rows `start` to `stop - 1`; they share memory with this object."""
+        """Return the counts of the packets from row `start` to before row `stop`."""
         rows = slice(start, stop)
         return PacketCounts(
             self.times[rows],
@@ -98,9 +98,9 @@ class PacketCounts:
         )
 
     def share_with_next_scan(self, row: int) -> None:
-        """Count a packet, or the frame that it is part of, in the next scan as well.
+        """Count a packet in the next scan, although the previous scan ended in it.
 
-        Packets missing before it are not counted again.
+        The next scan does not count the packets missing before it.
         """
         if not self.counts[row]:
             self.counts[row] = 1
@@ -131,7 +131,7 @@ class OpenScan(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the start and at least half of the packets have arrived."""
+        """Whether the start of the scan and at least half of its packets have arrived."""
         return self.has_start and self.lost <= self.packets
 
     @property
@@ -154,7 +154,7 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts of the scan with the losses before some packets.
+        """Add the packets missing before `packets`, and return the counts of the scan.
 
         The packets themselves are not added.
         """

@@ -120,12 +120,13 @@ class ScanCutter:
     def _end_scan(
         self, counts: PacketCounts, row: int, end: ScanEnd, *, is_gap_shared: bool
     ) -> ScanCut:
-        """End the scan at an end that the rule has found, and begin the next one.
+        """End the scan where the rule has found an end, and begin the next scan.
 
         Args:
+            counts: the counts of the packets.
             row: the row of the packet with the end.
-            is_gap_shared: whether packets missing before this packet count in the next scan as
-                well.
+            end: the end.
+            is_gap_shared: whether packets missing before this packet count in both scans.
         """
         scan = self._scan
         is_whole = scan.is_whole and not end.is_leap

@@ -42,8 +42,7 @@ class PointRun(NamedTuple):
         points: the points of the batch.
         start: the index in `points` of the first point of the run.
         stop: the index in `points` after the last point of the run.
-        parts_before: the number of parts of the first frame of the batch that were in earlier
-            batches.
+        parts_before: how many parts of the first frame were in earlier batches.
     """
 
     packets: Packets
@@ -128,13 +127,12 @@ def _find_origin(run: PointRun, point: int) -> PointOrigin:
 
 
 def find_part(packets: Packets, row: int, parts_before: int) -> int:
-    """Return the index of a packet among the parts of its frame, from 0.
+    """Return the index of a part in its frame; 0 if the packets are whole frames.
 
     Args:
-        packets: the batch.
-        row: the row of the packet.
-        parts_before: the number of parts of the first frame of the batch that were in earlier
-            batches.
+        packets: a batch of parts or of whole frames.
+        row: the row of the part in the batch.
+        parts_before: how many parts of the first frame were in earlier batches.
     """
     _, rows = packets.frames
     if isinstance(rows, slice):

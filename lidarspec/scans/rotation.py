@@ -55,7 +55,7 @@ class Rotation:
         return self._find_directions(totals)
 
     def _only_advances(self, total: float, steps: Floats) -> bool:
-        """Return whether the angle is farther than ever before, and never steps back.
+        """Return whether new steps advance beyond the furthest angle, and never go back.
 
         Args:
             total: the turns from the start to the first new step.
@@ -66,10 +66,10 @@ class Rotation:
         return float((self._direction * steps).min(initial=0.0)) >= 0
 
     def _find_directions(self, totals: Floats) -> Floats:
-        """Return the direction at each total, (k,).
+        """Return the direction of rotation at each row, (k,); (1,) if all are equal.
 
         Args:
-            totals: the turns from the start to each new step, (k,).
+            totals: the turns from the start to each row, (k,).
         """
         directions = np.empty(len(totals))
         start = 0
@@ -157,11 +157,13 @@ class WrapDetector:
     def _select_armed(
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
-        """Return the passes before which the angle had moved away from the given angle.
+        """Return the rows of the passes that jitter cannot have caused.
+
+        Between two such passes, the angle moves away from the angle that is passed.
 
         Args:
             passed: the rows of all passes.
-            behind: the angle at each row, measured from the given angle, (k,).
+            behind: the angle at each row, measured from the angle that is passed, (k,).
             full: a whole turn in the unit of the angles.
         """
         armed = list[int]()

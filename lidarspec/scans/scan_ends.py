@@ -35,15 +35,14 @@ Indices = NDArray[np.intp]
 
 
 class ScanEnd(NamedTuple):
-    """An end of a scan by the rule.
+    """A place in the stream at which the sensor's rule ends a scan.
 
     Attributes:
         point: the index of the first point after the end.
-        packet: the row of the packet that shows the end; the packet may have no points. None if a
-            point shows the end.
-        is_leap: whether the angle leaps at the end, by more than `MIN_TURNS_AWAY` and by more than
-            twice the step at the previous end. If so, packets are missing there, or the value is
-            not an angle.
+        packet: the row of the packet that shows the end, even if it has no points. None if a point
+            shows the end.
+        is_leap: whether the angle leaps at the end. Packets are then missing, or an angle is
+            corrupt.
     """
 
     point: int
@@ -146,7 +145,13 @@ class EndFinder:
     def _find_passes(
         self, passes: PassDetector, packets: Packets, points: EvaluatedPoints
     ) -> list[ScanEnd]:
-        """Return the ends at which the angle in a field passes the angle of `passes`."""
+        """Return the scan ends at which the angle in a field passes the cut angle.
+
+        Args:
+            passes: finds these rows; it knows the cut angle.
+            packets: the packets.
+            points: the points of the packets.
+        """
         if isinstance(self._rule, OnWrap):
             path = _make_own_path(packets, self._rule.name)
             column = _read_field(points, path)
@@ -167,9 +172,10 @@ class EndFinder:
         values: Floats,
         full: float | None,
     ) -> Indices:
-        """Return the rows whose value, compared with the previous one, begins a scan.
+        """Return the rows at which a scan begins.
 
         Args:
+            rule: the rule that decides this by the values.
             values: the values of the rows.
             full: a whole turn in the unit of the values; None if they are not angles.
         """
@@ -254,7 +260,7 @@ def _is_per_packet(column: Column) -> bool:
 
 
 def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices]:
-    """Return the values of a field, and the index of the first point of each value.
+    """Return the values of a field, and for each value the index of its first point.
 
     Values are in stream order. Array elements without points are left out.
     """
@@ -283,7 +289,7 @@ def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices
 
 
 def first_points(points: EvaluatedPoints) -> Indices:
-    """Return the index of the first point of each evaluated packet, (points.ready,)."""
+    """Return the index of the first point of each packet, (points.ready,)."""
     points_per_packet = _sum_axes(points.counts, 1)
     return np.cumsum(points_per_packet) - points_per_packet
 

@@ -116,10 +116,10 @@ class Selection:
 
     @property
     def needs_all_scans(self) -> bool:
-        """Whether the result for a scan depends on the scans before it.
+        """Whether all earlier scans are needed to select a scan or to find its time.
 
-        This is the case if scans are counted, or if times are in UTC, which depends on earlier
-        arrival times. A file is then not read in pieces.
+        This is the case if scans are counted, or if times are in UTC. A file is then not read in
+        pieces.
         """
         return self.is_counted or self.time == "utc"
 
@@ -182,13 +182,13 @@ class TimeSlice:
         return wanted & (at < end)
 
     def missed_error(self, source: object, number: str = "data") -> UsageError:
-        """Return the error to raise if no time of a source was selected.
+        """Return the error to raise if a source has no data at the selected times.
 
         The error states the first and the last time of the source.
 
         Args:
             source: the name of the source.
-            number: a description of the items that the source has, such as "12 scans,".
+            number: states how much data the source has, for example "12 scans,".
         """
         first = self.first or 0
         last = self.last or 0
@@ -209,10 +209,10 @@ class TimeSlice:
         return (self.ns(self._times[0]) or 0) - (self.first or 0)
 
     def ns(self, moment: Moment | None) -> int | None:
-        """Return one of the limits as a time of the stream, ns.
+        """Return a limit of the slice in ns; None if there is no limit.
 
-        Returns None if there is no limit, or if the limit counts from the first time of the stream,
-        and this time is not known yet.
+        A limit in seconds counts from the first time of the stream. Returns None until this time is
+        known.
         """
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
@@ -474,7 +474,7 @@ class ScanSelector:
 
 
 class _LimitedRanges(CloudColumns):
-    """The columns of a cloud in which points outside an interval of ranges are invalid."""
+    """The columns of a cloud in which too near and too far points are invalid."""
 
     def __init__(self, cloud: PointCloud, near: float, far: float) -> None:
         super().__init__(cloud)

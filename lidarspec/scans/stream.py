@@ -120,7 +120,10 @@ class ScanStream:
         return self._add_marked(batches)
 
     def _add_marked(self, batches: list[Packets]) -> list[Scan]:
-        """Return the scans that packets complete after masked sectors were marked."""
+        """Add packets, and return the scans that they complete.
+
+        The packets are sorted, and masked sectors are marked.
+        """
         scans = list[Scan]()
         for packets in batches:
             if packets.masked is not None and not self._uses_sector:
@@ -142,9 +145,9 @@ class ScanStream:
         self._uses_sector = True
 
     def _take_parts_with_points(self, packets: Packets) -> Packets:
-        """Return the packets that have points: `packets`, or their parts.
+        """Return `packets`, or their parts if the parts have the points.
 
-        Parts are numbered so that a frame without parts leaves no gap in the index.
+        Frames without parts are left out of the index, so that they do not count as missing.
         """
         parts = packets.with_points
         if parts is not packets:
