@@ -1,4 +1,6 @@
-"""Read the datagrams of a capture in batches: arrays of offsets, times and senders.
+"""Read the datagrams of a capture in batches.
+
+A batch has arrays of offsets, times and senders.
 
 The records of a device differ in their payloads and times, but hardly in their other bytes.
 `CaptureBatches` therefore parses only one record of each kind, as `CaptureReader` does. The result
@@ -136,7 +138,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
         return None
     head = pattern.head
     start = pattern.head + headers.size
-    if start > MAX_HEADER_BYTES or not pattern.times.fits():
+    if start > MAX_HEADER_BYTES or not pattern.times.fits_int64():
         return None
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
@@ -164,8 +166,8 @@ def find_records(
     """Return the offsets of the complete records between `start` and `stop`.
 
     Returns:
-        The start of each record, followed by the end of the last record, and whether `form.read`
-        must read the record after these.
+        The start of each record, followed by the end of the last record; and whether the next
+        record must be read by `form.read`.
     """
     pieces: list[Indices] = []
     single: list[int] = []
@@ -320,7 +322,7 @@ class CaptureBatches(CaptureReader):
     def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the file, in one batch for each filled buffer."""
         kinds: list[RecordKind] = []
-        with self._count_end():
+        with self._close_at_end():
             form = self._form = self._form or make_record_reader(self._source)
             while self._source.begin_record():
                 starts, stuck = find_records(
@@ -402,7 +404,7 @@ class _RecordBlock:
         return None
 
     def select_known(self) -> list[RecordKind]:
-        """Return the kinds to compare later records with, the most frequent first."""
+        """Return the kinds that later records may have, the most frequent first."""
         if self._form.sections != self._section:
             return []
         if len(self._known) == 1:
@@ -463,9 +465,9 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Return the buffer followed by the datagrams that were read singly.
+        """Return `buffer`, followed by the datagrams that were read singly.
 
-        Their rows are inserted into `columns`, in the order of the records.
+        For each of these datagrams, a row is inserted into `columns`, in the order of the records.
         """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
@@ -506,8 +508,10 @@ class _RecordBlock:
     def _match(self, kind: int, since: int = 0) -> bool:
         """Assign a kind to the records that match it; return whether all now have a kind.
 
-        Records before `since` are ignored, because each of them has already been read as a single
-        record. If one of them was rejected as malformed, it must not match the new kind.
+        Args:
+            kind: the number of the kind.
+            since: the first record to compare. Earlier records were read singly, and must not match
+                the kind if they are malformed.
         """
         template = self._known[kind]
         number = len(self._kinds)

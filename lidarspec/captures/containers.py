@@ -158,7 +158,7 @@ class UnpackedFile(io.RawIOBase):
             self._count += len(data)
             return data
         except EOFError:
-            self.damage = Damage(f"{self.name} is truncated{self._read_part}", 0)
+            self.damage = Damage(f"{self.name} is truncated{self._message_end}", 0)
         except Exception as error:
             # Each library raises its own exceptions for damaged bytes; bz2 and gzip raise OSError.
             if isinstance(error, OSError) and error.errno is not None:
@@ -167,13 +167,13 @@ class UnpackedFile(io.RawIOBase):
             size = self._packed.seek(0, os.SEEK_END) if offset else 0
             where = f" before byte {offset} of {size}" if offset else ""
             self.damage = Damage(
-                f"{self.name} is corrupt{where} ({error}){self._read_part}", max(size - offset, 1)
+                f"{self.name} is corrupt{where} ({error}){self._message_end}", max(size - offset, 1)
             )
         return b""
 
     @property
-    def _read_part(self) -> str:
-        """The last words of a message, which name the part of the content that was read."""
+    def _message_end(self) -> str:
+        """The end of a message about damage, which says how much content was read."""
         return f": only the first {self._count} decompressed bytes were read"
 
 
@@ -186,7 +186,7 @@ def find_damage(file: BinaryIO) -> Damage | None:
 
 
 def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
-    """Open a file; if it is compressed, return its content.
+    """Open a file for reading; if it is compressed, decompress it.
 
     Raises:
         SourceError: if the file cannot be opened or decompressed, or contains no capture.
@@ -200,7 +200,7 @@ def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
 
 
 def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
-    """Return an open file; if it is compressed, return its content.
+    """Return an open file or, if it is compressed, its decompressed content.
 
     Closing the result closes the file.
 

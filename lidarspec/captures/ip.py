@@ -224,9 +224,8 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
 def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
     """Return the sizes of the headers of a UDP packet; None for a reassembled packet.
 
-    If two frames have the same link type, length and header bytes, except for the variable bytes,
-    their payloads have the same offset and the same sender. `parse_ip` and `parse_udp` depend on no
-    other bytes.
+    Two frames of the same link type and length have the same sender and the same offset of the
+    payload if their headers differ only in the bytes at `variable_offsets`.
     """
     if not packet.body_offset:
         return None

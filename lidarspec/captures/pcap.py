@@ -1,7 +1,7 @@
-"""Read the UDP datagrams of pcap and pcapng files, and make the records of new files.
+"""Read the UDP datagrams of pcap and pcapng files, and make records of datagrams.
 
-`records` reads the records of a file, and `ip` parses the captured frames. This module joins both,
-and counts the packets that contain no datagram in `CaptureStats`. Captures are untrusted input: if
+`records` reads the records of a file, and `ip` parses the frames in them. This module combines
+both, and counts packets without a datagram in `CaptureStats`. Captures are untrusted input: if
 the first four bytes are those of a capture, no content raises an exception. The memory use depends
 on the number of bytes in the file, not on length fields.
 """
@@ -95,9 +95,8 @@ class CaptureStats:
         fragments: number of IP fragments of UDP packets.
         incomplete_fragments: number of fragments of datagrams that stayed incomplete.
         malformed: number of packets and records with fields that contradict each other.
-        damaged: the number of records that could not be read. After each, the next readable record
-            was searched.
-        lost: the number of bytes that were skipped to find these next readable records.
+        damaged: number of records that could not be read.
+        lost: number of bytes that were skipped to find readable records after damaged ones.
         stopped_at: file offset of the truncated or malformed record that ended the reading; None if
             the file was read to its end.
     """
@@ -210,7 +209,7 @@ class CaptureReader(ClosingContext):
             self._owned.close()
 
     def _iter_datagrams(self) -> Iterator[Datagram]:
-        with self._count_end():
+        with self._close_at_end():
             form = make_record_reader(self._source)
             self._form = form
             while self._source.begin_record():
@@ -233,8 +232,8 @@ class CaptureReader(ClosingContext):
         self.stats.stopped_at = None if has_more else damage_start
 
     @contextmanager
-    def _count_end(self) -> Iterator[None]:
-        """On exit from the context, close the file and record whether it was truncated."""
+    def _close_at_end(self) -> Iterator[None]:
+        """At the end of the context, close the file and complete the statistics."""
         try:
             yield
         except TruncatedError:

@@ -7,9 +7,8 @@ searches a file by capture time.
 Malicious input cannot exhaust memory or time: `source` reads in steps of limited size, and each
 iteration of a loop either advances or ends the reading.
 
-If a record has an implausible length, the length is accepted unless other records begin within the
-record. After a record that cannot be read, `skip_damage` continues at the next two consecutive
-records.
+An implausible length of a record is accepted unless other records begin within the record. After a
+record that cannot be read, `skip_damage` continues at the next two consecutive records.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -129,8 +128,8 @@ class TimeEncoding:
     is_split: bool
     offset: int = 0
 
-    def fits(self) -> bool:
-        """Return whether all times up to `_MAX_TIME_S` fit into 64 bits."""
+    def fits_int64(self) -> bool:
+        """Return whether times up to `_MAX_TIME_S` can be calculated with 64 bits."""
         return self.ticks <= 9 * _SECOND_NS and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
@@ -160,8 +159,8 @@ class RecordLayout(NamedTuple):
 
     Attributes:
         head: number of bytes before the packet.
-        free: offsets of the header bytes that differ between records: the bytes of the time.
-        uncut: offsets of the bytes of the packet's original length.
+        free: offsets of the bytes of the time, which differ between records.
+        uncut: offsets of the bytes of the packet's length on the network.
         times: the encoding of the time.
         trailer: NumPy type of the word at the end that repeats the length, with the byte order;
             None if there is none.
@@ -208,12 +207,13 @@ class PcapRecords:
             at: the offset.
         """
         captured, original = self._lengths.unpack_from(data, at + 8)
-        return self._head.size + captured if self._is_sure(captured, original) else 0
+        return self._head.size + captured if self._is_plausible(captured, original) else 0
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, type, value) of both length fields of a record, as one number.
+        """Return (offset, NumPy type, value) of the two length fields, as one number.
 
-        The record has this length, and its packet is not truncated.
+        Args:
+            length: the length of a record whose packet is not truncated.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -237,7 +237,9 @@ class PcapRecords:
         # The missing parts of a sparse or damaged file are read as zeros.
         if captured > MAX_PACKET_BYTES or not any(head):
             raise DamagedRecordError
-        if not self._is_sure(captured, original) and self._has_wrong_length(captured, original):
+        if not self._is_plausible(captured, original) and self._has_wrong_length(
+            captured, original
+        ):
             raise DamagedRecordError
         self._began = seconds if self._began is None else self._began
         self._source.skip(self._head.size)
@@ -289,18 +291,22 @@ class PcapRecords:
             return int(offsets[right.argmax()])
         return None
 
-    def _is_sure(self, captured: int, original: int) -> bool:
-        """Return whether two lengths of a record are plausible.
+    def _is_plausible(self, captured: int, original: int) -> bool:
+        """Return whether the lengths of a packet are plausible.
 
-        The packet must be whole, or truncated at the snap length.
+        They are plausible if the packet is whole, or truncated at the snap length.
+
+        Args:
+            captured: the length of the packet in the file.
+            original: the length of the packet on the network.
         """
         return 0 < captured <= MAX_PACKET_BYTES and captured in (original, self._snap_length)
 
     def _has_wrong_length(self, captured: int, original: int) -> bool:
         """Return whether the length of a record is wrong.
 
-        The length is wrong if neither a record nor the end of the input follows the record, and if
-        another record begins within the original packet.
+        The length is wrong if another record begins within the packet, but neither a record nor
+        the end of the input follows it.
         """
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
@@ -356,7 +362,11 @@ class PcapngBlocks:
         return length
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, type, value) of the length field of a block of this length."""
+        """Return (offset, NumPy type, value) of the length field of a block.
+
+        Args:
+            length: the length of the block.
+        """
         return 4, f"{self.order}u4", length
 
     def find_layout(self, record: bytes) -> RecordLayout | None:
@@ -400,16 +410,16 @@ class PcapngBlocks:
             self._interfaces.append(_interface(self.order, body))
         if kind in _PACKETS:
             return (
-                _block_packet(self.order, kind, body, self._interfaces) or NoPacketReason.MALFORMED
+                _parse_packet_block(self.order, kind, body, self._interfaces)
+                or NoPacketReason.MALFORMED
             )
         return NoPacketReason.NO_PACKET
 
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """Return the first offset below `stop` at which a block may begin, or None.
 
-        If an interface block was lost, only the start of a section is accepted. Packets refer to
-        interfaces by number, so packets before the next section would be assigned to wrong
-        interfaces.
+        If an interface block was lost, returns only the start of a section, because the interfaces
+        of the packets before it are unknown.
         """
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -432,8 +442,8 @@ class PcapngBlocks:
         """Return whether the length of a block is wrong.
 
         The length is wrong if it is impossible for the type of the block, or if the last word of
-        the block does not repeat it. If the last word cannot be read, the length is wrong if
-        another block begins within the block.
+        the block does not repeat it. If the last word is not in the buffer, the length is wrong if
+        another block begins within this block.
         """
         if not _is_possible_length(length) or (
             length > MAX_BLOCK_BYTES and kind in _PACKETS | {_INTERFACE}
@@ -481,18 +491,19 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     """Seek to shortly before the first packet that was captured at a time or later.
 
-    The position is at most `NEAR_BYTES` before the packet. The search assumes that packets are in
-    the order of their times, and that all sections of a pcapng file have the interfaces of the
-    current section. Because another section may encode times differently, the search does not skip
-    the start of a section, or packets with times that are more than a year away.
+    The packets must be in the order of their times. The position is at most `NEAR_BYTES` before the
+    packet, but never after the start of another pcapng section, or after a packet with a time that
+    is more than a year away.
 
     Args:
         at: ns since 1970.
 
     Returns:
-        False if the position is unchanged. This is the case if the packet is not further ahead, or
-        if the file is a pipe or compressed.
+        False if the position is unchanged, because the packet is near or behind, or because the
+        file is a pipe or compressed.
     """
+    # All sections are read with the interfaces of the current one. Another section may encode
+    # times differently, so its packets are not used to decide what to skip.
     here = low = source.offset
     high = source.size
     if high is None:
@@ -516,7 +527,7 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
 def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[int, int] | None:
     """Return the time and the offset of the next packet with a time.
 
-    Returns None if no such packet begins before `stop` or before another section.
+    Returns None if `stop` or the start of another section comes before such a packet.
     """
     section = form.sections
     form = form.reopen(source)
@@ -563,10 +574,10 @@ def _interface(order: str, body: bytes) -> Interface:
     return Interface(link, snap_length, ticks, offset)
 
 
-def _block_packet(
+def _parse_packet_block(
     order: str, kind: int, body: bytes, interfaces: list[Interface]
 ) -> CapturedPacket | None:
-    """Return the packet of a block; None if the block is invalid.
+    """Return the packet of a packet block; None if the block is invalid.
 
     A block is invalid if its lengths contradict each other, or if its interface is unknown.
     """
@@ -628,12 +639,10 @@ def _refuse_size(data: bytes) -> None:
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record at an offset of a piece of a written file.
-
-    If the piece begins with the file header, returns the length of the header at offset 0.
+    """Return the length of the record, or of the file header, at an offset.
 
     Args:
-        data: the piece.
+        data: a piece of a pcap file, as this module writes it.
         at: the offset in the piece.
     """
     if at == 0 and is_capture(bytes(data[:4])):

@@ -173,9 +173,9 @@ class BufferedInput:
         return have >= size
 
     def _move_unread(self, have: int) -> None:
-        """Move the unread bytes to the start of a buffer.
+        """Move the unread bytes to the start of a buffer, and use this buffer.
 
-        This is the current buffer, unless it has a view or is too small.
+        It is another buffer if the current one has a view, or is too small.
         """
         size = len(self.storage) - SLACK_BYTES
         tail = self.storage[self.at : self.at + have]
