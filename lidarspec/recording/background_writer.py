@@ -1,8 +1,9 @@
-"""Write records to a file in a thread, so that a slow disk does not delay the capture.
+"""Write records to a file in a thread.
 
-Records wait in memory. The thread writes them every 0.2 s, or when there are 64 KiB, and calls
-fsync every second. An existing file is kept until the new file has its first record. If the disk is
-full, a partly written record is removed, so that the file ends after a complete record.
+A slow disk therefore does not delay the capture. Records wait in memory. The thread writes them
+every 0.2 s, or when there are 64 KiB, and calls fsync every second. An existing file is kept until
+the new file has its first record. If the disk is full, a partly written record is removed, so that
+the file ends after a complete record.
 """
 
 from __future__ import annotations

@@ -236,7 +236,7 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
     """Return the length of the record at an offset, from its first bytes.
 
     Returns:
-        0 if the buffer ends within these bytes; -1 if the bytes are not the start of a record.
+        0 if the buffer ends before the length is known; -1 if no record begins at the offset.
     """
     mark = bytes(buffer[start : start + len(MARK)])
     if mark != MARK[: len(mark)]:
@@ -309,8 +309,8 @@ class Recording(ClosingContext):
             at: ns since 1970.
 
         Returns:
-            False if the position is unchanged, because this record is not further ahead, arrival
-            times are unknown, or the file is a pipe.
+            False if the position is unchanged, because the record is near or behind, arrival times
+            are unknown, or the file is a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -333,7 +333,7 @@ class Recording(ClosingContext):
         Records without a time are ignored.
         """
         self._move(start)
-        while self.offset < stop and self._holds(1):
+        while self.offset < stop and self._fill_window(1):
             size = self._find_valid_length()
             place = self._place
             if size > 0:
@@ -342,7 +342,7 @@ class Recording(ClosingContext):
                     return record.at, self.offset
                 self._skip(size)
             else:
-                self._next_mark()
+                self._skip_to_mark()
         return None
 
     def _move(self, offset: int) -> None:
@@ -361,7 +361,7 @@ class Recording(ClosingContext):
                 else:
                     seen = "it is empty"
                 raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
-            pairs = self._pairs()
+            pairs = self._iter_valid_records()
             first = next(pairs, None)
         if first is not None and first[0] == HEADER:
             self.header = read_header(first[1].data)
@@ -383,9 +383,9 @@ class Recording(ClosingContext):
         with system_errors(self.path):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
-    def _pairs(self) -> Iterator[tuple[int, Record]]:
+    def _iter_valid_records(self) -> Iterator[tuple[int, Record]]:
         """Yield (kind, record) of every valid record."""
-        while self._holds(1):
+        while self._fill_window(1):
             if (size := self._find_valid_length()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
                 self._skip(size)
@@ -396,13 +396,13 @@ class Recording(ClosingContext):
             if not self.salvage:
                 self.leftover += self._count_remaining_bytes()
                 return
-            self.leftover += self._next_mark()
+            self.leftover += self._skip_to_mark()
 
     def _find_valid_length(self) -> int:
         """Return the length of the current record; 0 if it is damaged or incomplete."""
-        self._holds(_HEAD.size)
+        self._fill_window(_HEAD.size)
         size = size_at(self._window, self._place)
-        self.is_cut = size == 0 or (size > 0 and not self._holds(size))
+        self.is_cut = size == 0 or (size > 0 and not self._fill_window(size))
         if size < 0 or self.is_cut:
             return 0
         end = self._place + size - _CRC.size
@@ -410,11 +410,11 @@ class Recording(ClosingContext):
             zlib.crc32(self._window[self._place : end]) == _CRC.unpack_from(self._window, end)[0]
         )
         start = self._place + _HEAD.size
-        if passes and _endpoints(self._window[start : start + self._window[self._place + 6]]):
+        if passes and _read_endpoints(self._window[start : start + self._window[self._place + 6]]):
             return size
         return 0
 
-    def _holds(self, number: int) -> bool:
+    def _fill_window(self, number: int) -> bool:
         """Read until `number` bytes are in memory; return False if the file is too short."""
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
@@ -428,15 +428,15 @@ class Recording(ClosingContext):
         self._place += number
         self.offset += number
 
-    def _next_mark(self) -> int:
-        """Move to the next mark or the end, and return the number of skipped bytes."""
+    def _skip_to_mark(self) -> int:
+        """Skip to the next record mark, or the end; return the number of skipped bytes."""
         before = self.offset
         self._skip(1)
         while (position := self._window.find(MARK, self._place)) < 0:
             left = len(self._window) - self._place
             keep = min(len(MARK) - 1, left)  # possible beginning of a mark
             self._skip(left - keep)
-            if not self._holds(keep + 1):
+            if not self._fill_window(keep + 1):
                 self._skip(keep)
                 return self.offset - before
         self._skip(position - self._place)
@@ -455,7 +455,7 @@ class Recording(ClosingContext):
 def _unpack_record(record: bytes) -> tuple[int, Record]:
     _, kind, flags, addresses, size, at = _HEAD.unpack_from(record)
     start = _HEAD.size + addresses
-    sender, receiver = _endpoints(record[_HEAD.size : start]) or (None, None)
+    sender, receiver = _read_endpoints(record[_HEAD.size : start]) or (None, None)
     arrival_ns = None if at == _UNKNOWN else at
     direction = DIRECTIONS.get(kind, "event")
     marks = (bool(flags & mark) for mark in (DATAGRAM, GAP, QUIET))
@@ -476,11 +476,10 @@ def _endpoint(address: Address | None) -> bytes:
 
 
 @lru_cache(maxsize=256)
-def _endpoints(data: bytes) -> list[Address | None] | None:
-    """Return the sender and receiver in a record.
+def _read_endpoints(data: bytes) -> list[Address | None] | None:
+    """Return the sender and the receiver in the address bytes of a record.
 
-    Returns:
-        None unless the bytes contain exactly two addresses.
+    An unknown address is None. If the bytes are invalid, the result itself is None.
     """
     addresses: list[Address | None] = []
     offset = 0

@@ -52,8 +52,8 @@ class RecorderFactory:
     """Makes a recorder as soon as the sensor of a source is known.
 
     Attributes:
-        make: a function of the open transport and of the sensor, which is configured with the
-            options that it reported. It returns the recorder.
+        make: a function that takes the open transport and the configured sensor, and returns the
+            recorder.
     """
 
     make: Callable[[Transport, Sensor | str | None], TrafficLog]
@@ -201,11 +201,11 @@ class FrameRecorder(BackgroundWriter):
         if direction == "in":
             self._at = chunk.at or self._at
             if chunk.gap:
-                self._cut(self._decoder.idle())
+                self._write_frames(self._decoder.idle())
             self._held += chunk.data
-            self._cut(self._decoder.feed(chunk.data, self._at))
+            self._write_frames(self._decoder.feed(chunk.data, self._at))
 
-    def _cut(self, frames: list[Found]) -> None:
+    def _write_frames(self, frames: list[Found]) -> None:
         """Write frames, and the bytes outside frames before them.
 
         Bytes that may belong to an incomplete frame are kept for the next call.
@@ -228,7 +228,7 @@ class FrameRecorder(BackgroundWriter):
 
     def _finish(self) -> None:
         if not self._closing:
-            self._cut(self._decoder.finish())
+            self._write_frames(self._decoder.finish())
         super()._finish()
 
 
@@ -364,9 +364,11 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record at an offset, in a part of a recording.
+    """Return the length of the record, or of the magic bytes, at an offset.
 
-    At the start of the file, returns the length of the magic bytes.
+    Args:
+        data: a piece of a recording.
+        at: the offset in the piece.
     """
     if data.startswith(MAGIC, at):
         return len(MAGIC)
