@@ -74,7 +74,7 @@ class _TimeField:
 
 @dataclass(frozen=True)
 class _StatusChoice:
-    """A possible status of a clock: its fields' raw values, and what they mean."""
+    """A possible status of a clock: the raw values of its fields, and its meaning."""
 
     raw: tuple[int, ...]
     state: ClockState
@@ -148,13 +148,13 @@ class ClockWriter:
         return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
     def find_power_on_reading(self, frame: CompiledTable) -> int:
-        """Return the reading at power-on of a clock that has no source of time, ns.
+        """Return the reading with which an unsynchronized clock starts at power-on, ns.
 
-        If the frames have a year, a month and a day, it is 2000-01-01. All other clocks begin with
-        their lowest reading.
+        A clock with a year, a month and a day starts at 2000-01-01. Every other clock starts at its
+        lowest reading.
 
         Args:
-            frame: a table of one frame, whose fields of the clock are overwritten.
+            frame: a table of one frame; the fields of its clock are overwritten.
         """
         if self._date is not None:
             return POWER_ON_DATE_NS
@@ -229,8 +229,8 @@ class ClockWriter:
         ((_, step, _, _),) = clock_terms((source,), rows.schema, self._sensor.id)
         path = without_indices(source)[0]
         fields = rows.schema.fields
-        form = _describe_form(fields[path])
-        same = [other for other, info in fields.items() if _describe_form(info) == form]
+        form = _get_encoding(fields[path])
+        same = [other for other, info in fields.items() if _get_encoding(info) == form]
         self._fields = [_TimeField(other, _to_step(step)) for other in same]
 
     def _find_function_fields(self, table: CompiledTable) -> None:
@@ -269,7 +269,7 @@ class ClockWriter:
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
-        """Increase a field by one, twice; return both increases of the reading, ns."""
+        """Return by how much the reading grows if a field grows by 1, and again by 1, ns."""
         before = table.raw(path)
         start = 0  # a float cannot represent a date and a step of one raw value
         if info.kind == "int":
@@ -397,9 +397,13 @@ class FrameClock:
                 status.write(table, timeline.lock_states(times), timeline.faults.follows)
 
     def _write_dates(self, table: CompiledTable, readings: Times) -> None:
-        """Write the dates of readings, (n,) ns since 1970, into fields outside the clock.
+        """Write dates into fields that do not belong to the clock.
 
-        Frames after a restart have no date, and keep their values.
+        Frames without a date, after a restart, keep their values.
+
+        Args:
+            table: the frames.
+            readings: the dates, (n,) ns since 1970.
         """
         date = self._sensor.frames[self._frame].simulation.date
         if date is None:
@@ -435,7 +439,7 @@ def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
 
 
 def find_status_clocks(sensor: Sensor) -> dict[str, Clock]:
-    """Return {frame type: clock} of the frame types that contain the status of a clock."""
+    """Return {frame type: clock} of the frame types with the status of a clock."""
     clocks = dict[str, Clock]()
     for name in sensor.main_frames:
         clock = find_clock(sensor, name)
@@ -580,7 +584,7 @@ class StatusWriter:
 def _shift_raw(
     info: FieldInfo, raw: NDArray[Any], shifts: Times, step_ns: float, period_ns: int
 ) -> NDArray[Any]:
-    """Return raw values of a clock after adding time differences, wrapped."""
+    """Add time differences to raw values of a clock, and return them, wrapped."""
     if info.kind == "int" and isinstance(step_ns, int):
         # exact, also for a shift of years
         whole: NDArray[Any] = raw.astype(np.int64) + shifts // step_ns
@@ -591,13 +595,13 @@ def _shift_raw(
     return shifted % (period_ns / step_ns) if period_ns else shifted
 
 
-def _describe_form(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties by which fields with times of the same clock are found."""
+def _get_encoding(info: FieldInfo) -> tuple[str, float, float, int, str]:
+    """Return the properties that all fields with times of one clock have in common."""
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 
 def _to_step(step: Any) -> float:
-    """Return a step in ns as an int if it is whole."""
+    """Return a step in ns as an int if it is whole, else as a float."""
     if step == int(step):
         return int(step)
     return float(step)

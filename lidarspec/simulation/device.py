@@ -154,7 +154,7 @@ class ReplyMaker:
         self._frames = FramesWithoutPoints(sensor, shake)
         self._received: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
-        self._decoders = {link: _command_decoder(sensor, link) for link in links}
+        self._decoders = {link: _make_command_decoder(sensor, link) for link in links}
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
         """Return the commands whose last bytes are in the received bytes.
@@ -237,9 +237,10 @@ class ReplyMaker:
 def _match_command(
     command: Command, values: Mapping[str, Any], fields: Mapping[str, FieldInfo]
 ) -> dict[str, str] | None:
-    """Return {name in braces: text} of the placeholders of a command's templates.
+    """Return the texts in a frame that match the placeholders of a command.
 
-    Returns None if the values of the frame do not match the command.
+    The keys are the names of the placeholders in braces, for example "{handle}". Returns None if
+    the values of the frame do not match the command.
     """
     fixed = {
         path: find_code(fields[path], value) if path in fields else value
@@ -262,7 +263,7 @@ def _rank(command: Command) -> tuple[int, int]:
     return len(command.fixed), literal_size
 
 
-def _command_decoder(sensor: Sensor, link: str) -> Decoder:
+def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
     """Return a decoder for the frames that a link transmits to the sensor."""
     frames = {
         name: _as_incoming(frame)
@@ -310,8 +311,8 @@ class _PlannedData(NamedTuple):
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
-        repetition: how many frames of a periodic type were sent before; the argument of its
-            `sweep`. None for all other data, such as a reply.
+        repetition: for a frame that is sent periodically, the number of earlier frames of its type;
+            None for all other data.
     """
 
     at: float
@@ -411,10 +412,10 @@ class SimulatedDevice:
         destination: (address, port) to which a command has redirected the data; None if no command
             has. The address is "" if the command contained only a port.
         sent: number of sent frames by type, before faults.
-        lines: name of each link -> the link with its faults.
-        utc_offset_ns: UTC minus the time that the caller passes, ns. A clock that is synchronized
-            then shows the current date. None: the clock shows the dates that the spec's `sweep`
-            declares. A change takes effect at the next `start`.
+        lines: the links with their faults, by name.
+        utc_offset_ns: UTC minus the time that the caller passes, ns, so that a synchronized clock
+            shows the current date. If None, the clock shows the dates of the spec's `sweep`. A
+            change takes effect at the next `start`.
 
     Raises:
         UsageError: if the sensor declares no `sweep`, or if its clock cannot have the faults.
@@ -586,7 +587,7 @@ class SimulatedDevice:
         return out
 
     def _split_messages(self, packets: list[Packet]) -> list[Packet]:
-        """Return the datagrams of messages that the link splits into fragments."""
+        """Return `packets`, split into datagrams if the link splits messages."""
         if self._fragmenter is None:
             return packets
         return [(frame, part) for frame, data in packets for part in self._fragmenter.split(data)]
@@ -694,7 +695,10 @@ class SimulatedDevice:
                 self._begin_data(time_ns, chosen)
 
     def _apply_effect(self, command: str) -> None:
-        """Change the sweep after a command; frames that exist already are still sent."""
+        """Change the sweep as the spec declares it for a command.
+
+        Frames that were made before are sent unchanged.
+        """
         sweep = self._sweep or self.sensor.simulation.sweep
         if sweep is None:
             return
@@ -745,7 +749,7 @@ class SimulatedDevice:
         heapq.heappush(self._plan, planned)
 
     def _switch_plug(self, now: int) -> None:
-        """Disconnect or reconnect the device when it is due."""
+        """Disconnect or reconnect the device if the time for this has come."""
         if self._plug is None or now < self._plug:
             return
         if self.present:

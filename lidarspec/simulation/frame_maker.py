@@ -35,7 +35,7 @@ class FrameMaker:
     """Makes frames of one type of a sensor, and caches their layouts.
 
     Raises:
-        SpecError: if the frame type is not compiled.
+        SpecError: if only construct can build the frame type.
     """
 
     def __init__(self, sensor: Sensor, frame: str) -> None:
@@ -163,7 +163,7 @@ class FrameMaker:
         return frames
 
     def _with_texts(self, values: Values) -> Values:
-        """Return the values of a frame, with texts as bytes, and with the sizes of texts."""
+        """Return values in which texts are encoded, and the sizes of texts are added."""
         result = dict(values)
         for path, info in self._decoded.items():
             value = result.get(path)
@@ -242,9 +242,9 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the first field of a formula so that the result of the formula is `number`.
+        """Set the first field of a formula so that the formula gives `number`.
 
-        If this field has a value already, nothing is changed.
+        Nothing is changed if this field has a value already.
         """
         if formula is None:
             paths = []

@@ -23,10 +23,10 @@ def round_raw(info: FieldInfo, raw: Floats) -> Floats:
 
 
 class PartRows(CompiledTable):
-    """A table of the parts that contain the points, taken from frames.
+    """The parts of frames, as a table; `put_back` writes them into the frames.
 
     Args:
-        frames: the frames. `put_back` writes the parts into them.
+        frames: the frames.
         path: path of the parts.
     """
 

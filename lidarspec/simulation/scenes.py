@@ -196,10 +196,7 @@ def _shorten_ranges(
 
 
 def _may_hit(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
-    """Return a mask of the beams that may hit a body.
-
-    All other beams miss even the sphere that contains the body.
-    """
+    """Return a mask that is False for beams that certainly miss a body."""
     middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     aside = np.sqrt(sum(np.max(np.square(part)) for part in origin))
     squared = sum(np.square(part) for part in middle) - (body.radius + aside) ** 2

@@ -92,8 +92,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: the points may have more axes than the field. This is the index, in these last axes,
-            of the points that the field determines.
+        inner: the points may have more axes than the field. The field determines the points at this
+            index in the additional axes.
         step: metres per raw step; None if it differs between packets, for example because of a
             value in the header or a calibration.
         zero: range of the raw value 0, metres.
@@ -107,9 +107,9 @@ class RangeField:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a table of packets; the first axis of each array is the packet.
+    """The beams of n packets.
 
-    The arrays broadcast against each other.
+    The first axis of each array is the packet. The arrays broadcast against each other.
 
     Attributes:
         range: as in `Polar`.
@@ -144,7 +144,7 @@ class Measurement:
     Args:
         sensor: the sensor.
         frame: the frame type.
-        table: example frames, from which the fields with ranges are found.
+        table: example frames, in which the fields with ranges are searched.
         given: paths of the fields that `sweep` gives. They are not changed unless they are ranges.
 
     Raises:
@@ -245,7 +245,7 @@ class Measurement:
         return Beams(
             **own,
             origin=(origin[0], origin[1], origin[2]),
-            counts=_counts(shape, axes, batch),
+            counts=_count_points(shape, axes, batch),
             intensity=intensity,
             places=places,
         )
@@ -291,7 +291,7 @@ class Measurement:
         return raw_values
 
     def _find_max_raw(self, table: CompiledTable, path: str) -> float:
-        """Return the maximum raw value of a field that its wire form can represent."""
+        """Return the largest raw value of a field that can be sent."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
         leaves = [
@@ -330,10 +330,10 @@ class Measurement:
         return tuple(targets)
 
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
-        """Return the fields that ranges depend on linearly, but not by the declared scale.
+        """Return the fields that `points` converts to ranges by a linear function.
 
-        These are fields in metres to which `points` applies a correction, and elements of arrays
-        that have no unit, if ranges are proportional to them.
+        Fields in metres may have an offset. For all other fields, only array elements without a
+        unit are considered, and ranges must be proportional to them.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -354,9 +354,14 @@ class Measurement:
         return targets
 
     def _probe(self, table: CompiledTable, paths: Iterable[str], *probes: int) -> list[Beams]:
-        """Return the beams for each probe value of some fields.
+        """Return the beams of a table for each of several values of some fields.
 
-        The table is restored afterwards.
+        The fields are restored at the end.
+
+        Args:
+            table: the frames.
+            paths: paths of the fields.
+            probes: the raw values.
         """
         before = {path: table.raw(path) for path in paths}
         beams = []
@@ -382,7 +387,12 @@ class Measurement:
         return (twice - once) / PROBE_VALUE, 2 * once - twice
 
     def _list_inner_indices(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
-        """Return all indices in the axes that the points have but the fields do not have."""
+        """Return all possible values of `RangeField.inner`.
+
+        Args:
+            table: the frames.
+            answer: the ranges of their points, (n, ...).
+        """
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
             return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
@@ -401,7 +411,7 @@ class Measurement:
 
 
 class PointPlacement(Measurement):
-    """For Cartesian points, writes the raw values of the point that each beam hits.
+    """Writes Cartesian points into frames: for each beam, the point that it hits.
 
     Raises:
         SpecError: if no directions are declared, or no field determines the coordinates of a point.
@@ -573,7 +583,7 @@ def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[
 
 
 def _make_point_batch(sensor: Sensor, table: CompiledTable) -> Batch:
-    """Return a batch of frames or parts, without earlier frames of other types."""
+    """Return frames or parts as a batch, as if no frame of another type had arrived."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -590,7 +600,9 @@ def _with_depth(array: Floats, depth: int) -> Floats:
     return array.reshape(*(1,) * (depth - array.ndim), *array.shape)
 
 
-def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) -> NDArray[np.intp]:
+def _count_points(
+    shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch
+) -> NDArray[np.intp]:
     """Return the number of points of each packet, (n,)."""
     counts = np.ones(len(batch), np.intp)
     for length, name in zip(shape[1:], axes, strict=True):
@@ -681,7 +693,7 @@ class RestingImu:
         return paths
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
-        """Return the measurements with one field at its probe value and the others at 0."""
+        """Return the measurements if a field is `PROBE_VALUE` and all others are 0."""
         write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
@@ -803,8 +815,8 @@ class FrameSimulation:
     Args:
         sensor: the sensor.
         frame: the frame type.
-        blocked: whether the rotor does not turn. If so, the angles, and the field that separates
-            scans, have the same values in all frames as in the second frame.
+        blocked: whether the rotor does not turn. If so, all frames have the angles of the second
+            frame, and its value of the field that separates scans.
 
     Attributes:
         interval: mean time between packets, ns; 0 if the spec does not determine times.
@@ -935,8 +947,8 @@ class FrameSimulation:
 class FramesWithoutPoints:
     """Makes frames without points: replies and periodic frames.
 
-    A frame has the defaults of the spec, the values of its `sweep`, and the measurements of an IMU
-    at rest.
+    The values of a frame come from the defaults of the spec, the `sweep` of the frame type, and the
+    measurements of an IMU at rest.
 
     Args:
         sensor: the sensor.
@@ -965,9 +977,11 @@ class FramesWithoutPoints:
         return self._clocks[name]
 
     def make(self, name: str, values: Mapping[str, Any], now: float) -> bytes:
-        """Return a frame with these physical values.
+        """Return a frame of a type.
 
         Args:
+            name: the frame type.
+            values: physical values that replace the values that the spec declares.
             now: the time of the frame, ns since power-on.
         """
         table = self._fill(name, range(1), values)
@@ -1002,7 +1016,13 @@ class FramesWithoutPoints:
         return self._get_maker(name).seal(table)
 
     def _fill(self, name: str, numbers: range, values: Mapping[str, Any]) -> CompiledTable:
-        """Return frames with the values of the spec, except for these physical values."""
+        """Return frames with the values that the spec declares.
+
+        Args:
+            name: the frame type.
+            numbers: the numbers of the frames.
+            values: physical values that replace declared values.
+        """
         declared = self._sensor.frames[name]
         state = self._sensor.state.get(name, {})
         sweep = declared.simulation.sweep
@@ -1118,9 +1138,10 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
 
 @functools.lru_cache(maxsize=64)
 def find_followed_scale(sensor: Sensor) -> str:
-    """Return the time scale that the clock of a simulated sensor follows: "utc", "tai" or "gps".
+    """Return the time scale that the clock of a simulated sensor follows.
 
-    Returns "" if the simulated clock is not synchronized, or if no date can be written into it.
+    This is "utc", "tai" or "gps", or "" if the clock is not synchronized, or if no date can be
+    written into it.
     """
     others = FramesWithoutPoints(sensor)
     try:
@@ -1147,7 +1168,9 @@ def find_followed_scale(sensor: Sensor) -> str:
 
 
 def _find_main_clock(sensor: Sensor, others: FramesWithoutPoints) -> tuple[str, FrameClock] | None:
-    """Return the frame type with the sensor's clock, and this clock; None if it sends no clock.
+    """Return the frame type with the sensor's clock, and the clock of its frames.
+
+    Returns None if the sensor sends no clock.
 
     Raises:
         UsageError: if the clock of the data frame cannot be written.
