@@ -41,7 +41,7 @@ from lidarspec.errors import (
     suggest,
     suggestion,
 )
-from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
+from lidarspec.formats import find_existing, format_of, require_feature, write, write_imu
 from lidarspec.formats.common import replace_file
 from lidarspec.formats.frame_tables import holds_several_types, write_frames
 from lidarspec.framing.frame_engine import get_codec
@@ -202,7 +202,9 @@ def convert(
     }
     for name, is_requested in properties.items():
         if is_requested:
-            check_holds(target if suffix is None else f"{target}.{suffix.removeprefix('.')}", name)
+            require_feature(
+                target if suffix is None else f"{target}.{suffix.removeprefix('.')}", name
+            )
     if not sources:
         raise UsageError(f"Missing argument 'OUT': the output file for the points of {target}")
     if suffix is not None:

@@ -185,13 +185,13 @@ def write(
     chosen = format_of(path)
     packet_argument = {} if packets is None else {"packets": packets}
     if packet_argument:
-        check_holds(path, "packets")
+        require_feature(path, "packets")
         if PLACEHOLDER.search(str(path)):
             raise UsageError(
                 f"{path}: packets require a single output file, so omit placeholders such as %05d"
             )
     if organized:
-        check_holds(path, "organized")
+        require_feature(path, "organized")
         has_one_scan = "scans" not in chosen.holds
         scans = _iter_organized(
             path, scans, is_single=has_one_scan and not PLACEHOLDER.search(str(path))
@@ -208,11 +208,10 @@ def write(
             chosen.write(part, file_scans, every_point=every_point, **packet_argument)
 
 
-def check_holds(path: str | Path, feature: str) -> None:
+def require_feature(path: str | Path, feature: str) -> None:
     """Raise UsageError if the format of a path lacks a feature of `Format.holds`.
 
-    Raises:
-        UsageError: if the format lacks the feature. The error lists the formats that have it.
+    The error lists the formats that have the feature.
     """
     if feature not in format_of(path).holds:
         having = ", ".join(

@@ -30,7 +30,9 @@ MAX_UNJOINED_BATCHES = 8
 def _write(
     path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]
 ) -> None:
-    """Write the columns of the first scan, and columns about the scan of each point.
+    """Write the points of scans as a table.
+
+    The table has the columns of the first scan, and columns about the scan of a point.
 
     The column `scan` is the number of the scan. `stamp` is the stamp of the scan, as a timestamp in
     ns without a time zone, which pandas and DuckDB read exactly. `time` is in seconds since this
@@ -89,7 +91,10 @@ def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 
 def _make_scan_fields(path: Path | None) -> list[Any]:
-    """Return the fields about the scan of a point that are not in the path."""
+    """Return the schema fields with facts about scans.
+
+    A field that a folder of the path gives, such as scan=7, is left out.
+    """
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
     named = {part.partition("=")[0] for part in folders if "=" in part}

@@ -164,7 +164,7 @@ def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
 
 
 class ColumnSpool:
-    """Stores the values of one column in an unnamed file in the folder of the target."""
+    """Stores the values of one column in an unnamed temporary file in a folder."""
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`

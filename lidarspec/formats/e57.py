@@ -142,7 +142,13 @@ def _make_header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the minima and maxima of the valid points, by group and name."""
+    """Return the least and the largest value of columns, for the header of a scan.
+
+    Only valid points count.
+
+    Returns:
+        For each group of limits of E57, the limits by name.
+    """
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}

@@ -186,8 +186,8 @@ def _write_table(
 def _with_float_integers(columns: Columns) -> Columns:
     """Return columns with integers converted to float64, except `time_ns`.
 
-    A column of integers is float64 in a batch in which a frame lacks the field. After the
-    conversion, it has the same type in all batches.
+    Batches in which a frame lacks a field have a float64 column for it. The conversion makes the
+    types of all batches equal.
     """
     return {
         name: values.astype(np.float64)

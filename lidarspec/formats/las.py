@@ -191,7 +191,7 @@ def _fill_records(
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a compressed file.
 
-    It has 1/6 to 1/2 of the size of a LAS file. Writing it takes seven times as long.
+    Compared with a LAS file, it has 1/6 to 1/2 of the size, and takes seven times as long to write.
     """
     lazrs = import_library("lazrs", "las")
     try:

@@ -40,7 +40,7 @@ def write_pcd(
 ) -> None:
     """Write a binary PCD 0.7 file.
 
-    The fields are those of x y z intensity ring time that the sensor has, and the additional
+    The fields are x y z, intensity, ring and time if the sensor has them, and the additional
     columns. If every point of a single organized scan is written, WIDTH and HEIGHT are the shape of
     the scan, and missing points are nan. Otherwise HEIGHT is 1.
     """
@@ -127,7 +127,7 @@ def _make_pcd_header(rows: PointRows, data: str = "binary") -> bytes:
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a binary little-endian PLY file.
 
-    The properties are those of x y z intensity ring time that the sensor has, and the additional
+    The properties are x y z, intensity, ring and time if the sensor has them, and the additional
     columns. Their types are float, double, uchar or int, because Open3D ignores other types. `ring`
     is an int. Integers that do not fit into an int become double.
     """

@@ -29,7 +29,7 @@ WRITE_BYTES = 1 << 20
 
 
 class PointRows:
-    """Iterates over the rows of each scan, structured arrays of one type, (n,).
+    """Yields the points of each scan as rows of a structured array, (n,).
 
     The possible columns are x y z intensity ring time, the additional columns of the first scan,
     and, for several scans, the number of the scan (`scan`). If a later scan lacks a column, its
@@ -40,8 +40,8 @@ class PointRows:
         layout: a function that returns the type of a row, given the types of the first scan's
             columns by name.
         every_point: whether to include points without a valid return.
-        is_image: whether to order the points of an organized scan row by row. Used only for a
-            single scan of which every point is written.
+        is_image: whether to order the points of an organized scan row by row. It has no effect if
+            there are several scans, or if `every_point` is False.
 
     Attributes:
         dtype: the type of a row.
@@ -92,7 +92,7 @@ class PointRows:
             yield self._select_columns(scan, number, self.dtype.names or ()), scan.points
 
     def fill(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
-        """Return the rows of a scan, and add them to `length`."""
+        """Return the rows of a scan, and add their number to `length`."""
         rows = np.zeros(len(columns["x"]), self.dtype)
         for name, column in columns.items():
             rows[name] = column

@@ -229,12 +229,12 @@ class _PipeCopy(threading.Thread):
     The SDK does not write the file itself, because it may wait forever if the disk is full.
 
     Attributes:
-        end: the file descriptor of the end of the pipe that is written to.
-        failure: the error that ended the writing; None if there is no error. Data after an error is
-            read from the pipe and discarded.
+        end: the file descriptor to which the SDK writes.
+        failure: the error that ended the writing of the file, or None. After an error, the output
+            of the SDK is discarded.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: if the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
