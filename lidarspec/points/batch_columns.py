@@ -1,9 +1,9 @@
 """The columns of the points of a batch, computed from plans when they are first read.
 
 Columns are computed for the whole batch, for a large slice of it, or for a block of points that
-several small slices share (`BatchColumns.columns`). Some columns are computed together
-(`_compute`). A program of `points.numpy_plan` or a kernel of `points.numba_kernels` computes them
-for each layout in the batch (`GroupPoints`).
+several small slices share (`BatchColumns.columns`). For each layout in the batch (`GroupPoints`), a
+program of `points.numpy_plan` or a kernel of `points.numba_kernels` computes several columns
+together (`_compute`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lidarspec.points.conventions import (
     TYPES,
     Grids,
     convert_numbers,
-    grid_of,
+    make_grid,
     narrow_angle,
     seconds_since,
     turn_azimuth,
@@ -90,7 +90,7 @@ class BatchColumns(ColumnSource):
         if grids:
             self.grid = grids.between(0, size)
         else:
-            self.grid = grid_of(self._plan.shape, self._plan.axes)
+            self.grid = make_grid(self._plan.shape, self._plan.axes)
         self._computed: dict[str, NDArray[Any]] = {}
         self._blocks: list[PointBlock] = []
 
@@ -228,8 +228,8 @@ class BatchColumns(ColumnSource):
         """Return a column of the points from `start` to `stop`, in stream order.
 
         Args:
-            values: for each layout, the values of all points of the packets with this layout in
-                `_packet_range`.
+            values: an array for each layout, with the values of all points in the packets of
+                `_packet_range` that have this layout.
         """
         if self._is_regular:
             skipped = start % self._plan.width

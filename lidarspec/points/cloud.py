@@ -197,7 +197,7 @@ class PointCloud:
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
             shape = find_organised_shape(
                 len(picked["x"]),
-                whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])),
+                whole_columns(find_grid(self), which.indices(len(self))[0], len(picked["x"])),
             )
         return PointCloud(**{**picked, "shape": shape})
 
@@ -216,7 +216,7 @@ class PointCloud:
         """
         if self.shape is None or self.column is None:
             raise UsageError("an image requires organised points with column numbers")
-        column_size = grid_of(self).column_size
+        column_size = find_grid(self).column_size
         numbers, counts = np.unique(self.column[::column_size], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
@@ -255,7 +255,7 @@ class PointCloud:
             else:
                 reason = "the points are not organised in rows and columns"
             raise UsageError(reason)
-        grid = grid_of(self)
+        grid = find_grid(self)
         columns, rows = self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
         places = source * rows + np.arange(rows)
@@ -265,12 +265,12 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at these indices, which consist of whole columns.
+        """Return the points at `indices`, which are those of whole columns of points.
 
         An index of -1 gives an invalid point.
         """
         indices = indices.reshape(-1)
-        column_size = grid_of(self).column_size
+        column_size = find_grid(self).column_size
         gaps = indices < 0
         picked = self[np.where(gaps, np.arange(len(indices)) % column_size, indices)]
         if gaps.any():
@@ -356,7 +356,7 @@ def _select(value: Any, which: Any) -> Any:
     return value
 
 
-def grid_of(cloud: PointCloud) -> Grid:
+def find_grid(cloud: PointCloud) -> Grid:
     """Return how the points of a cloud are organised; an empty Grid if they are not."""
     if cloud.shape:
         return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
@@ -382,7 +382,7 @@ class CloudColumns(ColumnSource):
         if grids:
             self.grid = grids.between(0, self.size)
         else:
-            self.grid = grid_of(cloud)
+            self.grid = find_grid(cloud)
         if isinstance(cloud, LazyCloud):
             self.extra = cloud.lazy.source.extra
         else:

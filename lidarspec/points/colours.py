@@ -77,7 +77,7 @@ def to_hex(rgb: Rgb) -> str:
 
 
 def _interpolate(ends: tuple[float, float], share: float) -> float:
-    """Return the value at a position between two values, from 0 (first) to 1 (second)."""
+    """Return a value between two values, by its `share` of the way, 0 to 1."""
     return ends[0] + (ends[1] - ends[0]) * share
 
 

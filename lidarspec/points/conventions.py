@@ -169,7 +169,7 @@ class Grid(NamedTuple):
         return self.rows * self.returns
 
 
-def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
+def make_grid(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
     """Return how points of a given shape are organised.
 
     Args:
@@ -223,7 +223,7 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
 
     Args:
         grid: how all points are organised.
-        first: the index of the first point of the slice, counted from the start of any column.
+        first: the number of points between the start of a column and the slice.
         number: the number of points of the slice.
     """
     if grid.rows and first % grid.column_size == 0 and number % grid.column_size == 0:

@@ -20,7 +20,7 @@ from lidarspec.expressions.graph import Node
 from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.points.batch_columns import BatchColumns
-from lidarspec.points.conventions import Grids, grid_of
+from lidarspec.points.conventions import Grids, make_grid
 from lidarspec.points.layout_groups import GroupPoints, PlainValues
 from lidarspec.points.plan import MODERATE_SIZES, STATEFUL_KINDS, Plan, plan_for
 from lidarspec.points.reference_evaluator import (
@@ -146,7 +146,7 @@ def _is_valid(share: GroupPoints) -> bool:
 def _is_moderate(share: GroupPoints, node: Node) -> bool:
     """Return whether all numbers of a field are suitable for computation in float32.
 
-    They have to be finite, and neither too small nor too large (`MODERATE_SIZES`).
+    They must be finite, and within `MODERATE_SIZES`.
     """
     leaf = share.plan.layout.leaves.get(node.path)
     if leaf is None:
@@ -185,7 +185,7 @@ def _make_source(
         for number, share in enumerate(shares):
             widths[share.group.where] = share.plan.width
             which[share.group.where] = number
-        each = [grid_of(share.plan.shape, share.plan.axes) for share in shares]
+        each = [make_grid(share.plan.shape, share.plan.axes) for share in shares]
         grids = Grids(np.cumsum(widths), which, each)
         starts = grids.ends - widths
         size = int(widths[:ready].sum())

@@ -1,9 +1,9 @@
 """Group the returns of each firing, and choose one of them.
 
 Returns belong to one firing if they have the same column and ring. The points of most sensors have
-no column; their returns have the same time and ring. Several points with one return index, time and
-ring belong to successive firings: the first point with return index 0 and the first with return
-index 1 are the first firing.
+no column; their returns have the same time and ring. If several points have the same return index,
+time and ring, they belong to successive firings. The first point with each return index belongs to
+the first firing.
 
 A return of a firing may be missing, because it was not sent, or because its packet is lost.
 """
@@ -87,9 +87,10 @@ def choose_returns(
 
     Args:
         which: "first", "last" or "strongest". The strongest return has the highest intensity.
-        names: the names of the returns, by return index (`Sensor.returns`). Without names, the
-            first and the last return are found by the return index. If there are names, but `which`
-            is not one of them, these returns are found by the range.
+        names: the names of the returns, by return index (`Sensor.returns`). If `which` is one of
+            them, the return with this name is chosen. Otherwise, the first return is the one with
+            the smallest range, and the last return the one with the largest range. Without names,
+            returns are ordered by their index.
 
     Raises:
         UsageError: for "strongest" if there is neither an intensity nor a return of this name.

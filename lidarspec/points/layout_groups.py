@@ -133,11 +133,16 @@ class GroupPoints:
         return columns
 
     def compute_plainly(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return a part of the result of `points`, computed by the reference evaluator.
+        """Return one part of the result of `points`, by the reference evaluator.
 
-        The shape is (stop - first, *plan.shape); a `stop` of None means all packets. A column in
-        `extra` that contains the raw integers of a field has the type of this field. All other
-        parts are float64.
+        Args:
+            name: the part, for example "range".
+            first, stop: the packets from `first` to `stop - 1`; a `stop` of None means all packets
+                from `first` on.
+
+        Returns:
+            An array of shape (stop - first, *plan.shape). It is float64, except for a column of
+            `extra` with the raw integers of a field, which has the type of the field.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]

@@ -93,9 +93,10 @@ def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
 
 
 def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
-    """Return an expression of one field for every value of its window.
+    """Evaluate an expression of one field for every value of the bytes of the field.
 
-    The shape is (256,) or (65536,). Returns None if the field has no window.
+    Returns:
+        (256,) or (65536,); None if the field is not in one or two bytes.
     """
     field_window = find_window(leaf)
     if field_window is None:
@@ -107,7 +108,7 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
-    Returns None unless the expression depends on a single field with a window.
+    Returns None unless the expression depends on a single field of one or two bytes.
     """
     source = get_only_field(node)
     if source is not None:

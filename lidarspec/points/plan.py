@@ -82,9 +82,9 @@ class ColumnMaker(Protocol):
 
         Args:
             rows: the frames, (n, size), evenly spaced in memory.
-            values: a function that returns the value of a node by the reference evaluator, (n or 1,
-                ...).
-            columns: the arrays to fill, flat and contiguous, as `columns` returns them.
+            values: a function that computes the value of a node with the reference evaluator, (n or
+                1, ...).
+            columns: the arrays to fill, by name. The method `columns` makes them.
         """
 
 
@@ -100,8 +100,8 @@ class Plan:
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
-        sent: for each column in `extra` that contains the raw integers of a field, this field, by
-            the name of the column.
+        sent: the columns in `extra` with the raw integers of a field: the field, by the name of the
+            column.
         exact: whether coordinates and range are computed in float64 in the order in which they are
             written. All other columns are always computed in this way.
         positive: nodes whose values have to be positive numbers for the plan to be valid.
@@ -200,10 +200,13 @@ class Plan:
         return self.exact or name == "intensity" or name in self.extra
 
     def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """Return the field whose integers are the values of a column in `extra`.
+        """Return the field with exactly the values of a column in `extra`.
 
-        Returns None unless each point has its own value of a single integer field, and the column
-        has the type of the field.
+        Returns None if the column has to be computed.
+
+        Args:
+            part: the expression of the column.
+            dtype: the type of the column.
         """
         if isinstance(part, Node) and part.kind == "field":
             leaf = self.layout.leaves.get(part.path)

@@ -181,7 +181,7 @@ def _make_points(
         conventions.vendor_turn(packets.sensor),
         list_extra_types(result, parts),
         stamp_ns=stamp_ns,
-        shape=find_organised_shape(len(every["time"]), conventions.grid_of(shape[1:], axes)),
+        shape=find_organised_shape(len(every["time"]), conventions.make_grid(shape[1:], axes)),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     grids = None
@@ -208,7 +208,7 @@ def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conv
     counts = inside.sum(axis=tuple(inner))
     lengths[lengths.prod(axis=1) != counts] = 0  # a packet with rows of several lengths has no grid
     shapes, which = np.unique(lengths, axis=0, return_inverse=True)
-    grids = [conventions.grid_of(shape, axes) for shape in shapes.tolist()]
+    grids = [conventions.make_grid(shape, axes) for shape in shapes.tolist()]
     return conventions.Grids(np.cumsum(counts), which.reshape(-1), grids)
 
 

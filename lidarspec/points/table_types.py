@@ -50,9 +50,8 @@ def arrow_schema(
     Float columns are not nullable, because this is faster to write. A missing value is nan.
 
     Args:
-        units: the unit of each column by name; columns that are plain numbers are left out. They
-            are stored in the metadata of each field, and together as JSON in the metadata of the
-            schema.
+        units: the unit of each column by name, without columns of plain numbers. Each field has its
+            unit in its metadata, and the schema has all units as JSON.
         facts: further metadata of the schema.
 
     Raises:

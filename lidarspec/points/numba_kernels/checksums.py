@@ -132,7 +132,10 @@ def _compute_along_rows(
 
 
 class _ByteShares:
-    """The share of each byte of a frame in one checksum, computed on first use.
+    """Tables from which the checksum of a frame is computed byte by byte.
+
+    The checksum is the XOR of `start` and of a share for each byte, which depends on the position
+    and the value of the byte.
 
     Attributes:
         seen: the number of frames so far.
@@ -143,8 +146,8 @@ class _ByteShares:
             checksum does not cover, and for bytes that an earlier word contains.
         is_plain: whether each share is the byte itself, in the low or the high byte of the
             checksum.
-        lows: if `is_plain`, a mask for each word. It selects the bytes that are XORed into the low
-            byte of the checksum.
+        lows: if `is_plain`, for each word, a mask of the bytes whose share is in the low byte of
+            the checksum.
         highs: the same for the high byte of the checksum.
     """
 

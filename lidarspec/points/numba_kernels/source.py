@@ -77,9 +77,9 @@ class Beam(NamedTuple):
 
 
 def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """Return a sum as a `Beam`.
+    """Return an expression as a `Beam`.
 
-    Returns None if the sum does not have this form, or if the raw distance has too many bits for
+    Returns None if it is not a coordinate on a beam, or if the raw distance has too many bits for
     float32.
     """
     if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
@@ -138,7 +138,7 @@ class Trig:
 
 
 class Expressions(KernelWriter):
-    """Writes traced expressions into the loops."""
+    """Writes traced expressions into the loops of a kernel."""
 
     def double(self, value: Any, depth: int = 0) -> KernelValue:
         """Write an expression in float64, or a condition, and return its value."""
@@ -287,8 +287,8 @@ class Expressions(KernelWriter):
         Args:
             exact: whether the value is computed in float64 and rounded once, as in the reference
                 evaluator.
-            root: whether the expression is a coordinate. Sums of coordinates may be computed in
-                float32.
+            root: whether the expression is a whole coordinate. In this case, sums may be computed
+                in float32.
         """
         if not isinstance(value, Node):
             return self.constant(value, len(self.shape), "float32")
@@ -321,10 +321,10 @@ class Expressions(KernelWriter):
         )
 
     def _write_along_beam(self, beam: Beam) -> KernelValue | None:
-        """Return a coordinate along a beam, rounded once.
+        """Return a coordinate of points on a beam, rounded once.
 
-        The direction is split into two float32 numbers for more precision. Returns None if only
-        NumPy can read the distance or the rows.
+        The direction is split into two float32 numbers for more precision. Returns None if NumPy
+        has to compute values of the beam.
         """
         sent = self._write_distance(beam.distance, raw=True)
         table = beam.direction.args[1]
@@ -391,7 +391,7 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """Return a product or sum; a `DeferredFloat` if an operand is one."""
+        """Return a product or sum; a `DeferredFloat` if an operand is a `DeferredFloat`."""
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
@@ -399,7 +399,7 @@ class Expressions(KernelWriter):
     def _write_field(self, node: Node, *, exact: bool) -> KernelValue | None:
         """Return an expression of one field: a linear function or a table lookup.
 
-        Returns None unless each point has its own value of such a field.
+        Returns None if points share a value of the field, or if `find_window` has no result for it.
         """
         source = get_only_field(node)
         if source is not None and is_full(source, self.width):
@@ -475,7 +475,7 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return an angle of one field from a lookup table; None without a table.
+        """Return a lookup of an angle that depends on one field; None without a table.
 
         The table is float32 if this is precise enough.
         """

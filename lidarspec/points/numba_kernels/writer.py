@@ -280,7 +280,7 @@ def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
 
 
 class KernelWriter:
-    """Writes values into the loops of a kernel.
+    """Writes the source lines of a kernel that compute values.
 
     Args:
         layout: the layout of the frames.
@@ -455,10 +455,7 @@ class KernelWriter:
         )
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:
-        """Return the strides of a field's arrays.
-
-        The stride of the innermost arrays is the same in all frames.
-        """
+        """Return the strides of a field's arrays as texts: numbers or arguments."""
         strides = [self.number(stride) for stride in leaf.strides]
         if leaf.strides and len(leaf.info.axes) == max(
             len(other.info.axes) for other in self.layout.leaves.values()
@@ -483,9 +480,15 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Return the lookup that replaces an expression of one field.
+        """Add a lookup that replaces an expression, and return its text.
 
         Returns None if `find_window` has no result for the field.
+
+        Args:
+            node: the expression, which depends on a single field.
+            source: the field.
+            kind: the dtype of the table.
+            factor: a number by which the values are multiplied.
         """
         leaf = self.layout.leaves.get(source.path)
         field_window = find_window(leaf) if leaf is not None else None

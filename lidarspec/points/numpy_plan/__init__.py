@@ -39,8 +39,8 @@ def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]
 def describe(plan: Plan) -> list[str]:
     """Return a description of a plan as lines of text.
 
-    The lines show the shape of the points, the values that are computed for each packet, and the
-    calls for each chunk.
+    The lines show the shape of the points, the values that the reference evaluator computes, and
+    the steps of the NumPy program.
     """
     names = tuple(
         name

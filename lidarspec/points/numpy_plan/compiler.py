@@ -48,7 +48,7 @@ class Compiler:
 
     Attributes:
         program: the program, with an output for each column that was added.
-        low: the nodes that the program reads, and that have one value for each packet or block.
+        low: the nodes with one value for each packet or block that are inputs of the program.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -148,11 +148,10 @@ class Compiler:
         return self.program.call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
-        """Compile the cosine or sine of a sum of angles that several points share.
+        """Compile the cosine or sine of a sum of angles.
 
-        Each angle has one value for each packet or block, or is a constant.
-
-        By the angle addition theorem, no trigonometric function is computed for each point.
+        Each angle is a constant, or has one value for each packet or block. By the angle addition
+        theorem, only the cosines and sines of these values are computed, and none for each point.
         """
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
@@ -223,7 +222,7 @@ class Compiler:
         return self._compile_field(node, kind)
 
     def _compile_field(self, node: Node, kind: str) -> int | None:
-        """Load a field, or look up an expression of one field by its window.
+        """Load a field, or look up an expression of a single field in a table.
 
         Returns None if neither is possible.
         """
@@ -317,8 +316,7 @@ class Compiler:
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
         """Compile a lookup of rows of a table.
 
-        Returns None if each point has its own index, or if a row does not have one value for each
-        element of the innermost arrays.
+        Returns None unless a row has exactly the values of the points that share its index.
         """
         index, table = node.args
         inner = table.shape[1]
@@ -337,10 +335,10 @@ class Compiler:
         return self.program.step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
-        """Compile a sum; terms with one value for each packet or block are added first.
+        """Compile a sum of which some terms have one value for each packet or block.
 
-        Returns None if all terms have a value for each point, or if such a term is multiplied by an
-        array.
+        These terms are added first. Returns None if there are none, or if a term with a value for
+        each point is multiplied by an array.
         """
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
