@@ -63,7 +63,7 @@ from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
-from lidarspec.spec.syntax import prepare, seals
+from lidarspec.spec.syntax import iter_seals, prepare
 from lidarspec.trusted_files import own_settings, read_document
 
 if TYPE_CHECKING:
@@ -787,7 +787,7 @@ def _replace_checksum(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"must return a Checksum or None, got {type(algorithm).__name__}")
     struct = prepare(frame.struct)
-    seal = next(seals(struct), None)
+    seal = next(iter_seals(struct), None)
     if seal is None:
         raise SpecError("returns a checksum for a frame type that declares no checksum")
     seal.algorithm = algorithm

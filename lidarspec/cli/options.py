@@ -17,7 +17,7 @@ import click
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor
 from lidarspec.sensor_operations import Sensor
-from lidarspec.spec.fields import duration, factor, share, split_unit
+from lidarspec.spec.fields import factor, parse_duration, parse_share, split_unit
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -171,14 +171,14 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
 
 
 def _parse_duration(text: str) -> float:
-    seconds = duration(text)
+    seconds = parse_duration(text)
     if seconds <= 0:
         raise ValueError(text)
     return seconds
 
 
 def _parse_share(text: str) -> float:
-    if not 0 <= (number := share(text)) <= 1:
+    if not 0 <= (number := parse_share(text)) <= 1:
         raise ValueError(text)
     return number
 
@@ -228,7 +228,7 @@ def _parse_pair(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
 
 def _parse_moment(text: str) -> float | datetime:
     try:
-        return duration(text)
+        return parse_duration(text)
     except UsageError:
         return datetime.fromisoformat(text)
 

@@ -66,7 +66,7 @@ from lidarspec.spec.tree import (
     Sealed,
     find_runs,
     formulas,
-    parts,
+    iter_subformulas,
     refs,
 )
 
@@ -311,7 +311,7 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
             for ref in refs(value):
                 ends = [other.start + other.size for other in layout.find_entries(ref.path)]
                 yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in ends)
-            for part in parts(value):
+            for part in iter_subformulas(value):
                 if (
                     isinstance(part, Op)
                     and part.symbol in ("//", "%")

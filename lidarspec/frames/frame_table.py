@@ -22,7 +22,7 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.arrays import add_axes, count_up, is_counted, repeat
 from lidarspec.frames.layout import Bytes2D, Derivation, Layout, Leaf, gather_rows
 from lidarspec.frames.schema import Schema, make_schema, without_indices
-from lidarspec.spec.syntax import get_member, leaves
+from lidarspec.spec.syntax import get_member, iter_leaves
 
 if TYPE_CHECKING:
     from lidarspec.frames.parts import FoundParts
@@ -679,7 +679,7 @@ def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
     if isinstance(parsed, bytes):
         return list(parsed)
     if not isinstance(parsed, dict):
-        return next(iter(leaves(parsed)))[1]
+        return next(iter(iter_leaves(parsed)))[1]
     return None
 
 

@@ -27,9 +27,9 @@ from lidarspec.spec.tree import (
     FieldInfo,
     Formula,
     Node,
-    arrays,
+    evaluate_arrays,
     get_element,
-    parts,
+    iter_subformulas,
     refs,
     width,
 )
@@ -388,7 +388,7 @@ class Derivation:
                 dtype = np.int64 if values.dtype.kind in "iu" else np.float64
                 spare = (1,) * (1 + depth - values.ndim)
                 columns[ref.path] = values.astype(dtype).reshape(*values.shape, *spare)
-            return np.asarray(arrays(self.formula, columns, None))
+            return np.asarray(evaluate_arrays(self.formula, columns, None))
         values = np.array(self.start).reshape((1,) * (1 + depth))
         if any(self.strides):
             for axis, (length, stride) in enumerate(zip(self.shape, self.strides, strict=True)):
@@ -576,13 +576,13 @@ class Condition:
             path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim))
             for path, array in raw.items()
         }
-        results = np.asarray(arrays(self.formula, columns, self._dtype))
+        results = np.asarray(evaluate_arrays(self.formula, columns, self._dtype))
         return results if results.dtype == np.bool_ else results != 0
 
     @cached_property
     def _dtype(self) -> Any:
         """The smallest integer type that can represent all intermediate values of the formula."""
-        most = max(width(part) for part in parts(self.formula or 0))
+        most = max(width(part) for part in iter_subformulas(self.formula or 0))
         if most < 15:
             return np.int16
         if most < 31:

@@ -408,7 +408,7 @@ class _PartWalk:
         """Return the value of a formula in each part; -1 if the formula raises an error."""
         asked = tree.refs(formula)
         is_simple = isinstance(formula, tree.Ref) or (
-            isinstance(formula, tree.Op) and all(map(_fits_columns, tree.parts(formula)))
+            isinstance(formula, tree.Op) and all(map(_fits_columns, tree.iter_subformulas(formula)))
         )
         if is_simple and all(
             ref.path in layout.leaves and ref.info.bits <= MAX_COLUMN_BITS for ref in asked
@@ -417,7 +417,7 @@ class _PartWalk:
                 ref.path: layout.leaves[ref.path].read(self._buffer, offsets)[1].astype(np.int64)
                 for ref in asked
             }
-            values = tree.arrays(formula, columns, np.int64)
+            values = tree.evaluate_arrays(formula, columns, np.int64)
             return np.broadcast_to(values, len(offsets)).astype(np.int64)
         return np.array(
             [self._evaluate(layout, formula, offset) for offset in offsets.tolist()],

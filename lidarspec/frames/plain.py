@@ -19,7 +19,7 @@ from lidarspec.frames.schema import Schema, make_schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import MismatchError, field_path, leaves, to_public
+from lidarspec.spec.syntax import MismatchError, field_path, iter_leaves, to_public
 from lidarspec.spec.tree import FieldInfo
 
 #: The maximum number of times that a frame is built until its lengths no longer change.
@@ -108,7 +108,7 @@ def _iter_fields(
     struct: Any, prefix: str, data: bytes, infos: Mapping[str, FieldInfo]
 ) -> Iterator[WireField]:
     """Yield the fields of a parsed struct, which contains the spans of its members."""
-    for name, (start, end) in struct["_marks"].items():
+    for name, (start, end) in struct["_spans"].items():
         path = f"{prefix}.{name}".strip(".")
         value = struct[name]
         elements = value if isinstance(value, list) else [value]
@@ -120,7 +120,7 @@ def _iter_fields(
                     below = path
                 yield from _iter_fields(element, below, data, infos)
         elif isinstance(value, dict):  # a bit block
-            for keys, raw in leaves(value):
+            for keys, raw in iter_leaves(value):
                 below = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
                 info = infos.get(f"{path}{below}", FieldInfo(f"{path}{below}"))
                 yield WireField(f"{path}{below}", path, info, start, end, None, raw)
@@ -139,9 +139,9 @@ def _has_spans(value: Any, start: int, end: int) -> bool:
     False if the bytes of the struct were decoded first, because the spans are then offsets in the
     decoded bytes.
     """
-    if not isinstance(value, dict) or not value.get("_marks"):
+    if not isinstance(value, dict) or not value.get("_spans"):
         return False
-    spans = value["_marks"].values()
+    spans = value["_spans"].values()
     return bool(min(spans)[0] >= start and max(stop for _, stop in spans) <= end)
 
 

@@ -223,7 +223,7 @@ class FormCoder(Coder):
                 for row in part:
                     values = _limit_values(run.from_bytes(row.tobytes()), largest)
                     if isinstance(self.form, DrawsValues):
-                        values = self.form.writable(run, values)
+                        values = self.form.to_encodable(run, values)
                     row[:] = np.frombuffer(run.to_bytes(values), np.uint8)
             elif self.form.is_text:
                 part[:] = part % 26 + ord("A")

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, did_you_mean
 from lidarspec.leap_seconds import read_leap_seconds
-from lidarspec.spec.fields import duration
+from lidarspec.spec.fields import parse_duration
 from lidarspec.spec.timing import DATED_EPOCHS
 
 Times = NDArray[np.int64]
@@ -90,7 +90,7 @@ def parse_clock_faults(text: str) -> ClockFaults:
     for part in text.split(","):
         fault, mark, when = part.strip().partition("@")
         name, _, value = fault.partition("=")
-        start_s = duration(when) if mark else 0.0
+        start_s = parse_duration(when) if mark else 0.0
         if name in DATED_EPOCHS and part.strip() == name:
             faults = replace(faults, follows=name)
         elif name in _READERS:
@@ -117,7 +117,7 @@ def _add_drift(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
 
 
 def _add_step(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
-    size = duration(value.lstrip("+-"))
+    size = parse_duration(value.lstrip("+-"))
     if value.startswith("-"):
         size = -size
     return replace(faults, steps=(*faults.steps, (start_s, size)))
@@ -132,7 +132,7 @@ def _repeat_second(faults: ClockFaults, value: str, start_s: float) -> ClockFaul
 
 
 def _unlock(faults: ClockFaults, value: str, start_s: float) -> ClockFaults:
-    end_s = start_s + duration(value) if value else math.inf
+    end_s = start_s + parse_duration(value) if value else math.inf
     return replace(faults, unlocked=(*faults.unlocked, (start_s, end_s)))
 
 

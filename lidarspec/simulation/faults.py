@@ -16,7 +16,7 @@ from typing import Any
 
 from lidarspec.errors import OutOfRange, UsageError
 from lidarspec.simulation.clock_faults import ClockFaults, parse_clock_faults
-from lidarspec.spec.fields import duration, share
+from lidarspec.spec.fields import parse_duration, parse_share
 
 #: Fraction of datagrams that are delayed if `reorder` is set.
 DELAYED_SHARE = 0.1
@@ -78,11 +78,11 @@ def parse_faults(options: Mapping[str, str]) -> Faults:
         UsageError: if a value cannot be parsed.
     """
     read: dict[str, Any] = {
-        "errors": share,
-        "loss": share,
+        "errors": parse_share,
+        "loss": parse_share,
         "reorder": int,
-        "unplug": duration,
-        "absent": duration,
+        "unplug": parse_duration,
+        "absent": parse_duration,
         "shake": float,
         "rotor": str,
         "clock": parse_clock_faults,

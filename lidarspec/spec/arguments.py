@@ -23,7 +23,7 @@ from lidarspec.errors import SpecError
 class Range:
     """A number from `low` to `high`, in the unit of its field.
 
-    A plugin writes it as two numbers after the path.
+    In a command, a plugin writes the two numbers without `Range`.
     """
 
     low: float

@@ -50,10 +50,10 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The position of the value as consecutive bits of an integer.
+        """The position of the value, if its bits are consecutive in an integer; else None.
 
-        This is a tuple of the integer's byte order ("<" or ">"), first byte and number of bytes,
-        and of the lowest bit of the value. It is None if the bits are not consecutive.
+        The items are the byte order of the integer ("<" or ">"), its first byte, its number of
+        bytes, and the lowest bit of the value in the integer.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first = parts[0].byte

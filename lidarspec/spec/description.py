@@ -91,8 +91,8 @@ class Simulation:
             periodically.
         answers: for each command, a list of the items that the sensor sends before any data, or a
             function that returns this list, given the raw fields of the request. An item is the
-            name of a frame, (name, physical values by path), bytes, or a pause in seconds during
-            which the sensor sends its fillers. The raw fields also contain the values of a
+            name of a frame, (name, physical values by path), bytes, or a pause in seconds. In a
+            pause, the sensor sends `Sensor.fillers`. The raw fields also contain the values of a
             `Template` as texts, by the name in braces, such as "{handle}". "{data_port}" is the
             port at which the simulated sensor serves its data. By default, a command is answered
             with its `reply`. Only for a sensor, not for a frame type.
@@ -243,7 +243,7 @@ class Frame:
         """The struct of the frame as a tree of nodes; made on first use.
 
         Raises:
-            SpecError: for a constant that its Enum does not have.
+            SpecError: if a constant of an Enum field is none of the names of its Enum.
         """
         return frame_tree(self.prepared)
 

@@ -1,8 +1,7 @@
 """Additions to construct for units, checksums, sizes and parts of variable size.
 
 They are ordinary members of a struct and can be nested in any construct. They do not change the raw
-integers of a frame. Units are texts; units that can be used on the command line are converted
-exactly.
+integers of a frame. Units are texts.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ _FACTORS: dict[str, dict[str, Fraction]] = {
 
 
 def factor(unit: str, target: str) -> Fraction | None:
-    """Return the size of `unit` in `target` units.
+    """Return the factor that converts values in `unit` to `target`.
 
     Returns None if they measure different quantities.
     """
@@ -109,7 +108,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def duration(text: str) -> float:
+def parse_duration(text: str) -> float:
     """Return the seconds in a text such as "10s", "500ms", "2min", "2m", "1h" or "10".
 
     Raises:
@@ -132,7 +131,7 @@ def duration(text: str) -> float:
     )
 
 
-def share(text: str) -> float:
+def parse_share(text: str) -> float:
     """Return the value of "1%" or "0.01" as a number.
 
     Raises:
@@ -257,7 +256,7 @@ class Checksummed(layer.SealedStruct):
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        obj = self._marked._parsereport(stream, context, path)
+        obj = self._measured._parsereport(stream, context, path)
         end = stream.tell()
         if not layer.is_verifying(context):
             return obj
@@ -283,7 +282,7 @@ class Checksummed(layer.SealedStruct):
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replace(blank, name, self._make_zero(name) if value is None else value)
-        con = self._marked
+        con = self._measured
         trial = io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
@@ -297,13 +296,13 @@ class Checksummed(layer.SealedStruct):
         )
 
     @property
-    def _marked(self) -> Construct:
-        """The struct with recorded member offsets.
+    def _measured(self) -> Construct:
+        """The struct, which adds the offsets of its members to the parsed value.
 
-        The struct of a frame has recorded offsets already. This property adds them to a struct
-        that is used without a frame.
+        The engine has replaced the struct of a frame by such a struct. A struct that is used
+        without a frame is replaced here.
         """
-        if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct):
+        if isinstance(layer.unwrap(self.subcon), layer.MeasuredStruct):
             return self.subcon
         return layer.prepare(self.subcon)
 
@@ -381,10 +380,10 @@ class Checksummed(layer.SealedStruct):
 
         The range of a bit field includes all bytes that contain its bits.
         """
-        con = self._marked
+        con = self._measured
         parts = name.split(".")
         for depth, part in enumerate(parts):
-            start, end = obj["_marks"][part]
+            start, end = obj["_spans"][part]
             con = layer.unwrap(con, bits=False)._subcons[part]
             obj = obj[part]
             if parts[depth + 1 :] and layer.unwrap(con, bits=False) is not layer.unwrap(con):
@@ -485,10 +484,10 @@ class Parts(layer.Partition):
         raise SizeofError("the size of the parts depends on their content", path=path)
 
     def _make_size_rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
-        """Return a function from the previous parts to the size of the next part.
+        """Return a function that calculates the size of the next part.
 
-        The size is in bytes; 0 if there is no further part, and -1 if the struct of the part
-        determines its size.
+        Its argument is the parts parsed so far. It returns bytes, or 0 if no part follows, or -1 if
+        the struct of the part determines the size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
         bounds = (

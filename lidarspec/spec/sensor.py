@@ -127,7 +127,10 @@ class SensorDescription:
 
     @property
     def data_frame(self) -> str:
-        """The name of the frame type with the points, or of the selected one of several.
+        """The name of the frame type with the points.
+
+        If there are several such types, it is the one that the option `answer` selects, or the
+        first.
 
         Raises:
             UsageError: for a sensor without points. The error lists its frame types.
@@ -239,7 +242,7 @@ class SensorDescription:
         )
 
     def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
-        """Return the path of the parts of a frame that have `points` or `imu`.
+        """Return the path of the parts of a frame that have a `points` or `imu` function.
 
         Returns:
             The path; "" if the frame itself has the function, or if the sensor does not have the
@@ -277,7 +280,7 @@ class SensorDescription:
 
     @property
     def announces_port(self) -> bool:
-        """Whether an opening command sends the sensor the port to which it sends its data."""
+        """Whether a command in `on_open` contains the port of this computer for the data."""
         return any(self.commands[name].has_own_port for name in self.on_open)
 
     @property

@@ -290,14 +290,14 @@ def unix_time(
 ) -> Any:
     """Return the seconds from 1970-01-01 to a date of the Gregorian calendar, in UTC.
 
-    The arguments are numbers, arrays or columns. The function is used in the `source` of a `Clock`.
-    A fraction of a second is a separate term of the source, so that nanoseconds are exact.
+    The function is used in the `source` of a `Clock`. Its arguments are numbers, arrays or columns.
+    A source with nanoseconds adds them as a separate term, so that they stay exact.
 
     Args:
         year: with its century, for example 2026.
         month: 1 to 12.
         day: 1 to 31.
-        hour, minute, second: the time of day; values beyond their usual range are added as well.
+        hour, minute, second: the time of day. A larger value, such as 86400 seconds, is allowed.
 
     Returns:
         float64, the broadcast shape; whole seconds are exact.

@@ -149,8 +149,8 @@ class FieldInfo:
 
     Attributes:
         path: the path without indices, such as "points.distance".
-        axes: the axes of the arrays that contain the field, outermost first. A field of bytes adds
-            its own path.
+        axes: the axes of the arrays that contain the field, outermost first. A field of bytes is
+            itself an array of bytes, so its path is the last axis.
         dtype: the dtype of the raw value in native byte order; None if only construct can read it.
         kind: "int", "float", "bytes" or "other".
         scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
@@ -399,20 +399,20 @@ def evaluate(formula: Formula, read: Read) -> Any:
     return formula
 
 
-def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
-    """Return the values of a formula for arrays; booleans for a condition.
+def evaluate_arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
+    """Evaluate a formula for many frames at once; a condition gives booleans.
 
     Args:
-        columns: the values of fields, by path.
+        columns: the values of each field, by path.
         dtype: a dtype that can represent all intermediate values.
     """
     match formula:
         case Ref():
             return columns[formula.path]
         case Op("not", (operand,)):
-            return arrays(operand, columns, dtype) == 0
+            return evaluate_arrays(operand, columns, dtype) == 0
         case Op(symbol, args):
-            values = [arrays(arg, columns, dtype) for arg in args]
+            values = [evaluate_arrays(arg, columns, dtype) for arg in args]
             if symbol not in _BOOLEAN_OPERATIONS:
                 values = [
                     np.asarray(value, dtype) if isinstance(value, np.ndarray) else value
@@ -441,8 +441,8 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
     Args:
         named: a function that returns the text of a field.
-        operations: for each operation that the language writes differently from Python, a format
-            string by symbol, with "{}" for each argument.
+        operations: how the language writes operations that differ from Python, by Python's symbol.
+            A text has "{}" for each argument.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.
@@ -465,12 +465,14 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return the field of an array element; None if the field is not in these arrays.
+    """Return the description of one element of a field that is inside arrays.
+
+    Returns None if the field is not inside all arrays of `indices`.
 
     Args:
-        info: the field in the array.
+        info: the description of the field.
         path: the path of the element.
-        indices: the index by axis. These axes are removed.
+        indices: the index of the element in each array, by the axis of the array.
     """
     if not indices.keys() <= set(info.axes):
         return None
@@ -483,7 +485,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 def fraction_in(formula: Formula) -> str | float | None:
     """Return a "/" or a float that makes a formula fractional; None if it has neither."""
-    for part in parts(formula):
+    for part in iter_subformulas(formula):
         if isinstance(part, float):
             return part
         if isinstance(part, Op) and part.symbol == "/":
@@ -491,17 +493,17 @@ def fraction_in(formula: Formula) -> str | float | None:
     return None
 
 
-def parts(formula: Formula) -> Iterator[Formula]:
+def iter_subformulas(formula: Formula) -> Iterator[Formula]:
     """Yield a formula and all its operands, recursively."""
     yield formula
     if isinstance(formula, Op):
         for arg in formula.args:
-            yield from parts(arg)
+            yield from iter_subformulas(arg)
 
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """Return the fields that a formula depends on, each once, in order."""
-    return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
+    return tuple(dict.fromkeys(part for part in iter_subformulas(formula) if isinstance(part, Ref)))
 
 
 #: The maximum number of bits that values of a formula may have to be computed in 64-bit integers.
@@ -606,7 +608,7 @@ class Ending:
 
     @property
     def terminator(self) -> bytes:
-        """The bytes after the content; b"" if the mark belongs to the content."""
+        """The end mark, or b"" if it belongs to the content."""
         return b"" if self.is_content else self.mark
 
     def find(self, data: bytes) -> int:
@@ -747,8 +749,8 @@ class Repeat:
     """An array of `count` elements.
 
     Attributes:
-        axis: the name of the array. This is the path of the array, with "[]" appended for each
-            array that directly contains it.
+        axis: the name of the axis. This is the path of the array. In an array of arrays, each inner
+            level appends "[]".
     """
 
     name: str

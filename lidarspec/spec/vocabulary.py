@@ -27,7 +27,7 @@ ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_i
 
 
 class AlongAxis(NDArrayOperatorsMixin):
-    """Numbers for the elements of an array of the frame, which all packets share.
+    """Numbers for the elements of an array of the frame, the same in all packets.
 
     They can be combined with each other and with columns by NumPy's ufuncs.
 
@@ -72,9 +72,9 @@ class AlongAxis(NDArrayOperatorsMixin):
         )
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Any:
-        """Return `function` of the values, which are first aligned by the names of arrays.
+        """Align the values by the names of their arrays, and apply a function to them.
 
-        If a column is among the values, the column applies the function.
+        If a column is among the values, its own `apply_function` is called.
         """
         for value in values:
             if hasattr(value, "apply_function") and not isinstance(value, AlongAxis):
@@ -102,8 +102,8 @@ class AlongAxis(NDArrayOperatorsMixin):
         Axes that the numbers do not have get the length 1.
 
         Args:
-            names: for each axis of the result, the last name of the path of its array. Each array
-                of the attribute `axes` must be among them.
+            names: for each axis of the result, the name of its array without the path. They must
+                include the arrays of `axes`.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])
@@ -247,16 +247,16 @@ def between_blocks(
 ) -> Array:
     """Return the angle that a rotor turns from each block to the next.
 
-    A step that is larger than the rotor can turn in this time results from a loss or a masked
-    sector. It is replaced by the last valid step in the stream.
+    A step that is larger than `fastest` results from lost packets or a masked sector. It is
+    invalid, and replaced by the last valid step in the stream.
 
     Args:
         azimuth: the azimuth of each block, in the unit of `full`.
-        ahead: the azimuth of the next block with another azimuth, for example
-            ``following(azimuth)``.
+        ahead: the azimuth of the next block, for example ``following(azimuth)``. If consecutive
+            blocks have the same azimuth, it is the next azimuth that differs.
         fastest: the angle from block to block at the highest speed of the sensor, in the unit of
             `full`. Steps may be up to 25 % larger, because encoder readings vary.
-        repeat: whether to replace an invalid step by the last valid step, or else by nan.
+        repeat: False to replace invalid steps by nan.
         full: a whole turn in the unit of `azimuth`.
 
     Returns:

@@ -188,8 +188,8 @@ class Decoded:
 
     Attributes:
         struct: the bytes of the struct.
-        spans: two arrays for each run: the offset of each of its fields in the encoded frame, and
-            the size of each field in the struct.
+        spans: for each run, the offsets of its fields in the encoded frame, and the sizes of the
+            fields in the struct.
         end: the offset in the encoded frame of the first byte after the last field.
         problem: the first error; None if the whole frame was decoded.
     """
@@ -201,15 +201,15 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """A list with an offset in the frame for each byte of the struct.
+        """The offset in the frame of each byte of the struct, and at last `end`.
 
-        The offset is where the field of the byte begins. The last item is `end`.
+        The offset of a byte is the offset of the field that contains it.
         """
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return where the field of a struct byte begins in the encoded frame.
+        """Return the offset in the encoded frame of the field that contains a struct byte.
 
         Args:
             place: the offset of the byte in the struct.
@@ -228,12 +228,12 @@ class WireForm(Protocol):
     is_text: ClassVar[bool]
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of encoded frames; None for each byte that varies.
+        """Return the first bytes of all encoded frames; None for each byte that varies.
 
-        The bytes end before the first byte that has no fixed offset.
+        The result ends before the first byte without a fixed offset.
 
         Args:
-            texts: the first fields of the structs.
+            texts: the bytes of the first fields of the struct; None for each byte that varies.
         """
 
     def find_end(self, data: bytes) -> int:
@@ -264,8 +264,8 @@ class BulkEnds(Protocol):
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         """Return the size of the frame at each offset, or `NO_END` or `NO_FRAME`, (n,).
 
-        The result is the same as that of `find_end`, except that it may be `NO_FRAME` for an
-        invalid frame.
+        For a valid frame, the size is the same as that of `find_end`. For an invalid frame, the
+        result may be `NO_FRAME` instead.
 
         Args:
             buffer: the input.
@@ -278,8 +278,8 @@ class BulkEnds(Protocol):
 class DrawsValues(Protocol):
     """A wire form that cannot encode every value up to `largest`."""
 
-    def writable(self, run: NumberRun, values: Values) -> Values:
-        """Return values that can be encoded, (n,), given random bits as `values`, (n,)."""
+    def to_encodable(self, run: NumberRun, values: Values) -> Values:
+        """Return random values that can be encoded, (n,), made from random bits, (n,)."""
 
 
 def find_ends(
@@ -307,7 +307,7 @@ class RunReader(Protocol):
         """
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
-        """Read the fields of a run, up to the first invalid field.
+        """Read consecutive fields, up to the first invalid field.
 
         Returns:
             The bytes of the struct, and the offset of each field in the frame.
@@ -364,10 +364,10 @@ def _make_digit_values(base: int) -> tuple[Values, NDArray[np.bool_]]:
 
 @lru_cache(maxsize=64)
 def _make_digit_weights(base: int) -> Values:
-    """Return the weight of a digit, by its position counted from the end of its token.
+    """Return the factor of a digit, by its position counted from the end of its token.
 
-    Index 1 is the last digit. Index 0 is for characters that are not digits, and the last index is
-    for digits that are too far from the end. The weight of both is 0.
+    The last digit has the position 1. Position 0 is for characters that are not digits, and the
+    last position for digits beyond `MAX_DIGITS`. The factors of both positions are 0.
     """
     return np.array([0, *(base**place for place in range(MAX_DIGITS)), 0], np.uint64)
 
@@ -399,7 +399,7 @@ class HexCheck:
         return 1 + -(-self.algorithm.width // 4)
 
     def write(self, content: bytes) -> bytes:
-        """Return the mark and the digits of the checksum of some content."""
+        """Return the mark, and the checksum of `content` in hexadecimal digits."""
         return self.mark + b"%0*X" % (self.size - 1, self.algorithm(content))
 
 
@@ -421,8 +421,8 @@ class Tokens:
         width: the minimum number of digits of an encoded integer. Decoding accepts any number of
             digits.
         check: the checksum before the end; None without a checksum.
-        formats: the minimum number of digits of encoded floats, by path, as manuals write it:
-            "hhmmss.ss" means six digits before the point and two digits after it.
+        formats: the format of each float, by path, as manuals write it: "hhmmss.ss" means at least
+            six digits before the point and two digits after it.
         joined: the number of fields of bytes that together form the first token.
         padded: whether a token may be shorter than its field of bytes, which is then padded with
             zero bytes.
@@ -561,7 +561,7 @@ class Tokens:
     def largest(self, size: int) -> int:
         return int(256**size - 1)
 
-    def writable(self, run: NumberRun, values: Values) -> Values:
+    def to_encodable(self, run: NumberRun, values: Values) -> Values:
         """Return values that can be encoded; floats become fractions with few digits."""
         if self.base == 16:
             return values
@@ -647,7 +647,7 @@ class _TokenReader:
         self._is_number = ~has_wrong & (lengths > 0) & (lengths <= MAX_DIGITS)
 
     def _convert_signed(self, first_characters: NDArray[np.uint8]) -> None:
-        """Convert the tokens with a sign, which are decimal."""
+        """Convert the tokens that begin with a sign to decimal numbers."""
         self._signs = first_characters
         has_sign = (first_characters == PLUS) | (first_characters == MINUS)
         for index in np.flatnonzero(has_sign).tolist():
@@ -853,8 +853,8 @@ class SixBits:
 
     Args:
         first: the character for 0.
-        echoes: how the steps after the head are sent if they have a variable number of echoes; None
-            if all numbers are sent.
+        echoes: the encoding of steps with a variable number of echoes; None if the frame has no
+            such steps.
 
     Raises:
         SpecError: for invalid `echoes`: a mark that is a digit or not one character, or a size or

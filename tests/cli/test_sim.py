@@ -17,7 +17,7 @@ import lidarspec as ls
 from lidarspec.cli.options import DURATION
 from lidarspec.simulation.clock_faults import parse_clock_faults
 from lidarspec.simulation.faults import parse_faults
-from lidarspec.spec.fields import duration
+from lidarspec.spec.fields import parse_duration
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.simulated import connect
 from tests.cli.running import process, ran
@@ -165,12 +165,12 @@ def test_an_existing_link_is_a_source_error(tmp_path: Path) -> None:
 def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> None:
     assert (
         DURATION.convert(text, None, None)
-        == duration(text)
+        == parse_duration(text)
         == parse_faults({"unplug": text}).unplug
     )
     assert connect(
         SourceAddress.parse(f"sim:ldrobot-stl27l?unplug={text}")
-    ).device.faults.unplug == duration(text)
+    ).device.faults.unplug == parse_duration(text)
 
 
 def test_a_blocked_rotor_is_simulated_and_reported(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, FaultyLink, parse_faults
 from lidarspec.simulation.simulator import RestingImu
 from lidarspec.spec import Command, Frame, Scaled, Serial, Simulation
-from lidarspec.spec.fields import duration
+from lidarspec.spec.fields import parse_duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.broken import sound
@@ -399,12 +399,8 @@ def test_faults_by_text() -> None:
         "absent": "500ms",
     }
     assert parse_faults(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
-    assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (
-        120,
-        5400,
-        7,
-        pytest.approx(20e-6),
-    )
+    durations = [parse_duration(text) for text in ("2min", "1.5h", "7", "20us")]
+    assert durations == pytest.approx([120, 5400, 7, 20e-6])
     with pytest.raises(UsageError, match="reorder requires datagrams"):
         on(stl(), faults=Faults(reorder=2))
 

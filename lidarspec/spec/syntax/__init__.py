@@ -22,7 +22,7 @@ from lidarspec.spec.syntax.refusals import check_struct as check_struct
 from lidarspec.spec.syntax.replacements import (
     DescribedField as DescribedField,
     Fault as Fault,
-    MarkedStruct as MarkedStruct,
+    MeasuredStruct as MeasuredStruct,
     MismatchError as MismatchError,
     ParsedParts as ParsedParts,
     Partition as Partition,
@@ -40,10 +40,10 @@ from lidarspec.spec.syntax.structs import (
     has_member as has_member,
     is_expression as is_expression,
     is_struct as is_struct,
-    leaves as leaves,
+    iter_leaves as iter_leaves,
+    iter_seals as iter_seals,
     prepare as prepare,
     random_value as random_value,
-    seals as seals,
     to_public as to_public,
     unwrap as unwrap,
 )

@@ -63,10 +63,10 @@ class Trial:
     lost: tuple[Any, Any] | None
 
 
-def int_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions of an adapter of an integer.
+def make_int_adapter(con: Construct) -> tree.Adapter | None:
+    """Return the functions that decode and encode an integer with an adapter.
 
-    Returns None if the construct is not such an adapter, or if only construct can apply it.
+    Returns None for other constructs, and if only construct can apply the adapter.
     """
     if not is_int_adapter(con):
         return None
@@ -83,7 +83,7 @@ def int_adapter(con: Construct) -> tree.Adapter | None:
 @functools.lru_cache(maxsize=4096)
 def without_int_adapters(con: Construct) -> Construct:
     """Return a copy of a bit block with integers in place of adapters of integers."""
-    if int_adapter(con) is not None:
+    if make_int_adapter(con) is not None:
         return without_int_adapters(con.subcon)
     if not isinstance(con, Subconstruct | construct.Struct):
         return con
@@ -97,9 +97,9 @@ def without_int_adapters(con: Construct) -> Construct:
 
 
 def is_int_adapter(con: Construct) -> bool:
-    """Return whether a construct is a general adapter of an integer.
+    """Return whether a construct is an adapter of an integer with an unknown function.
 
-    Adapters in `_KNOWN`, whose meaning is known, are not general.
+    The adapters of construct that are in `_KNOWN` do not count.
     """
     if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
         return False
@@ -185,7 +185,7 @@ def _int_bits(con: Construct) -> int:
     return bits if bits <= MAX_INT_BITS else 0
 
 
-def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
+def make_text_adapter(con: construct.StringEncoded) -> tree.Adapter:
     """Return the functions that decode and encode a text."""
     inner = con.subcon
     while isinstance(inner, Subconstruct) and not isinstance(inner, construct.NullStripped):
@@ -196,7 +196,7 @@ def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
     return tree.Adapter(decode, encode, np.dtype(object), is_partial=True, form=form)
 
 
-def number_adapter(con: Construct) -> tree.Adapter:
+def make_number_adapter(con: Construct) -> tree.Adapter:
     """Return the functions that decode and encode a number of variable size.
 
     A number is invalid if it needs more than 64 bits, or if construct encodes it to bytes that
@@ -240,7 +240,7 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
     return data if stripped is None else data.ljust(size, b"\0")
 
 
-def part_adapter(con: Construct) -> tree.Adapter | None:
+def make_part_adapter(con: Construct) -> tree.Adapter | None:
     """Return the functions that decode and encode a part that depends only on its own bytes.
 
     Returns:
@@ -292,10 +292,7 @@ def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[
 
 
 def _find_xor(con: Construct) -> construct.ProcessXor | None:
-    """Return the ProcessXor of a part; None without one.
-
-    The ProcessXor may be in a FixedSized.
-    """
+    """Return the ProcessXor that a part is, or that its FixedSized contain; else None."""
     while isinstance(con, construct.FixedSized):
         con = con.subcon
     return con if isinstance(con, construct.ProcessXor) else None

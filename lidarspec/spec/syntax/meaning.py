@@ -37,10 +37,10 @@ from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.syntax.adapters import (
-    int_adapter,
-    number_adapter,
-    part_adapter,
-    text_adapter,
+    make_int_adapter,
+    make_number_adapter,
+    make_part_adapter,
+    make_text_adapter,
     without_int_adapters,
 )
 from lidarspec.spec.syntax.replacements import (
@@ -59,7 +59,7 @@ from lidarspec.spec.syntax.structs import (
     author_class,
     fixed_size,
     is_greedy,
-    leaves,
+    iter_leaves,
     unwrap,
 )
 
@@ -68,16 +68,16 @@ def frame_tree(con: Construct) -> tree.Node:
     """Return the tree of a struct.
 
     Raises:
-        SpecError: for a constant name that its Enum does not have.
+        SpecError: if a constant of an Enum field is none of the names of its Enum.
     """
     return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
 
 def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """Return the node that `build` makes, and the builder.
+    """Call `build` with a builder; return its node and the builder.
 
-    If values of built frames depend on later fields, the node is made a second time. The builder of
-    this second pass has the fields and sizes of the first pass.
+    If a value in built frames depends on a later field, `build` is called again with a builder that
+    knows the fields and sizes from the first call.
     """
     builder = _Builder()
     root = build(builder)
@@ -88,10 +88,9 @@ def _build_twice(build: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Bu
 
 
 def _trace(expression: Any, scope: tree.Scope) -> Any:
-    """Return the value of an expression for symbols in place of the fields.
+    """Evaluate an expression with symbols in place of the fields.
 
-    This function evaluates construct's expressions itself instead of calling them. The reason is
-    that construct evaluates ``~`` as ``not value``, and a symbol has no truth value.
+    construct's own evaluation of ``~`` is ``not value``, which a symbol does not support.
     """
     if isinstance(expression, BinExpr):
         return expression.op(_trace(expression.lhs, scope), _trace(expression.rhs, scope))
@@ -139,7 +138,7 @@ class _Context:
     """The context of a construct.
 
     Attributes:
-        info: what the surrounding constructs declare about the field.
+        info: the facts about the field that its surrounding constructs declare.
         scope: the fields that expressions can refer to.
         name: the name of the construct in its struct; "" without a name.
         in_bits: whether the construct is inside a bit block.
@@ -194,16 +193,16 @@ class _Builder:
         if not place.in_bits and (
             is_block or (isinstance(inner, BytesInteger) and _is_variable_integer(inner))
         ):
-            return self._block(inner, place)
+            return self._make_block(inner, place)
         if is_block:
             return self.node(inner.subcon, place)
         if isinstance(inner, SealedStruct):
-            return self._seal(inner, place)
+            return self._make_sealed(inner, place)
         if isinstance(inner, Struct):
-            return self._struct(inner, place)
+            return self._make_struct(inner, place)
         if isinstance(inner, Array):
             axis = axis_path(info)
-            count = self._formula(inner.count, place)
+            count = self._to_formula(inner.count, place)
             inside = place.with_changes(axes=(*info.axes, axis), default=None)
             if inside.offset is not None:
                 inside = replace(inside, offset=_return_no_offset)
@@ -214,28 +213,28 @@ class _Builder:
                     return sequence
             return tree.Repeat(name, axis, count, element, info.default)
         if isinstance(inner, Partition):
-            return self._parts(inner, place)
+            return self._make_parts(inner, place)
         if isinstance(inner, construct.IfThenElse):
-            condition = self._formula(inner.condfunc, place)
+            condition = self._to_formula(inner.condfunc, place)
             branches = (
                 self.node(branch, place.with_changes(optional=True))
                 for branch in (inner.thensubcon, inner.elsesubcon)
             )
             return tree.When(name, condition, *branches)
         if isinstance(inner, construct.Switch):
-            return self._select(inner, place)
+            return self._make_select(inner, place)
         if isinstance(inner, BoundedPart) or (
             isinstance(inner, construct.FixedSized)
             and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
         ):
-            bytes_left = self._formula(inner.length, place)
+            bytes_left = self._to_formula(inner.length, place)
             return self.node(inner.subcon, replace(place, bytes_left=bytes_left))
         if isinstance(inner, construct.GreedyRange | construct.RepeatUntil) and not place.in_bits:
-            return self._fill_with_elements(inner, place)
+            return self._make_elements(inner, place)
         if isinstance(inner, RawPart):
             return self._make_raw_copy(inner, place)
         if isinstance(inner, construct.Check):
-            return self._check(inner, place)
+            return self._make_check(inner, place)
         if inner is construct.Error:
             return tree.Never(name)
         if inner is construct.Pass:
@@ -244,7 +243,7 @@ class _Builder:
             derived = self._make_derived(inner, place)
             if derived is not None:
                 return derived
-        return self._leaf(inner, place)
+        return self._make_leaf(inner, place)
 
     def _make_derived(self, con: Construct, place: _Context) -> tree.Node | None:
         """Return the node of a value without bytes of its own.
@@ -272,13 +271,13 @@ class _Builder:
         if not callable(con.func):
             self._add_value(place, con.func)
             return tree.Derived(place.info, "computed", constant=con.func)
-        formula = self._formula(con.func, place, may_be_fraction=True)
+        formula = self._to_formula(con.func, place, may_be_fraction=True)
         asked = [] if isinstance(formula, tree.Untraced) else tree.refs(formula)
         is_fractional = tree.fraction_in(formula) is not None
         is_computable = (
             not isinstance(formula, tree.Untraced)
             and all(_is_single_value(ref, place.info) for ref in asked)
-            and all(map(_is_always_defined, tree.parts(formula)))
+            and all(map(_is_always_defined, tree.iter_subformulas(formula)))
             and (is_fractional or tree.width(formula) <= tree.MAX_FORMULA_BITS)
         )
         if not is_computable:
@@ -345,7 +344,7 @@ class _Builder:
                     place = place.with_changes(docs=con.docs)
             elif isinstance(con, DescribedField):
                 place = replace(place, info=con.describe(place.info))
-            elif (adapter := self._adapter(con, place.info)) is not None:
+            elif (adapter := self._find_adapter(con, place.info)) is not None:
                 place = place.with_changes(adapter=adapter, allowed=adapter.allowed)
             elif isinstance(con, construct.Enum):
                 place = place.with_changes(
@@ -369,26 +368,26 @@ class _Builder:
                     known = None
                 else:
                     known = self._known.get(place.scope.path)
-                place = place.with_changes(rebuilt=self._formula(con.func, place, known))
+                place = place.with_changes(rebuilt=self._to_formula(con.func, place, known))
             elif isinstance(con, construct.Default):
-                place = place.with_changes(default=self._default(con.value, place))
+                place = place.with_changes(default=self._to_default(con.value, place))
             else:
                 return con, place
             con = con.subcon
 
-    def _adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
+    def _find_adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
         """Return the adapter of an integer; None if the field has a constant, labels or a scale."""
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
-        return int_adapter(con)
+        return make_int_adapter(con)
 
-    def _default(self, value: Any, place: _Context) -> Any:
+    def _to_default(self, value: Any, place: _Context) -> Any:
         """Return the value of construct's Default, as a formula if it is a function."""
         if callable(value):
-            return self._formula(value, place)
+            return self._to_formula(value, place)
         return value
 
-    def _formula(
+    def _to_formula(
         self,
         expression: Any,
         place: _Context,
@@ -437,8 +436,8 @@ class _Builder:
         path = place.info.path
         return tree.Untraced(f"{path}: {reason}", _format_expression(expression, path))
 
-    def _select(self, con: construct.Switch, place: _Context) -> tree.Select:
-        key = self._formula(con.keyfunc, place, is_key=True)
+    def _make_select(self, con: construct.Switch, place: _Context) -> tree.Select:
+        key = self._to_formula(con.keyfunc, place, is_key=True)
         labels = key.info.labels if isinstance(key, tree.Ref) else {}
         raw = {name: value for value, name in labels.items()}
         # construct finds the case of a named value only by its name
@@ -464,14 +463,14 @@ class _Builder:
         if isinstance(key, tree.Untraced):
             values = {case: case for case in con.cases}
         cases = tuple(
-            (value, self._branch(con.cases[case], place)) for case, value in values.items()
+            (value, self._make_branch(con.cases[case], place)) for case, value in values.items()
         )
-        return tree.Select(place.name, key, cases, self._branch(con.default, place))
+        return tree.Select(place.name, key, cases, self._make_branch(con.default, place))
 
-    def _branch(self, con: Construct, place: _Context) -> tree.Node:
+    def _make_branch(self, con: Construct, place: _Context) -> tree.Node:
         return self.node(con, place.with_changes(optional=True))
 
-    def _struct(self, con: Struct, place: _Context) -> tree.Struct:
+    def _make_struct(self, con: Struct, place: _Context) -> tree.Struct:
         info = place.info
         scope = tree.Scope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
@@ -502,7 +501,7 @@ class _Builder:
                 filler = unwrap(filler.thensubcon)
             if isinstance(filler, PaddingField):
                 size = _sum_member_sizes(members, filler.of[0])
-                inside = replace(inside, bytes_left=self._padding(filler, inside, size))
+                inside = replace(inside, bytes_left=self._find_padding_size(filler, inside, size))
             elif place.bytes_left is not None and child is con.subcons[-1]:
                 inside = replace(
                     inside,
@@ -528,11 +527,15 @@ class _Builder:
             )
         return made
 
-    def _padding(
+    def _find_padding_size(
         self, con: PaddingField, place: _Context, size: tree.Formula | None
     ) -> tree.Formula | None:
-        """Return the number of padding bytes after a part of this size."""
-        number = self._formula(con.modulus if con.to is None else con.to, place)
+        """Return the number of padding bytes after a part.
+
+        Args:
+            size: the size of the part in bytes.
+        """
+        number = self._to_formula(con.modulus if con.to is None else con.to, place)
         if con.to is not None:
             return tree.combine("-", number, size)
         if size is None:
@@ -542,7 +545,7 @@ class _Builder:
     def _measure_part(self, con: SizeField, place: _Context) -> tree.Formula | None:
         """Return the formula for the size of a part; None in the first pass.
 
-        Also registers the SizeOf field, so that `_struct` computes the size when the struct is
+        Also registers the SizeOf field, so that `_make_struct` computes the size when the struct is
         complete.
         """
         scope = place.scope
@@ -563,7 +566,7 @@ class _Builder:
             return None
         return size
 
-    def _fill_with_elements(
+    def _make_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
         """Return the node for elements that fill a part, or end with a certain element.
@@ -598,7 +601,7 @@ class _Builder:
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.bytes_left, size), element)
 
-    def _parts(self, con: Partition, place: _Context) -> tree.PartSequence:
+    def _make_parts(self, con: Partition, place: _Context) -> tree.PartSequence:
         info = place.info
         scope = place.scope
         axis = axis_path(place.info)
@@ -623,7 +626,7 @@ class _Builder:
                 tree.Ref(ref.path[2:], ref.info) for ref in asked if ref.path.startswith("_.")
             )
         count, size, within = (
-            None if rule is None else self._formula(rule, place)
+            None if rule is None else self._to_formula(rule, place)
             for rule in (con.count, con.size, con.within)
         )
         total = tree.FieldInfo(
@@ -678,7 +681,7 @@ class _Builder:
         is_traced = not any(
             isinstance(part, tree.Untraced)
             for formula in _iter_formulas(root, ends)
-            for part in tree.parts(formula)
+            for part in tree.iter_subformulas(formula)
         )
         is_plain = any(isinstance(node, tree.Opaque) for node in tree.nodes(root))
         is_known = all(ref.info.kind == "int" and not ref.info.axes for ref in outer)
@@ -703,7 +706,7 @@ class _Builder:
     def _make_part_frame(
         self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
-        """Return a part as a frame of its own, and the formula of `following` in it."""
+        """Return a part as a frame of its own, and `following` as a formula."""
 
         def around(builder: _Builder) -> _Context:
             assert place.scope is not None
@@ -714,16 +717,18 @@ class _Builder:
         if following is None:
             rule = None
         else:
-            rule = builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
+            rule = builder._to_formula(
+                following, replace(around(builder), scope=builder.scopes[""])
+            )
         return root, rule
 
-    def _check(self, con: construct.Check, place: _Context) -> tree.Node:
+    def _make_check(self, con: construct.Check, place: _Context) -> tree.Node:
         """Return the node of a condition.
 
         If the condition uses fields of another array or frame, or if its values may exceed 64 bits,
         only construct can check it.
         """
-        condition = self._formula(con.func, place)
+        condition = self._to_formula(con.func, place)
         info = place.info
         if isinstance(condition, int):
             if condition:
@@ -738,7 +743,7 @@ class _Builder:
             if (
                 not asked
                 and tree.width(condition) <= tree.MAX_FORMULA_BITS
-                and all(map(_is_always_defined, tree.parts(condition)))
+                and all(map(_is_always_defined, tree.iter_subformulas(condition)))
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)
             if asked:
@@ -754,7 +759,7 @@ class _Builder:
             f"{reason.partition(': ')[2]}: use plausible=lambda f: ..., which is vectorized",
         )
 
-    def _seal(self, con: SealedStruct, place: _Context) -> tree.Node:
+    def _make_sealed(self, con: SealedStruct, place: _Context) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(
@@ -777,7 +782,7 @@ class _Builder:
             tuple(sorted(con.absent)),
         )
 
-    def _leaf(self, con: Construct, place: _Context) -> tree.Node:
+    def _make_leaf(self, con: Construct, place: _Context) -> tree.Node:
         name = place.name
         info = _add_type(con, place.info)
         if name and place.scope is not None:
@@ -796,15 +801,15 @@ class _Builder:
         elif isinstance(con, Bytes) and not isinstance(con, PaddingField):
             if isinstance(con, Reserved):
                 info = replace(info, default=con.pattern)
-            node = tree.Blob(name, info, self._formula(con.length, place), info.const)
-        elif not place.in_bits and (blob := self._encoded_blob(con, place)) is not None:
+            node = tree.Blob(name, info, self._to_formula(con.length, place), info.const)
+        elif not place.in_bits and (blob := self._make_encoded_blob(con, place)) is not None:
             node = blob
             if name and place.scope is not None:
                 place.scope.names[name] = _to_scope_value(blob.info)
         else:
             kind = author_class(con)
             if isinstance(con, construct.FixedSized):
-                size = self._formula(con.length, place)
+                size = self._to_formula(con.length, place)
             else:
                 size = None
             node = tree.Opaque(
@@ -819,7 +824,7 @@ class _Builder:
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
 
-    def _encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
+    def _make_encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
         """Return a node of bytes with functions that decode them.
 
         Returns None if only construct can read the bytes.
@@ -831,13 +836,13 @@ class _Builder:
         adapter: tree.Adapter | None
         if ending is not None:
             size: tree.Formula | None = tree.Ref(ending.size.path, ending.size)
-            adapter = _ended_adapter(con)
+            adapter = _make_ended_adapter(con)
         elif isinstance(con, construct.StringEncoded):
-            size = self._text_size(con, place)
-            adapter = text_adapter(con)
+            size = self._find_text_size(con, place)
+            adapter = make_text_adapter(con)
         else:
             size = fixed_size(con) or place.bytes_left
-            adapter = None if size is None else part_adapter(con)
+            adapter = None if size is None else make_part_adapter(con)
         if size is None or (adapter is None and ending is None):
             return None
         axes = (*info.axes, axis_path(info))
@@ -845,7 +850,7 @@ class _Builder:
         known = replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=axes)
         return tree.Blob(place.name, replace(known, adapter=adapter), size, ending=ending)
 
-    def _text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
+    def _find_text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
         """Return the size of a text in bytes.
 
         Returns None if the text extends to a terminator or to the end of the datagram.
@@ -858,12 +863,12 @@ class _Builder:
             if isinstance(content, construct.NullStripped):
                 content = content.subcon
             is_whole = content is construct.GreedyBytes
-            return self._formula(inner.length, place) if is_whole else None
+            return self._to_formula(inner.length, place) if is_whole else None
         if isinstance(inner, Bytes):
-            return self._formula(inner.length, place)
+            return self._to_formula(inner.length, place)
         return None
 
-    def _block(self, con: Construct, place: _Context) -> tree.Node:
+    def _make_block(self, con: Construct, place: _Context) -> tree.Node:
         """Return the node of a bit block; the bits of each field are found by probing."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
@@ -974,9 +979,11 @@ def _find_offset_after(
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a computed value can read exactly one value of a field.
+    """Return whether a field has exactly one value for each computed value.
 
-    The field has to exist whenever the computed value exists, and must not be in a further array.
+    Args:
+        ref: a reference to the field.
+        info: the description of the computed value.
     """
     return (
         not ref.path.startswith("_.")
@@ -987,14 +994,18 @@ def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
 
 
 def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
-    """Return the description of a computed integer."""
+    """Return a description of a field, changed to that of a computed integer."""
     return replace(info, dtype=np.dtype(np.int64), kind="int", bits=64)
 
 
 def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
-    """Return the node of a peeked value.
+    """Return the node of a field that construct's Peek reads.
 
-    If the peeked bytes may extend beyond the frame, only construct can read the value.
+    If the field may extend beyond the frame, the result is a node that only construct can read.
+
+    Args:
+        derived: the node of the field.
+        behind: the nodes after it.
     """
     assert derived.node is not None
     needed = tree.size(derived.node)
@@ -1134,7 +1145,7 @@ def _make_number(info: tree.FieldInfo, size: int, *, is_big: bool) -> tree.Numbe
 
 
 def axis_path(info: tree.FieldInfo) -> str:
-    """Return the name of the axis of an array at this path.
+    """Return the name of the axis of an array field.
 
     If an array is directly inside an array, "[]" is appended to the path.
     """
@@ -1183,7 +1194,7 @@ def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
 
 
 def _is_text(con: Construct) -> bool:
-    """Return whether a construct parses to bytes of variable size."""
+    """Return whether a construct parses to all bytes up to an end, as texts do."""
     while isinstance(
         con,
         construct.NullTerminated
@@ -1196,10 +1207,7 @@ def _is_text(con: Construct) -> bool:
 
 
 def _find_opaque_reason(con: Construct) -> str:
-    """Return the reason why only construct can read a part.
-
-    The reason may be a construct inside the part.
-    """
+    """Return the reason why only construct can read a part."""
     below = con
     while author_class(below) not in _OPAQUE_REASONS and isinstance(below, Subconstruct):
         below = below.subcon
@@ -1218,9 +1226,11 @@ def _describe_form(con: Construct) -> str:
 
 
 def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> tree.Ending | None:
-    """Return the end of a field of variable size; None if its size is known otherwise.
+    """Return the mark that ends a field of variable size; None if no mark ends it.
 
     Args:
+        con: the construct of the field.
+        info: the description of the field.
         is_bounded: whether the field is in a part of known size.
     """
     size = _describe_integer(
@@ -1245,12 +1255,15 @@ def _find_ending(con: Construct, info: tree.FieldInfo, *, is_bounded: bool) -> t
     return tree.Ending(size, mark=con.term, mask=b"\xff" * len(con.term))
 
 
-def _ended_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode a field that a mark ends; None for plain bytes."""
+def _make_ended_adapter(con: Construct) -> tree.Adapter | None:
+    """Return the functions that decode a text or number of variable size.
+
+    Returns None if the bytes are not decoded.
+    """
     if isinstance(con, construct.StringEncoded):
-        return text_adapter(con)
+        return make_text_adapter(con)
     if con in (construct.VarInt, construct.ZigZag):
-        return number_adapter(con)
+        return make_number_adapter(con)
     return None
 
 
@@ -1288,7 +1301,7 @@ def _probe_block(con: Construct, size: int) -> list[BitField] | None:
     Returns None if the fields of the block depend on values, or if values are not plain integers.
     """
     if _has_fixed_fields(con):
-        return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
+        return probe(lambda block: dict(iter_leaves(con.parse(block, _verify=False))), size)
     return None
 
 

@@ -65,10 +65,11 @@ class _NameRecorder:
 
 
 def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
-    """Replace the checksums of a RawCopy among the members of a struct by plain fields.
+    """Replace each Checksum of a RawCopy in a struct by the field that stores it.
 
     Returns:
-        The new members, and for each replaced checksum the arguments of a `SealedStruct`.
+        The new members of the struct, and the arguments of a `SealedStruct` for each replaced
+        checksum.
     """
     found = list[Construct]()
     seals = list[dict[str, Any]]()

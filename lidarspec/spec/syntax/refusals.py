@@ -121,7 +121,7 @@ def check_struct(con: Construct) -> SpecError | None:
 
 
 def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
-    """Raise SpecError for a class that loses bits, runs code or reads bytes elsewhere."""
+    """Raise SpecError for a part of a class that is not supported."""
     lost = try_values(part).lost if is_int_adapter(part) else None
     if lost is not None and not isinstance(part, construct.FlagsEnum):
         raw, back = lost

@@ -92,28 +92,26 @@ def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
     return obj
 
 
-class MarkedStruct(Struct):  # type: ignore[misc]
-    """A Struct that adds the (start, end) of its members to the parsed value.
+class MeasuredStruct(Struct):  # type: ignore[misc]
+    """A Struct that adds the offsets of its members to the parsed value.
 
-    They are the entry ``_marks``.
-
-    construct's Struct does not keep these offsets. `Checksummed` needs them to find its bytes,
-    `SizeOf` and `PaddingField` to measure parts, and `explain` to list the fields of a frame
-    without a layout. An error about a missing value has the path of its field.
+    The entry ``_spans`` of the value has the (start, end) of each member, by name. construct's
+    Struct does not keep these offsets. They are needed for checksums, for the sizes of parts, and
+    by `explain`.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         obj = Container()
         inner = self._make_inner_context(stream, context, is_parsing=True)
-        marks = inner._marks
+        spans = inner._spans
         for con in self.subcons:
             start = stream.tell()
             value = con._parsereport(stream, inner, path)
             end = stream.tell()
             if con.name:
                 obj[con.name] = inner[con.name] = value
-                marks[con.name] = (start, end)
-        obj["_marks"] = marks
+                spans[con.name] = (start, end)
+        obj["_spans"] = spans
         for sizing, field, offset, value in inner._sizings if is_verifying(context) else ():
             expected = sizing.value(obj)
             if value != expected:
@@ -128,14 +126,14 @@ class MarkedStruct(Struct):  # type: ignore[misc]
             if not con.flagbuildnone and con.name not in obj:
                 raise MismatchError(f"{path} -> {con.name}", 0, "a value", "none", "missing")
         inner = self._make_inner_context(stream, context, is_parsing=False)
-        inner.update({name: value for name, value in obj.items() if name != "_marks"})
-        marks = inner._marks
+        inner.update({name: value for name, value in obj.items() if name != "_spans"})
+        spans = inner._spans
         for con in self.subcons:
             start = stream.tell()
             value = con._build(obj.get(con.name), stream, inner, path)
             if con.name:
                 inner[con.name] = value
-                marks[con.name] = (start, stream.tell())
+                spans[con.name] = (start, stream.tell())
         for sizing, field, _, _ in inner._sizings:
             context._params["_sizes"][field] = sizing.value(inner)
         return inner
@@ -143,7 +141,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     def _make_inner_context(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
         """Return the context of the members' expressions.
 
-        The entry `_marks` has (start, end) of each member by name. `_sizings` has (SizeField, path,
+        The entry `_spans` has (start, end) of each member by name. `_sizings` has (SizeField, path,
         offset, value) for each field that declares a size.
         """
         inner = Container(
@@ -158,7 +156,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
         inner._io = stream
         inner._index = context.get("_index", None)
         inner._root = context.get("_root", None) or inner
-        inner._marks = {}
+        inner._spans = {}
         inner._sizings = []
         return inner
 
@@ -166,9 +164,9 @@ class MarkedStruct(Struct):  # type: ignore[misc]
 class IndexedArray(Array):  # type: ignore[misc]
     """An Array that limits its elements, and reports the index of an invalid element.
 
-    construct's Array reports no index, and takes minutes for an invalid count of elements without
-    bytes. All arrays of a frame together may have at most `limit` elements without bytes. The limit
-    is not applied to each array, because the numbers of elements of nested arrays multiply.
+    construct's Array reports no index, and takes minutes if an invalid count is large and its
+    elements have no bytes. All arrays of a frame together may have at most `limit` elements without
+    bytes.
 
     Attributes:
         limit: the maximum size of a frame, in bytes, or in bits inside a bit block.
@@ -284,7 +282,7 @@ class LimitedNumber(Subconstruct):  # type: ignore[misc]
         return obj
 
 
-class HeldCheck(construct.Check):  # type: ignore[misc]
+class SkippableCheck(construct.Check):  # type: ignore[misc]
     """A Check that can be parsed without verification, for ``parse(verify=False)``."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -294,11 +292,10 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
 
 
 class CountedBytes(Bytes):  # type: ignore[misc]
-    """Bytes that distinguish an invalid length from an incomplete frame.
+    """Bytes that raise `RangeError` if their length is too large for a frame.
 
-    For a length that is too large for a frame, construct's Bytes reports the end of the stream. The
-    candidate would then wait for more bytes, and block the output until as many bytes as the
-    longest frame have arrived.
+    construct's Bytes reports the end of the stream instead, as for an incomplete frame. A decoder
+    would then wait for more bytes.
     """
 
     limit: int
@@ -310,7 +307,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
         return construct.stream_read(stream, length, path)
 
 
-class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
+class FastNullTerminated(construct.NullTerminated):  # type: ignore[misc]
     """A NullTerminated with a fast search for its terminator."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -348,10 +345,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that expressions read as a name, also when a frame is built.
+    """An Enum that gives expressions the name of its value, also when it is built.
 
-    With construct's Enum, a Switch on a name finds its case when a frame is parsed. When the frame
-    is built from the number, the Switch finds another case, so that other bytes are built.
+    If a frame is built from the number, expressions such as the key of a Switch get the number from
+    construct's Enum, and find no case for it.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -397,7 +394,7 @@ class RawPart(Construct):  # type: ignore[misc]
             offset1=start,
             offset2=end,
             length=end - start,
-            _marks={"value": (start, end)},
+            _spans={"value": (start, end)},
         )
 
     def _sizeof(self, context: Any, path: str) -> int:
@@ -521,13 +518,13 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         """Return the size of the part in a parsed or built struct."""
         *parents, name = self.of[self.levels_up :] or ("",)
         try:
-            marks = (get_member(obj, ".".join(parents)) if parents else obj)["_marks"]
+            spans = (get_member(obj, ".".join(parents)) if parents else obj)["_spans"]
             if name:
-                start, end = marks[name]
+                start, end = spans[name]
             else:
-                start = min(marks.values())[0]
-                end = max(end for _, end in marks.values())
-            start = marks[self.since][0] if self.since else start
+                start = min(spans.values())[0]
+                end = max(end for _, end in spans.values())
+            start = spans[self.since][0] if self.since else start
         except (KeyError, TypeError):
             raise SpecError(
                 f"SizeOf refers to {'.'.join(self.of)!r}, which does not exist"
@@ -546,9 +543,9 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
-        """Add the value to the sizes that the struct with the part has to check.
+        """Store the parsed size, so that the struct that contains the part can check it.
 
-        There is no such struct if a bit block is probed.
+        If a bit block is probed, there is no such struct.
         """
         for _ in range(self.levels_up):
             context = context.get("_", {})
@@ -556,9 +553,12 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
 
 class CountField(Subconstruct):  # type: ignore[misc]
-    """The number of elements of a later array, `of`.
+    """A field with the number of elements of a later array.
 
     `build` sets it to the length of the array and ignores a given value.
+
+    Attributes:
+        of: the name of the array.
     """
 
     def __init__(self, subcon: Construct, of: str) -> None:
@@ -617,8 +617,8 @@ class PaddingField(CountedBytes):
         self.flagbuildnone = True
 
     def _count_missing(self, context: Any) -> int:
-        start = context._marks[self.of[0]][0]
-        end = context._marks[self.of[1]][1]
+        start = context._spans[self.of[0]][0]
+        end = context._spans[self.of[1]][1]
         number = construct.evaluate(self.modulus if self.to is None else self.to, context)
         return int((start - end) % number if self.to is None else number - (end - start))
 

@@ -42,12 +42,12 @@ from lidarspec.spec.syntax.replacements import (
     CountField,
     DescribedField,
     ExactFloat,
+    FastNullTerminated,
     Fault,
     FullRange,
-    HeldCheck,
     IndexedArray,
     LimitedNumber,
-    MarkedStruct,
+    MeasuredStruct,
     NamedEnum,
     PaddingField,
     ParsedParts,
@@ -56,7 +56,7 @@ from lidarspec.spec.syntax.replacements import (
     Reserved,
     SealedStruct,
     SizeField,
-    SoughtTerminator,
+    SkippableCheck,
     check_bound,
 )
 
@@ -68,12 +68,12 @@ if TYPE_CHECKING:
 
 #: The replacements of construct's classes.
 _REPLACEMENTS: dict[type, type] = {
-    Struct: MarkedStruct,
+    Struct: MeasuredStruct,
     Array: IndexedArray,
     Const: CheckedConst,
     construct.Enum: NamedEnum,
     construct.GreedyRange: FullRange,
-    construct.NullTerminated: SoughtTerminator,
+    construct.NullTerminated: FastNullTerminated,
     construct.NamedTuple: BareNamedTuple,
     construct.Compressed: CheckedCompressed,
 }
@@ -121,7 +121,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         same.subcons = [prepare(child, limit, in_bits=in_bits) for child in con.subcons]
         return same
     if isinstance(con, construct.Check):
-        return HeldCheck(con.func)
+        return SkippableCheck(con.func)
     if isinstance(con, construct.Mapping) and {
         *map(type, con.encmapping),
         *map(type, con.decmapping),
@@ -153,11 +153,12 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         if not in_bits:
             members = [member for child in members for member in _expand_macro(child)]
             members = [
-                _mark_count(member, members[number:]) for number, member in enumerate(members, 1)
+                _to_count_field(member, members[number:])
+                for number, member in enumerate(members, 1)
             ]
         members, checksums = extract_seals(members)
         prepared = (prepare(child, limit, in_bits=in_bits) for child in members)
-        return seal(MarkedStruct(*prepared), checksums)
+        return seal(MeasuredStruct(*prepared), checksums)
     if isinstance(con, construct.Renamed):
         # ("name" / con) * "docs" wraps twice, and the path would name it twice
         inner = prepare(_strip_name(con), limit, in_bits=in_bits)
@@ -299,10 +300,10 @@ def _is_pascal_string(con: Construct) -> bool:
 
 
 def _distribute_xor(con: Construct) -> Construct:
-    """Return a ProcessXor of a struct as a struct with a ProcessXor of each member.
+    """Apply the ProcessXor of a struct to each of its members instead.
 
-    Any other construct is returned unchanged. So is a struct with a member that needs other fields,
-    or with a member before the last that has no fixed size.
+    Returns the construct unchanged if it is not a ProcessXor of a struct, or if the bytes of a
+    member are not known.
     """
     if not isinstance(con, construct.ProcessXor) or not isinstance(con.subcon, Struct):
         return con
@@ -333,12 +334,19 @@ def find_xor_key(con: construct.ProcessXor) -> bytes | None:
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
-    """Return a hidden field; its name and documentation are derived from the member."""
+    """Give a hidden field a name and documentation that refer to another field.
+
+    Args:
+        con: the other field.
+        ending: the text that is added to its name.
+        field: the hidden field.
+        what: the documentation up to the name of the other field.
+    """
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
 
 
 def _expand_content(con: Construct, content: Construct) -> list[Construct]:
-    """Return the members that replace the content of a member."""
+    """Return the members that replace a member, given the member without its name."""
     return _expand_macro(construct.Renamed(content, newname=con.name, newdocs=con.docs))
 
 
@@ -366,11 +374,10 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 
 
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
-    """Return the members that replace a FocusedSeq: its value, and a field for each other part.
+    """Return the members that replace a FocusedSeq.
 
-    If a part uses fields outside of itself, the FocusedSeq is returned unchanged, because paths in
-    its expressions have one more level. An array may use another part as its count, as in
-    construct's PrefixedArray.
+    They are its value and a field for each other part. The FocusedSeq is returned unchanged if one
+    of its parts cannot be such a field.
     """
     focus = inner.parsebuildfrom
     parts = {part.name: _strip_name(part) for part in inner.subcons}
@@ -403,13 +410,14 @@ def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Constru
 COUNT_TRIALS = (0, 1, 3, *((1 << bit) - 1 for bit in range(3, 17)))
 
 
-def _mark_count(member: Construct, later: Sequence[Construct]) -> Construct:
-    """Return a Rebuild of the length of a later array, or of later bytes, as a `CountField`.
+def _to_count_field(member: Construct, later: Sequence[Construct]) -> Construct:
+    """Return a `CountField` if a member counts the elements of a later member.
 
-    Any other member is returned unchanged.
+    Otherwise, the member is returned unchanged.
 
     Args:
-        later: the members of the struct after this one.
+        member: a member of a struct.
+        later: the members after it.
     """
     content = _strip_name(member)
     if not member.name or not isinstance(content, construct.Rebuild):
@@ -422,14 +430,15 @@ def _mark_count(member: Construct, later: Sequence[Construct]) -> Construct:
 
 
 def _is_fixed(con: Construct) -> bool:
-    """Return whether a part of fixed size depends only on its own bytes."""
+    """Return whether a part has a fixed size and does not depend on other parts."""
     return is_independent(con, _DESCRIBED_KINDS) and fixed_size(con) > 0
 
 
 def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: str) -> str | None:
-    """Return the name of the part with the length of an array in a FocusedSeq.
+    """Return the name of the part of a FocusedSeq that counts an array.
 
     Args:
+        array: the array.
         parts: the parts of the FocusedSeq, by name.
         focus: the name of the array.
     """
@@ -439,7 +448,14 @@ def _find_count(array: Construct | None, parts: Mapping[str, Construct], focus: 
 
 
 def _is_count(part: Construct, name: str, array: Construct, array_name: str) -> bool:
-    """Return whether a part of a struct is a Rebuild of the length of an array or of bytes."""
+    """Return whether a part of a struct is a Rebuild that counts an array or bytes.
+
+    Args:
+        part: the part.
+        name: its name.
+        array: the array, or the bytes.
+        array_name: the name of the array or bytes.
+    """
     if isinstance(array, Array):
         count = array.count
     elif isinstance(array, Bytes):
@@ -547,10 +563,10 @@ def is_greedy(
 
 
 def unwrap(con: Construct, *, bits: bool = True) -> Construct:
-    """Return the construct inside names, units and checksums.
+    """Return a construct without its name, unit, checksum and other wrappers.
 
     Args:
-        bits: whether to remove transformations of bits as well.
+        bits: whether to remove a conversion of bytes to bits, such as that of a BitStruct.
     """
     while isinstance(con, Subconstruct) and not isinstance(con, Array | Const):
         if isinstance(con, construct.Transformed | construct.Restreamed) and not bits:
@@ -683,22 +699,22 @@ def author_class(con: Construct) -> str:
 
 
 def children(con: Construct) -> list[Construct]:
-    """Return the constructs directly inside another, including branches."""
+    """Return the constructs directly inside a construct, including its branches."""
     if isinstance(con, Struct | construct.Sequence | construct.FocusedSeq):
         return list(con.subcons)
     below = [getattr(con, name) for name in _INNER if name in vars(con)]
     return below + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
-def seals(con: Construct) -> Iterator[SealedStruct]:
+def iter_seals(con: Construct) -> Iterator[SealedStruct]:
     """Yield the structs with checksums in a struct, outer structs first."""
     if isinstance(con, SealedStruct):
         yield con
     for child in children(con):
-        yield from seals(child)
+        yield from iter_seals(child)
 
 
-def leaves(
+def iter_leaves(
     parsed: Any, keys: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """Yield the values of a parsed object with the keys that lead to them.
@@ -708,10 +724,10 @@ def leaves(
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             if not name.startswith("_"):
-                yield from leaves(value, (*keys, name))
+                yield from iter_leaves(value, (*keys, name))
     elif isinstance(parsed, list):
         for index, value in enumerate(parsed):
-            yield from leaves(value, (*keys, index))
+            yield from iter_leaves(value, (*keys, index))
     else:
         yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
 
@@ -825,10 +841,9 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of values in an element of an array.
+    """Return the number of values in an element of an array of arrays.
 
-    If the element is itself an array, this is its length. Otherwise, or if the length is not known
-    yet, it is 1.
+    It is 1 for an element that is not an array, or if its length is not known yet.
     """
     with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
@@ -855,10 +870,9 @@ def _draw_parts(
 
 
 def _draw_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
-    """Return a random part.
+    """Return a random part; try again if its values are invalid.
 
-    A part with an invalid count is drawn again, because otherwise frames with many counts would
-    hardly ever have a part.
+    Without these attempts, frames with several counts would hardly ever have a part.
     """
     for _ in range(MAX_DRAWS):
         with contextlib.suppress(Fault):
