@@ -17,8 +17,8 @@ from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_o
 from lidarspec.cli.terminal import note
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.explaining.explanation import Explanation, values
-from lidarspec.explaining.formatting import TextSpan, number
+from lidarspec.explaining.explanation import Explanation, read_values
+from lidarspec.explaining.formatting import TextSpan, to_json_number
 from lidarspec.explaining.input_segments import InputPiece, explain_piece, iter_pieces
 from lidarspec.explaining.listing import LINE_BYTES, Line, list_differences
 from lidarspec.plugins import sensor as named_sensor
@@ -89,7 +89,7 @@ def _iter_names(parsed: Any, path: str) -> Iterator[tuple[str, str]]:
 
 def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
-        field_values = values(piece.data, sensor, piece.frame).values()
+        field_values = read_values(piece.data, sensor, piece.frame).values()
         rows = [
             [value.path, _raw_text(value.raw), str(value) if value.has_meaning else ""]
             for value in field_values
@@ -471,4 +471,4 @@ def plain(parsed: Any) -> Any:
         return parsed.hex(" ")
     if isinstance(parsed, int):
         return int(parsed)
-    return number(parsed)
+    return to_json_number(parsed)

@@ -97,10 +97,11 @@ def find_changes(
 
 
 def _find_max_size(engine: Codec, values: int) -> int:
-    """Return the length of the longest frame for which all candidates are tried.
+    """Return the maximum length of a frame for which the search is fast enough.
 
     Args:
-        values: number of candidates for each offset.
+        engine: parses the frame type.
+        values: number of changes to try at each offset.
     """
     is_compiled = isinstance(engine, CompiledCodec)
     if values > 8:
@@ -125,8 +126,11 @@ def _iter_changes(
     """Yield the changes of one kind that explain the damage.
 
     Args:
-        values: number of candidates for each offset.
+        kind: the kind of change.
+        values: number of changes of this kind to try at each offset.
+        data: the damaged frame.
         size: length of the undamaged frame.
+        engine: parses the frame type.
         chosen: the offsets at which changes are tried; None for all.
     """
     tried_offsets = np.arange(max(len(data), size))
@@ -169,7 +173,10 @@ def _undo_changes(
     changes: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """Return the damaged bytes with each change undone, (changes, size)."""
+    """Return a copy of the damaged frame for each change, with this change undone.
+
+    The result is an array (number of changes, size).
+    """
     columns = count_up(size)
     change_columns = offsets[:, None]
     if kind == "inserted byte":

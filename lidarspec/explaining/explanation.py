@@ -179,14 +179,14 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     rows = (*frame_rows.iter_rows(), *frame_rows.iter_rest(fault))
     if fault is not None and not is_valid_frame(sensor, data[: frame_rows.after], name):
         guesses = describe_damage(
-            sensor.frames[name], data, lambda candidate: values(candidate, sensor, name)
+            sensor.frames[name], data, lambda candidate: read_values(candidate, sensor, name)
         )
         return Explanation(sensor.id, name, data, rows, fault, tuple(guesses))
     rows, notes = _add_points(sensor, name, data[: frame_rows.after], rows)
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
-def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
+def read_values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
     """Return the values of a frame by path with array indices, in wire order."""
     return FrameRows(sensor.frames[frame], data).values()
 
@@ -206,7 +206,7 @@ def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, s
     return f"replied with {reply.frame}", rows
 
 
-def reply_text(sensor: Sensor, reply: Reply) -> str:
+def format_reply(sensor: Sensor, reply: Reply) -> str:
     """Return the result of a command as text, with a line for each field of the reply."""
     result, rows = describe_reply(sensor, reply)
     return "\n".join([result, *(f"{path}: {value}" for path, value, _ in rows)])
@@ -300,14 +300,14 @@ def _find_point_numbers(
 ) -> list[int]:
     """Return the indices of the points in a row.
 
-    Only the elements of the innermost array of `chain` have points.
+    The list is empty if the row is not an element of the innermost array with points.
 
     Args:
         path: the path of the row.
-        chain: the axes of the nested arrays with the points, outermost first.
-        axes: the array of the frame along each dimension of `numbers`; None for a dimension without
-            such an array.
-        numbers: index of the point of each array element; -1 for an element without a point.
+        chain: the paths of the nested arrays that contain the points, outermost first.
+        axes: for each dimension of `numbers`, the path of the array whose elements it counts; None
+            if it does not correspond to an array.
+        numbers: the index of the point of each array element; -1 for an element without a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

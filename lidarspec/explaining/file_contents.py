@@ -96,7 +96,8 @@ class SensorContent:
             the sensor.
         options: command-line options that select the sensor; "" if the file names the sensor.
         reading: statistics of the part that was decoded; None if the data cannot be decoded.
-        incomplete_returns: the number of groups of packets with a lost return, in the decoded part.
+        incomplete_returns: the number of incomplete groups of packets in the decoded part. A group
+            has the packets with the returns of the same firings.
         verb: the subcommand that shows the data.
         info: the facts that the sensor reports about itself in the decoded part, by name.
         clock: a description of the sensor's clock in the decoded part; "" if the sensor sends no
@@ -291,7 +292,7 @@ def _count_packets(contents: FileContents, opened: Transport) -> None:
 
 
 def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
-    """Return the time of the last packet; None if the file cannot seek."""
+    """Return the time of the last packet; None if the transport cannot skip to it."""
     last = None
     for chunk in chunks if opened.skip_until(_END_NS) else ():
         last = chunk.at or last
@@ -299,7 +300,7 @@ def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
 
 
 def _find_sensors(contents: FileContents) -> list[SensorContent]:
-    """Return the data of each sensor."""
+    """Find the sensors that sent the packets of a file."""
     try:
         if (declared := find_declared_sensor(contents.path)) is not None:
             measured = _measure(contents.path, declared)

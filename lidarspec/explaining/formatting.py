@@ -38,7 +38,8 @@ class TextSpan(NamedTuple):
 class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
-    Without a valid return, x, y and z are nan, and the range is inf (no return) or nan.
+    If there is no return, x, y and z are nan, and the range is inf. If the return is invalid, the
+    range is nan as well.
     """
 
     x: float
@@ -137,7 +138,7 @@ class FieldValue:
     def __str__(self) -> str:
         if self.physical is None:
             if isinstance(self.raw, bytes | bytearray):
-                return ascii_text(self.raw)
+                return format_ascii(self.raw)
             return repr(self.raw)
         if self.label:
             return format_code(self.raw, self.label)
@@ -162,11 +163,11 @@ class FieldValue:
         if isinstance(self.raw, bytes | bytearray):
             raw = self.raw.hex(" ")
         else:
-            raw = number(self.raw)
+            raw = to_json_number(self.raw)
         if self.physical is None:
             physical = {}
         else:
-            physical = {"value": number(self.physical)}
+            physical = {"value": to_json_number(self.physical)}
         position = {"start": self.start, "masks": self.masks.hex(" ")}
         more = {
             name: text
@@ -216,7 +217,7 @@ class ExplainedRow:
         alone = len(self.values) == 1 and not self.values[0].bits
         values = [] if drawn else self._format_values(alone=alone)
         verdict = "good" if self.right else "bad"
-        docs = self.values[0].docs if alone and self.first else ""
+        docs = self.values[0].docs if alone and self.is_in_first_element else ""
         points = list(dict.fromkeys(str(point) for point in self.points))
         parts = [(", ", text, "") for text in values] + [
             (", ", text, "point") for text in points[:1]
@@ -233,7 +234,7 @@ class ExplainedRow:
         ]
 
     @property
-    def first(self) -> bool:
+    def is_in_first_element(self) -> bool:
         """Whether the row is in the first element of each array that contains it.
 
         Texts that are the same in all elements are shown only in the first.
@@ -241,10 +242,11 @@ class ExplainedRow:
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
-        """Return each value as text.
+        """Return each value as text, with the bits if this is the first element of an array.
 
-        A text contains the name of the field only if another value of the row has the same unit. In
-        the first element of an array, it also contains the bits.
+        Args:
+            alone: whether the row is a single field. If not, a text begins with the name of its
+                field unless the unit identifies the field.
         """
         if alone and self.remarks:
             return []
@@ -257,7 +259,7 @@ class ExplainedRow:
             else:
                 name = value.path.removeprefix(f"{self.path}.")
             text = str(value)
-            if value.bits and self.first:
+            if value.bits and self.is_in_first_element:
                 where = f" ({value.bits})"
             else:
                 where = ""
@@ -277,7 +279,7 @@ class ExplainedRow:
             "right": self.right,
         }
         points = [
-            {name: number(value) for name, value in point._asdict().items()}
+            {name: to_json_number(value) for name, value in point._asdict().items()}
             for point in self.points
         ]
         more = {"remarks": list(self.remarks), "values": [value.to_dict() for value in self.values]}
@@ -351,7 +353,7 @@ class FieldDifference:
         }
 
 
-def bit_picture(data: bytes, masks: bytes) -> str:
+def draw_bits(data: bytes, masks: bytes) -> str:
     """Return the bits of one value as text, e.g. ".. 000001.. 00011000".
 
     The highest bit of each byte comes first. Dots stand for bits of other values; ".." is a byte
@@ -364,7 +366,7 @@ def bit_picture(data: bytes, masks: bytes) -> str:
     return " ".join(parts)
 
 
-def number(value: Any) -> Any:
+def to_json_number(value: Any) -> Any:
     """Return a value for JSON: None for nan and infinity, any other value unchanged."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
@@ -385,8 +387,8 @@ def format_fixed(value: float, digits: int | None) -> str:
     return text.removeprefix("-")
 
 
-def limits(low: float, high: float, between: str = "..") -> str:
-    """Format a range of numbers, e.g. "0..4294967295", with all digits of integers."""
+def format_limits(low: float, high: float, between: str = "..") -> str:
+    """Format a range of numbers, e.g. "0..4294967295"; all digits of an integer are shown."""
     return between.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
@@ -395,12 +397,12 @@ def limits(low: float, high: float, between: str = "..") -> str:
 def format_argument_type(kind: Taken, between: str = "..") -> str:
     """Return the range of a numeric command argument, or another argument's type."""
     if isinstance(kind, Range):
-        return limits(kind.low, kind.high, between)
+        return format_limits(kind.low, kind.high, between)
     return kind.describe(None)
 
 
 def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
-    """Return the names of an argument's values, or else its `format_argument_type`."""
+    """Return the values that an argument accepts as text: names, a range, or both."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(argument_slot(sensor, command, argument).info, kind)
@@ -410,7 +412,7 @@ def describe_argument(sensor: Sensor, command: str, argument: str, between: str 
     return format_argument_type(kind, between)
 
 
-def ascii_text(data: bytes | bytearray) -> str:
+def format_ascii(data: bytes | bytearray) -> str:
     """Return bytes as text in quotes, without trailing zero bytes.
 
     Returns "" if the bytes are not printable ASCII, or have fewer than four characters.

@@ -71,7 +71,7 @@ class FrameRows:
     def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
         """Return the fields of the frame; the last field may be truncated.
 
-        Returns None if the frame cannot be read, so that its end is unknown.
+        Returns None if the frame type is not compiled and construct cannot parse the bytes.
         """
         if isinstance(frame_layouts(frame), NotCompilableError):
             return plain_fields(frame, struct)

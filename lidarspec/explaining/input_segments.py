@@ -41,8 +41,9 @@ class InputPiece:
     Attributes:
         offset: offset of the first byte in the input.
         data: the bytes.
-        frame: the frame type; "" for bytes that are not in a frame; or `NEAREST`.
-        datagram: whether the bytes are a datagram or a part of a datagram, and are not in a frame.
+        frame: the frame type. It is "" for bytes that are not in a frame, and `NEAREST` for a short
+            input that is probably one damaged frame.
+        datagram: for bytes that are not in a frame, whether they are from a datagram.
     """
 
     offset: int
@@ -61,7 +62,7 @@ class InputPiece:
         return self.offset + len(self.data)
 
     def part(self, start: int, end: int, frame: str = "") -> InputPiece:
-        """Return the bytes from `start` to `end` of the piece as a new piece."""
+        """Return the bytes from `start` to `end` of this piece as a new piece of type `frame`."""
         return InputPiece(self.offset + start, self.data[start:end], frame)
 
 
@@ -70,15 +71,15 @@ def iter_pieces(
 ) -> Iterator[InputPiece]:
     """Yield the frames of the input and the bytes between them, in order.
 
-    A datagram that is not a frame is a piece of its own. An input that is not longer than the
-    longest frame, and contains no valid frame, is one piece of the type `NEAREST`.
+    A datagram that is not a frame is a piece of its own. If the whole input is short and contains
+    no valid frame, it is one piece of the type `NEAREST`.
 
     Args:
         sensor: the sensor.
         chunks: the input.
         datagrams: whether each chunk is a datagram, not a piece of a stream.
-        frame: the frame type that is preferred if several types match the same bytes. The `after`
-            of this type is ignored. Frames of other types are yielded as well.
+        frame: the frame type that is selected if several types match the same bytes. It need not
+            follow the type in its `after`.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -160,17 +161,18 @@ def _split_input(
 def explain_piece(
     sensor: Sensor, piece: InputPiece, frame: str | None = None
 ) -> Iterator[tuple[InputPiece, Explanation]]:
-    """Yield (piece, explanation) of a piece, or of each part of it.
+    """Yield a piece with its explanation.
 
-    A piece outside frames is split into damaged frames and the bytes between them.
+    Bytes that are not in a frame are first split into damaged frames and the bytes between them.
+    Each of these is then yielded as a piece.
 
     Args:
         sensor: the sensor.
         piece: the piece.
-        frame: the frame type for `NEAREST`; by default the type that fits best.
+        frame: the frame type of a piece of the type `NEAREST`; by default the type that fits best.
 
     Raises:
-        WireError: if the piece is `NEAREST`, and no frame type begins like its bytes.
+        WireError: if no frame type begins like the bytes of a piece of the type `NEAREST`.
     """
     if piece.frame:
         yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
@@ -255,8 +257,9 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    The frame has the size of its type, or one byte less or more if another frame begins after it.
-    If another frame begins earlier, the damaged frame ends where that frame begins.
+    This is the offset in `ends` at which the frame has the length of its type, or one byte less or
+    more. If there is none, the frame ends at the next offset in `ends`, or at the length of its
+    type if that is shorter.
 
     Args:
         data: the bytes.

@@ -16,8 +16,8 @@ from lidarspec.explaining.formatting import (
     FieldDifference,
     FieldValue,
     TextSpan,
-    bit_picture,
-    number,
+    draw_bits,
+    to_json_number,
 )
 from lidarspec.frames.wire_table import format_hex
 
@@ -48,7 +48,7 @@ def join_text(line: Line) -> str:
 def fold(line: Line, width: int) -> Line:
     """Insert line breaks into a line that is wider than `width` characters.
 
-    Continuation lines are indented to the end of the columns.
+    Continuation lines are indented to the text after the columns of offset, bytes and name.
     """
     indent = sum(len(span.text) for span in line[:COLUMN_COUNT])
     if len(join_text(line)) <= width or indent + MIN_FOLDED_WIDTH > width:
@@ -67,7 +67,7 @@ def fold(line: Line, width: int) -> Line:
     return tuple(spans)
 
 
-def parents(path: str) -> list[str]:
+def list_parents(path: str) -> list[str]:
     """Return the paths of the structs that contain a field, outermost first.
 
     For example, "a[0].b.c" gives ["a[0]", "a[0].b"].
@@ -87,11 +87,12 @@ class Listing:
     def __init__(self, rows: Sequence[ExplainedRow], *, every: bool) -> None:
         self._rows = rows
         self._drawn = [
-            any(value.bits for value in row.values) and (every or row.first) for row in rows
+            any(value.bits for value in row.values) and (every or row.is_in_first_element)
+            for row in rows
         ]
         self._bytes = min(max([1, *(len(row.data) for row in rows)]), LINE_BYTES)
         pictures = [
-            bit_picture(*part)
+            draw_bits(*part)
             for row, drawn in zip(rows, self._drawn, strict=True)
             if drawn
             for part in _split_bits(row)
@@ -113,7 +114,7 @@ class Listing:
         """Yield the lines; the line of a struct comes before its contents."""
         previous: list[str] = []
         for index, row in enumerate(self._rows):
-            containers = parents(row.path)
+            containers = list_parents(row.path)
             for depth, path in enumerate(containers):
                 if path not in previous[depth : depth + 1]:
                     yield self._make_line(row.offset, TextSpan(""), _indent_path(path, depth), [])
@@ -143,7 +144,7 @@ class Listing:
             )
             words += [TextSpan(f"; {value.docs}", "docs")] if value.docs else []
             if value.bits:
-                drawing = TextSpan(bit_picture(*picture), "bits")
+                drawing = TextSpan(draw_bits(*picture), "bits")
             else:
                 drawing = TextSpan(picture[0].hex(" "), role)
             yield self._make_line(
@@ -164,7 +165,7 @@ class Listing:
 
     def _names(self, index: int) -> Iterator[str]:
         row = self._rows[index]
-        around = parents(row.path)
+        around = list_parents(row.path)
         yield from (_indent_path(path, depth) for depth, path in enumerate([*around, row.path]))
         if self._drawn[index]:
             yield from (
@@ -234,7 +235,7 @@ def _iter_difference_lines(difference: FieldDifference) -> Iterator[Line]:
                 ("-", difference.first, "bad"),
                 ("+", difference.second, "good"),
             ):
-                bits = bit_picture(data[part], masks[part])
+                bits = draw_bits(data[part], masks[part])
                 yield (
                     TextSpan(f"{'':6}{sign} "),
                     TextSpan(f"{data[part].hex(' '):<{3 * DIFFERENCE_LINE_BYTES - 1}}  ", "hex"),
@@ -259,5 +260,5 @@ def _make_missing_line(group: list[FieldDifference], which: str) -> Line:
 def _format_value(value: FieldValue) -> str:
     text = str(value)
     return text or (
-        format_hex(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw))
+        format_hex(value.raw, 0) if isinstance(value.raw, bytes) else str(to_json_number(value.raw))
     )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, printable
 from lidarspec.explaining.explanation import Explanation
-from lidarspec.explaining.listing import parents
+from lidarspec.explaining.listing import list_parents
 from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
@@ -98,7 +98,7 @@ def explanation(value: Explanation) -> str:
     """
     rows = []
     for number, row in enumerate(value.rows[:MAX_ROWS]):
-        indent = "&nbsp;" * 2 * len(parents(row.path))
+        indent = "&nbsp;" * 2 * len(list_parents(row.path))
         name = escape(row.path.rpartition(".")[2])
         meaning = escape(printable(row.meaning))
         if row.right:

@@ -8,8 +8,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import explain
-from lidarspec.explaining.formatting import TextSpan, bit_picture
-from lidarspec.explaining.listing import fold, join_text, list_differences, parents
+from lidarspec.explaining.formatting import TextSpan, draw_bits
+from lidarspec.explaining.listing import fold, join_text, list_differences, list_parents
 from tests.cli.running import EXAMPLE, process, ran, run_json
 from tests.representatives import load_sensor
 
@@ -31,7 +31,7 @@ def test_parts_are_indented() -> None:
     assert ["0020 blocks[0]"] in found
     heads = [line for line in lines("robosense-m1", data) if line.endswith("blocks[1]")]
     assert heads == [f"004f  {'':23}  blocks[1]"]
-    assert parents("a[0].b.c") == ["a[0]", "a[0].b"]
+    assert list_parents("a[0].b.c") == ["a[0]", "a[0].b"]
 
 
 def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> None:
@@ -48,7 +48,7 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
 
 
 def test_a_picture_has_dots_for_other_bits() -> None:
-    assert bit_picture(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
+    assert draw_bits(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
 
 
 def test_differences_are_listed_by_field_and_bit() -> None:

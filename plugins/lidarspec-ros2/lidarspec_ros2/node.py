@@ -32,7 +32,7 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.explaining.clock_text import describe_clock
-from lidarspec.explaining.explanation import reply_text
+from lidarspec.explaining.explanation import format_reply
 from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
@@ -370,7 +370,7 @@ class LidarNode(LifecycleNode):
             response.message = str(error)
         else:
             response.success = True
-            response.message = reply_text(device.sensor, reply)
+            response.message = format_reply(device.sensor, reply)
         return response
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from lidarspec import LidarSpecError, UsageError, __version__, explain
 from lidarspec.explaining.assignments import parse_arguments
-from lidarspec.explaining.explanation import Explanation, reply_text
+from lidarspec.explaining.explanation import Explanation, format_reply
 from lidarspec.explaining.file_contents import measure_duration
 from lidarspec.points.appearance import is_flat
 from lidarspec.scans.provenance import PointOrigin
@@ -199,7 +199,7 @@ class PageMessages:
         return {
             "is": "replied",
             "command": name,
-            "text": reply_text(device.sensor, reply),
+            "text": format_reply(device.sensor, reply),
             "hex": reply.data.hex(),
         }
 
