@@ -1,13 +1,16 @@
-"""How late a scan is at a subscriber, and what the node takes of a processor, beside what it is
-made of.
+"""Measure the latency of scans at a subscriber, and the processor time of the node.
 
     python plugins/lidarspec-ros2/benchmarks/latency.py [SENSOR] [SECONDS]
 
-Three runs with processes of their own, of as many seconds each. A sender, in real time, sends what
-a sensor would, and notes when the packet left that ends each scan; the node publishes, and a
-subscriber notes when its callback was called. `lidarspec stats` reads the same. Then a publisher
-alone publishes as large a message as often. Printed are the milliseconds from the last byte, and
-from publishing, to the callback, and the shares of a core.
+There are three measurements of SECONDS each:
+
+* A simulated sensor sends packets in real time, the node publishes, and a subscriber receives. The
+  latency is the time from the last packet of a scan to the callback of the subscriber.
+* `lidarspec stats` reads the same packets.
+* A publisher without a node sends messages of the same size at the same rate.
+
+The second and the third measurement show how much of the processor time is spent on decoding and on
+publishing.
 """
 
 from __future__ import annotations
@@ -32,13 +35,20 @@ import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
 
 os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-#: seconds in which everything comes to run before anything is measured, and from which on packets
-#: are sent.
-WARMING, PORT = 5.0, 26699
+#: The time for all processes to start before the measurement begins.
+WARM_UP_S = 5.0
+UDP_PORT = 26699
 
 
 def send(sensor: str, seconds: float, place: str, notes: str) -> None:
-    """Send packets in real time, and write down when each of those left that end a scan."""
+    """Send simulated packets in real time, and store the time of the last packet of each scan.
+
+    Args:
+        sensor: the id of the sensor.
+        seconds: how long to send.
+        place: the name of a new serial line; "" to send by UDP.
+        notes: the file for the times.
+    """
     spec = ls.sensor(sensor)
     frames = list(simulate(spec, 20000))
     packets = spec.decode(b"".join(frames) if not spec.datagrams else frames)
@@ -46,7 +56,7 @@ def send(sensor: str, seconds: float, place: str, notes: str) -> None:
     cloud = packets.points()
     each = len(cloud) // len(frames)
     ends = set((np.cumsum([len(scan) for scan in spec.scans(frames)]) // each).tolist())
-    write = _line(place) if place else _socket()
+    write = _make_line_writer(place) if place else _make_socket_writer()
     begin, left = time.monotonic(), []
     for number in range(int(seconds / pace)):
         time.sleep(max(begin + number * pace - time.monotonic(), 0))
@@ -56,20 +66,27 @@ def send(sensor: str, seconds: float, place: str, notes: str) -> None:
     Path(notes).write_text(json.dumps(left), encoding="utf-8")
 
 
-def _line(place: str) -> Any:
+def _make_line_writer(place: str) -> Any:
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     os.symlink(os.ttyname(theirs), place)
     return lambda data: os.write(ours, data)
 
 
-def _socket() -> Any:
+def _make_socket_writer() -> Any:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    return lambda data: sock.sendto(data, ("127.0.0.1", PORT))
+    return lambda data: sock.sendto(data, ("127.0.0.1", UDP_PORT))
 
 
 def subscribe(kind: str, topic: str, seconds: float, notes: str) -> None:
-    """Write down when the callback was called, and how large the message is."""
+    """Receive the messages of a topic, and store the arrival time and size of each.
+
+    Args:
+        kind: the message type in `sensor_msgs`.
+        topic: the name of the topic.
+        seconds: how long to receive.
+        notes: the file for the times and sizes.
+    """
     import rclpy
     from sensor_msgs import msg
 
@@ -90,7 +107,15 @@ def subscribe(kind: str, topic: str, seconds: float, notes: str) -> None:
 
 
 def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> None:
-    """Publish bytes of a size, and write down when."""
+    """Publish messages at a constant rate, and store the time of each.
+
+    Args:
+        kind: the message type in `sensor_msgs`.
+        size: size of each message, in bytes.
+        rate: messages per second.
+        seconds: how long to publish.
+        notes: the file for the times.
+    """
     import rclpy
     from sensor_msgs import msg
 
@@ -112,8 +137,8 @@ def publish(kind: str, size: int, rate: float, seconds: float, notes: str) -> No
 
 
 @contextlib.contextmanager
-def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """A program, which is ended at the end."""
+def run_program(*words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Python with these arguments until the context ends."""
     begun = subprocess.Popen(
         [sys.executable, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -124,8 +149,8 @@ def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
         begun.wait()
 
 
-def share(pid: int, seconds: float) -> float:
-    """The share of a core that a process takes in so many seconds."""
+def measure_core_share(pid: int, seconds: float) -> float:
+    """Measure for some seconds how much of a processor core a process uses, from 0 to 1."""
 
     def taken() -> float:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -136,8 +161,13 @@ def share(pid: int, seconds: float) -> float:
     return (taken() - before) / (time.monotonic() - begin)
 
 
-def late(left: list[int], came: list[tuple[int, int]]) -> str:
-    """Median and 99th percentile from each time to the next one of a callback, ms."""
+def format_latency(left: list[int], came: list[tuple[int, int]]) -> str:
+    """Return the median and the 99th percentile of the latency as text.
+
+    Args:
+        left: the times at which the data was sent, in ns.
+        came: (time in ns, size) of each received message.
+    """
     times = np.array(left)
     after = np.array([at for at, _ in came if at > times[0]])
     which = np.searchsorted(times, after, side="right") - 1
@@ -149,9 +179,9 @@ def late(left: list[int], came: list[tuple[int, int]]) -> str:
 
 
 def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
-    """Print the figures."""
+    """Run the three measurements and print their results."""
     os.environ["ROS_DOMAIN_ID"] = str(random.randrange(50, 100))
-    spec, lasting = ls.sensor(sensor), seconds + 2 * WARMING
+    spec, lasting = ls.sensor(sensor), seconds + 2 * WARM_UP_S
     kind, topic = ("PointCloud2", "points") if spec.datagrams else ("LaserScan", "scan")
     with tempfile.TemporaryDirectory() as folder:
         left, came, place = (
@@ -159,40 +189,45 @@ def main(sensor: str = "ldrobot-stl27l", seconds: float = 20.0) -> None:
             f"{folder}/came",
             "" if spec.datagrams else f"{folder}/port",
         )
-        source = f"udp://127.0.0.1:{PORT}" if spec.datagrams else place
+        source = f"udp://127.0.0.1:{UDP_PORT}" if spec.datagrams else place
         with (
-            process(__file__, "send", sensor, lasting, place, left) as sender,
-            process(__file__, "subscribe", kind, topic, lasting, came) as subscriber,
+            run_program(__file__, "send", sensor, lasting, place, left) as sender,
+            run_program(__file__, "subscribe", kind, topic, lasting, came) as subscriber,
         ):
             while place and not os.path.islink(place):
                 time.sleep(0.1)
-            with process(
+            with run_program(
                 "-m", "lidarspec", "ros2", source, "-s", sensor, "--ros-args", "-p", "qos:=reliable"
             ) as node:
-                time.sleep(WARMING)
-                taken = share(node.pid, seconds)
+                time.sleep(WARM_UP_S)
+                taken = measure_core_share(node.pid, seconds)
                 sender.wait()
                 subscriber.wait()
         ends, messages = json.loads(Path(left).read_text()), json.loads(Path(came).read_text())
         size, rate = messages[-1][1], len(ends) / lasting
         print(f"{sensor}: {size} bytes, {rate:.1f} a second")
-        print(f"  the node, from the last byte:   {late(ends, messages)}; {taken:.1%} of a core")
+        print(
+            f"  the node, from the last byte:   {format_latency(ends, messages)};"
+            f" {taken:.1%} of a core"
+        )
         if place:
             Path(place).unlink()
-        with process(__file__, "send", sensor, lasting, place, left):
+        with run_program(__file__, "send", sensor, lasting, place, left):
             while place and not os.path.islink(place):
                 time.sleep(0.1)
-            with process("-m", "lidarspec", "stats", source, "-s", sensor) as stats:
-                time.sleep(WARMING)
-                reading = share(stats.pid, seconds)
+            with run_program("-m", "lidarspec", "stats", source, "-s", sensor) as stats:
+                time.sleep(WARM_UP_S)
+                reading = measure_core_share(stats.pid, seconds)
         with (
-            process(__file__, "subscribe", kind, "alone", lasting, came) as subscriber,
-            process(__file__, "publish", kind, size, rate, lasting - 2, left) as publisher,
+            run_program(__file__, "subscribe", kind, "alone", lasting, came) as subscriber,
+            run_program(__file__, "publish", kind, size, rate, lasting - 2, left) as publisher,
         ):
-            time.sleep(WARMING)
-            publishing = share(publisher.pid, seconds)
+            time.sleep(WARM_UP_S)
+            publishing = measure_core_share(publisher.pid, seconds)
             subscriber.wait()
-        alone = late(json.loads(Path(left).read_text()), json.loads(Path(came).read_text()))
+        alone = format_latency(
+            json.loads(Path(left).read_text()), json.loads(Path(came).read_text())
+        )
         print(f"  publishing alone:               {alone}; {publishing:.1%} of a core")
         print(
             f"  lidarspec stats: {reading:.1%} of a core; the node takes"

@@ -1,4 +1,4 @@
-"""Two lidars at once, a node each: /front/lidar and /back/lidar, by the parameters of one file.
+"""Start two lidars: the nodes /front/lidar and /back/lidar, with parameters from one file.
 
 ros2 launch lidarspec_ros2 two_lidars.launch.py config:=mine.yaml
 """
@@ -15,7 +15,7 @@ CONFIG = Path(__file__).resolve().parent.parent / "config" / "two_lidars.yaml"
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The file of parameters as an argument, and the nodes."""
+    """Return a launch description with the argument `config` and both nodes."""
     config = DeclareLaunchArgument(
         "config",
         default_value=str(CONFIG),

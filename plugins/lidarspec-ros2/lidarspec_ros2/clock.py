@@ -27,8 +27,8 @@ class MessageStamps:
 
     Args:
         wall: the host's clock, for a live sensor; None if a recording is played. If the computer's
-            clock is set, ROS's time jumps, but arrival times continue evenly. The difference is
-            found with this clock.
+            clock is set, ROS's time jumps, but arrival times continue evenly. `wall` measures this
+            difference.
 
     Attributes:
         clock: converts the sensor's clock to the host's.
@@ -43,8 +43,8 @@ class MessageStamps:
         """Update the conversion with packets, and record a step of the computer's clock.
 
         Args:
-            device_ns, host_ns: as for `DeviceClock.observe`; packets with an unknown arrival
-                time, 0, are ignored.
+            device_ns: the time of each packet by the sensor's clock, ns.
+            host_ns: the arrival time of each packet, ns; 0 if unknown, to ignore the packet.
         """
         is_known = host_ns > 0
         self.clock.observe(device_ns[is_known], host_ns[is_known])

@@ -143,7 +143,10 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
 
 
 def _find_shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
-    """Return the shared memory for the parameters' sensor; the node need not exist."""
+    """Return the settings of shared memory for the sensor that the parameters name.
+
+    The parameters are read from the command line, because the node does not exist yet.
+    """
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from lidarspec.transports.open_url import live_address

@@ -53,12 +53,14 @@ class LidarNode(LifecycleNode):
 
     Args:
         given: parameters that have priority over parameters of the command line and of files.
-        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
+        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
+            reliability "best effort"; None if unknown.
 
     Attributes:
-        failure: the error that prevented the configuration, or that ended reading; None without an
-            error.
-        ended: an event that is set when the node does nothing more by itself.
+        failure: the error that prevented the configuration, or that ended reading; None if there
+            was no error.
+        ended: an event that is set when the node is shut down and, if the node starts
+            automatically, when its input has ended or failed.
         opening: whether the node waits for the sensor to be found or to reply.
 
     Raises:
@@ -375,10 +377,11 @@ class LidarNode(LifecycleNode):
 
 
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
-    """Return the time of `time.monotonic` at which to wake for the end of the next scan.
+    """Return the time at which to look for the end of the next scan, by `time.monotonic`.
 
-    The result is slightly before the expected end. If a scan is late, it is the normal polling
-    time.
+    Args:
+        expected: the time that was returned for the previous scan.
+        feed: the scans that were just read, which give the duration of a scan.
     """
     now = time.monotonic()
     for scan in feed.scans:

@@ -230,7 +230,7 @@ class Settings:
     """The values of the parameters, by name.
 
     Raises:
-        UsageError: if a value is invalid whatever the sensor is.
+        UsageError: if a value is invalid for all sensors.
     """
 
     values: Mapping[str, Any]
@@ -275,10 +275,11 @@ class Settings:
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 
     def find_sensor(self) -> Sensor:
-        """Return the configured sensor, detected if the parameters do not name one.
+        """Return the sensor with its options; detect it if the parameters do not name one.
 
         Raises:
-            UsageError, WireError, SourceError: as on the command line.
+            UsageError, WireError, SourceError: if the sensor is not installed, does not accept an
+                option, or cannot be detected.
         """
         sensor = self._configured_sensor()
         return detect(self["source"]) if sensor is None else sensor
@@ -308,14 +309,14 @@ class Settings:
         return None if device is None else device.mount
 
     def open_device(self, record: Callable[[Transport], TrafficLog]) -> Device:
-        """Return the open device.
+        """Open the source of the parameters, and return the device.
 
         Args:
-            record: a function that makes the log that publishes packets; used if the parameters
-                request it.
+            record: a function that makes a log, which publishes the packets. It is called if the
+                parameter `publish_packets` is set.
 
         Raises:
-            LidarSpecError: as on the command line.
+            LidarSpecError: if a parameter is invalid, or the source cannot be opened.
         """
         if not self["source"]:
             raise UsageError(

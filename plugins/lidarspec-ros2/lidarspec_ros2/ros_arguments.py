@@ -30,7 +30,7 @@ def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
         arguments: the words of the command line; only words after ``--ros-args`` count.
         node_name: the default name of the node, which the command line can change.
     """
-    options = list(itertools.pairwise(_ros_words(arguments)))
+    options = list(itertools.pairwise(_find_ros_words(arguments)))
     values_by_pattern: dict[str, dict[str, Any]] = {}
     for option, value in options:
         if option in _PARAMETER_OPTIONS:
@@ -41,7 +41,7 @@ def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
             continue
         for pattern, values in nodes:
             values_by_pattern.setdefault(pattern, {}).update(values)
-    full_name = _full_name(options, node_name)
+    full_name = _find_full_name(options, node_name)
     parameters: dict[str, Any] = {}
     for pattern, values in values_by_pattern.items():
         if _is_name_of(pattern, full_name):
@@ -49,7 +49,7 @@ def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
     return parameters
 
 
-def _ros_words(arguments: Sequence[str]) -> list[str]:
+def _find_ros_words(arguments: Sequence[str]) -> list[str]:
     """Return the words between ``--ros-args`` and ``--``."""
     words = []
     is_ros = False
@@ -63,7 +63,7 @@ def _ros_words(arguments: Sequence[str]) -> list[str]:
     return words
 
 
-def _full_name(options: Sequence[tuple[str, str]], node_name: str) -> str:
+def _find_full_name(options: Sequence[tuple[str, str]], node_name: str) -> str:
     """Return the name of the node with its namespace, after remapping."""
     namespace = ""
     for option, value in options:

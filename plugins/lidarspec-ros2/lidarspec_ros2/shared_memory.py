@@ -70,13 +70,14 @@ MAX_PROBED_PACKETS = 1000
 
 @dataclass(frozen=True)
 class SharedMemory:
-    """How the node uses the shared memory of Fast DDS.
+    """The node's settings for the shared memory of Fast DDS.
 
     Attributes:
         segment_bytes: size of the segment in the node's profile; 0 if the node provides no profile.
-        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
+        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
+            reliability "best effort"; None if unknown.
         notice: a message for the log about the node's profile; "" if there is no profile.
-        warning: a message for the log that clouds may be lost; "" if they will not be lost.
+        warning: a message for the log that clouds may be lost; "" if there is no such danger.
     """
 
     segment_bytes: int = 0
@@ -101,7 +102,7 @@ def choose_shared_memory(
         return SharedMemory()
     try:
         sensor = find_sensor()
-        cloud_bytes = None if sensor is None else largest_cloud_bytes(sensor)
+        cloud_bytes = None if sensor is None else find_largest_cloud_bytes(sensor)
     except LidarSpecError:  # the node reports it when it opens the sensor
         cloud_bytes = None
     if cloud_bytes is None and is_serial:
@@ -110,7 +111,12 @@ def choose_shared_memory(
 
 
 def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
-    """Choose the shared memory for clouds of at most `cloud_bytes`; None if unknown."""
+    """Choose the settings for the clouds of a sensor.
+
+    Args:
+        cloud_bytes: size of the largest cloud; None if unknown.
+        free: free shared memory of the system, in bytes.
+    """
     assumed = ASSUMED_CLOUD_BYTES if cloud_bytes is None else cloud_bytes
     if MIN_CLOUDS * assumed <= DEFAULT_SEGMENT_BYTES:
         return SharedMemory(max_cloud_bytes=DEFAULT_SEGMENT_BYTES // MIN_CLOUDS)
@@ -125,7 +131,7 @@ def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
             )
             notice = (
                 f"Fast DDS uses {format_megabytes(segment_bytes)} of shared memory, for clouds of"
-                f" up to {size}{reason}; set {profile_variable()} to use another profile"
+                f" up to {size}{reason}; set {find_profile_variable()} to use another profile"
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
@@ -162,20 +168,20 @@ def has_user_profile() -> bool:
     return has_variable or any(Path(name).exists() for name in USER_FILES)
 
 
-def profile_variable() -> str:
-    """Return the environment variable for the profile of the loaded Fast DDS.
+def find_profile_variable() -> str:
+    """Return the name of the environment variable from which Fast DDS reads its profile.
 
-    Later versions of ROS also read the variable of Fast DDS 2, but warn that it is deprecated.
+    The name depends on the version of Fast DDS that this process has loaded.
     """
     libraries = Path("/proc/self/maps").read_text(encoding="utf-8")
     return OLD_PROFILE_VARIABLE if "libfastrtps.so" in libraries else PROFILE_VARIABLE
 
 
-def largest_cloud_bytes(sensor: Sensor) -> int | None:
-    """Return the size of a sensor's largest cloud, from simulated packets.
+def find_largest_cloud_bytes(sensor: Sensor) -> int | None:
+    """Return the size of a sensor's largest cloud in bytes; None if the spec is incomplete.
 
-    It is the cloud of a scan at the lowest speed with single return. Returns None if the spec is
-    incomplete.
+    The size is calculated from simulated packets with one return for each firing, for the lowest
+    speed of rotation.
 
     Raises:
         LidarSpecError: if the sensor cannot be simulated.
@@ -253,7 +259,7 @@ def use_profile(memory: SharedMemory) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="lidarspec-") as folder:
         file = Path(folder, "profile.xml")
         file.write_text(make_profile(memory.segment_bytes, os.environ), encoding="utf-8")
-        name = profile_variable()
+        name = find_profile_variable()
         os.environ[name] = str(file)
         try:
             yield

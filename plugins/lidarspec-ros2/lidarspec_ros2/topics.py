@@ -57,7 +57,8 @@ class Topics:
         node: the node that publishes them.
         sensor: the opened sensor.
         played: whether a file is played; its time is published on /clock if `use_sim_time` is set.
-        max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
+        max_cloud_bytes: the largest size of a cloud that is not lost if subscribers use the
+            reliability "best effort"; None if unknown.
 
     Attributes:
         stamps: the times of messages.
@@ -98,12 +99,12 @@ class Topics:
         self.fault = ""
         self._arrival_ns = 0
         self.use_settings(settings)
-        self._publisher(CLOUD)
+        self._get_publisher(CLOUD)
         if settings["publish_packets"]:
-            self._publisher(RAW)
+            self._get_publisher(RAW)
         self._is_imu_by_clock = ImuStream(sensor, Counters()).waiting is not None
         if sensor.imu_frames:
-            self._publisher(IMU)
+            self._get_publisher(IMU)
         if settings["publish_tf"]:
             self._publish_transform(settings)
         self._clock_publisher = (
@@ -127,7 +128,7 @@ class Topics:
         """Publish a scan on the topics with subscribers."""
         selected = self._selector.select(scan)
         assert selected is not None  # nothing is selected by number or time
-        stamp = self._stamp(scan)
+        stamp = self._calculate_stamp(scan)
         settings = self._settings
         if self._has_subscribers(CLOUD):
             organised = settings["organized"] and selected.points.shape is not None
@@ -177,13 +178,13 @@ class Topics:
         for publisher in self._plain_publishers:
             self._node.destroy_publisher(publisher)
 
-    def _stamp(self, scan: Scan) -> int:
+    def _calculate_stamp(self, scan: Scan) -> int:
         """Return the time of the first point in ROS's time, ns."""
         if not scan.host_ns:  # a file without arrival times
             return int(self._node.get_clock().now().nanoseconds)
         return self.stamps.stamp_scan(scan.stamp_ns, scan.host_ns, self._settings)
 
-    def _publisher(self, kind: str) -> Any:
+    def _get_publisher(self, kind: str) -> Any:
         """Return the publisher of a kind of messages, created on first use.
 
         The topic `scan` therefore has a publisher only after the first planar scan.
@@ -220,10 +221,10 @@ class Topics:
         )
 
     def _has_subscribers(self, kind: str) -> bool:
-        return self.active and self._publisher(kind).get_subscription_count() > 0
+        return self.active and self._get_publisher(kind).get_subscription_count() > 0
 
     def _send(self, message: RosMessage) -> None:
-        publisher = self._publisher(message.kind)
+        publisher = self._get_publisher(message.kind)
         data = bytes(message.data)
         if message.kind == CLOUD:
             self._warn_of_large_cloud(len(data))

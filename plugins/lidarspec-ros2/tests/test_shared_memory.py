@@ -25,7 +25,7 @@ from lidarspec_ros2.shared_memory import (
     USER_VARIABLES,
     SharedMemory,
     choose_shared_memory,
-    largest_cloud_bytes,
+    find_largest_cloud_bytes,
     make_profile,
     use_profile,
 )
@@ -143,7 +143,9 @@ def test_the_calculated_size_is_that_of_a_message(
     scans = spec.scans(data if spec.datagrams else b"".join(data))
     scan = next(scan for scan in scans if scan.whole)
     message = RosMessages("ROS2_HUMBLE").cloud(scan, 10**18, every_point=True)
-    assert largest_cloud_bytes(spec) == pytest.approx(len(message.data) / slowest_share, rel=0.05)
+    assert find_largest_cloud_bytes(spec) == pytest.approx(
+        len(message.data) / slowest_share, rel=0.05
+    )
 
 
 @pytest.mark.parametrize(
