@@ -280,7 +280,7 @@ class Broadcast:
         target = self._seek_target
         if target is not None:
             self._seek_target = None
-            self._move(target)
+            self._reopen_at(target)
         elif self._steps:
             self._steps -= 1
             self._read(feed.step)
@@ -307,7 +307,7 @@ class Broadcast:
             if not self._has_moved:
                 raise
 
-    def _move(self, target: float) -> None:
+    def _reopen_at(self, target: float) -> None:
         """Open a file again, and show the first scan at or after a time."""
         device = self._reopen()
         self.device.close()
@@ -345,7 +345,7 @@ class Broadcast:
             self._first_scan = feed.scans[0] if feed.scans else feed.scan
         number = self._scan_count
         self.shown = ShownScan(
-            feed.scan, number, self._position(feed.scan), self._arrival(feed.scan)
+            feed.scan, number, self._find_position(feed.scan), self._find_arrival(feed.scan)
         )
         self._by_number[number] = self.shown
         self._scan_count += 1
@@ -395,9 +395,10 @@ class Broadcast:
         }
 
     def _find_clock_offset(self, clock: ClockReport) -> float | None:
-        """Return the seconds by which the sensor's clock is ahead; None if unknown.
+        """Return by how many seconds the sensor's clock is ahead of the host's clock.
 
-        If the clock has no date, the result is relative to the start of the reading.
+        If the sensor's clock has no date, the result is the change since reading began. Returns
+        None if it is unknown.
         """
         if not math.isnan(clock.error_s):
             return clock.error_s
@@ -406,15 +407,18 @@ class Broadcast:
             return None
         return clock.offset_s - samples[0].offset_s
 
-    def _arrival(self, scan: Scan) -> float:
-        """Return when a scan's last packet arrived, s since 1970; for a file, return now."""
+    def _find_arrival(self, scan: Scan) -> float:
+        """Return the arrival time of a scan's last packet, in seconds since 1970.
+
+        For a file, or if the arrival time is unknown, this is the current time.
+        """
         if self.is_live and len(scan):
             host_ns = scan.provenance(len(scan) - 1).host_ns
             if host_ns:
                 return host_ns * 1e-9
         return self.now()
 
-    def _position(self, scan: Scan) -> float:
+    def _find_position(self, scan: Scan) -> float:
         """Return the seconds from the first scan to a scan.
 
         They are computed from arrival times if the source is live, and from the times of the scans

@@ -16,18 +16,17 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
     command = sensor.commands[name]
     return {
         "name": name,
-        "group": _group(sensor, name),
+        "group": _find_group(sensor, name),
         "only_stopped": command.only_stopped,
         "text": effect(sensor, name),
-        "arguments": [_argument(sensor, name, argument) for argument in command.args],
+        "arguments": [_describe_argument(sensor, name, argument) for argument in command.args],
     }
 
 
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
-    """Return the commands that stop the data and start it again.
+    """Return the commands that stop the data and start it again; None if one is missing.
 
-    The commands for opening are preferred. Commands with arguments are ignored. Returns None if
-    there are no others.
+    Only commands without arguments are used, first those of `on_open`.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]
@@ -38,7 +37,7 @@ def find_restart(sensor: Sensor) -> dict[str, str] | None:
     return {"stop": stop, "start": start}
 
 
-def _group(sensor: Sensor, name: str) -> str:
+def _find_group(sensor: Sensor, name: str) -> str:
     """Return the group of a command: "switch", "ask" or "set".
 
     "switch" commands start or stop the data, "ask" commands read a value, and "set" commands change
@@ -52,7 +51,7 @@ def _group(sensor: Sensor, name: str) -> str:
     return "set"
 
 
-def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
+def _describe_argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
     """Return the description of the input field for an argument."""
     kind = sensor.commands[name].arguments[argument].kind
     info = argument_slot(sensor, name, argument).info

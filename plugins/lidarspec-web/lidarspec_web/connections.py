@@ -77,14 +77,14 @@ class Connections:
             self._admitted.pop(client).abort()
 
     async def close(self) -> None:
-        """Close all connections, also if a client does not read."""
+        """Close all connections at once, without sending the remaining data."""
         waiting = [connection.transport for connection in self._waiting.values()]
         for transport in [*waiting, *self._admitted.values()]:
             transport.abort()
         await asyncio.sleep(0)  # the loop closes their sockets
 
     async def watch(self) -> None:
-        """Close connections without the token after the timeout, until this is cancelled."""
+        """Close pending connections after a timeout; run until this task is cancelled."""
         while True:
             await asyncio.sleep(CHECK_PERIOD_S)
             self._close_late()

@@ -205,7 +205,7 @@ class OpenPage:
 
     def _state_message(self) -> dict[str, Any] | None:
         now = time.monotonic()
-        recording = self._recording()
+        recording = self._find_recording()
         if now < self._state_due and recording == self._sent_recording:
             return None
         self._state_due = now + STATE_PERIOD_S
@@ -219,7 +219,7 @@ class OpenPage:
         self._sent_damaged = state["damaged"]["total"]
         return state
 
-    def _recording(self) -> tuple[str, str]:
+    def _find_recording(self) -> tuple[str, str]:
         """Return the name of the file that is being recorded, and the last error."""
         switch = self._broadcast.switch
         if switch is None:
@@ -292,7 +292,13 @@ class OpenPage:
     def _reply_later(
         self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
     ) -> None:
-        """Add a slow request to the queue."""
+        """Put a slow request into the queue; the reply is sent when it has run.
+
+        Args:
+            word: the name of the request.
+            work: a function that handles the request and returns the reply.
+            command: the command of the sensor that the request concerns; "" if there is none.
+        """
         self._questions.add(PageRequest(word, command, work))
 
     def _finish(self, request: PageRequest, result: dict[str, Any] | Exception | None) -> None:
@@ -306,7 +312,7 @@ class OpenPage:
         self.notify()
 
     def _ask_for_scan(self, request: Mapping[str, Any]) -> None:
-        self._wanted_points = round(_number(request, "most", 1, MAX_POINTS))
+        self._wanted_points = round(_read_number(request, "most", 1, MAX_POINTS))
         self.notify()
 
     def _pause(self, request: Mapping[str, Any]) -> None:
@@ -333,10 +339,10 @@ class OpenPage:
         self._broadcast.step()
 
     def _seek(self, request: Mapping[str, Any]) -> None:
-        self._broadcast.seek(_number(request, "to", 0.0, MAX_NUMBER))
+        self._broadcast.seek(_read_number(request, "to", 0.0, MAX_NUMBER))
 
     def _set_speed(self, request: Mapping[str, Any]) -> None:
-        self._broadcast.play_at(_number(request, "times", 0.0, MAX_NUMBER))
+        self._broadcast.play_at(_read_number(request, "times", 0.0, MAX_NUMBER))
 
     def _watch(self, request: Mapping[str, Any]) -> None:
         self._shows_frames = request.get("frames") is True
@@ -345,27 +351,29 @@ class OpenPage:
         self.notify()
 
     def _show_frame(self, request: Mapping[str, Any]) -> None:
-        """Explain the frame of a point, a damaged frame, or a frame by its number."""
+        """Reply with the frame of a point, a damaged frame, or a frame by its number."""
         backlog = self._backlog
         point = request.get("point")
         if isinstance(point, dict):
-            scan = round(_number(point, "scan", 0, MAX_NUMBER))
-            index = round(_number(point, "index", 0, MAX_POINTS))
+            scan = round(_read_number(point, "scan", 0, MAX_NUMBER))
+            index = round(_read_number(point, "index", 0, MAX_POINTS))
             shown = next((held for held in self._held if held.number == scan), None)
-            self._reply_later("frame", lambda: self._answers.origin(shown, scan, index, backlog))
+            self._reply_later(
+                "frame", lambda: self._answers.find_origin(shown, scan, index, backlog)
+            )
         elif "damaged" in request:
-            number = round(_number(request, "damaged", 0, MAX_NUMBER))
+            number = round(_read_number(request, "damaged", 0, MAX_NUMBER))
             self._reply_later("frame", lambda: self._answers.find_damaged(number, backlog))
         else:
-            number = round(_number(request, "number", 0, MAX_NUMBER))
+            number = round(_read_number(request, "number", 0, MAX_NUMBER))
             self._reply_later("frame", lambda: self._answers.find_frame(number, backlog))
 
     def _compose(self, request: Mapping[str, Any]) -> None:
-        name, arguments = _command(request)
+        name, arguments = _read_command(request)
         self._reply_later("compose", lambda: self._answers.compose_command(name, arguments), name)
 
     def _send_command(self, request: Mapping[str, Any]) -> None:
-        name, arguments = _command(request)
+        name, arguments = _read_command(request)
         self._commands.add(
             PageRequest("send", name, lambda: self._answers.send_command(name, arguments))
         )
@@ -409,7 +417,7 @@ def describe_bug(error: Exception) -> str:
     return f"a bug in lidarspec: {type(error).__name__}: {error}"
 
 
-def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> float:
+def _read_number(request: Mapping[str, Any], name: str, low: float, high: float) -> float:
     """Return a number of a request.
 
     Raises:
@@ -421,7 +429,7 @@ def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> f
     return value
 
 
-def _command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+def _read_command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """Return the name of a command, and its non-empty arguments as text.
 
     Raises:

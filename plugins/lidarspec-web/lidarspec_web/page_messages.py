@@ -41,7 +41,7 @@ class PageMessages:
 
     def __init__(self, broadcast: Broadcast, *, control: bool) -> None:
         self.broadcast = broadcast
-        self.duration = _duration(broadcast)
+        self.duration = _find_duration(broadcast)
         self.why_no_control = _describe_no_control(broadcast, control=control)
         # Several pages show the same frame, and each lists the same damaged pieces.
         self._explain = functools.lru_cache(maxsize=KEPT_EXPLANATIONS)(self._make_explanation)
@@ -126,7 +126,7 @@ class PageMessages:
         return {
             "is": "frame",
             "number": stored.number,
-            "position": self._position(stored.at),
+            "position": self._find_position(stored.at),
             "hex": stored.data.hex(),
             "why": why,
             "value": value,
@@ -137,30 +137,30 @@ class PageMessages:
         """Return a frame by its number."""
         stored = backlog.frame(number)
         if stored is None:
-            return _discarded_reply(f"frame {number}")
+            return _make_discarded_reply(f"frame {number}")
         return self.frame(stored, "number")
 
-    def origin(
+    def find_origin(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
         """Return the frame that contained a point of a scan, with the path of its field."""
         if shown is None or index >= len(shown.scan):
-            return _discarded_reply(f"point {index} of scan {number}")
+            return _make_discarded_reply(f"point {index} of scan {number}")
         point_origin = shown.scan.provenance(index)
         stored = backlog.find_point_frame(point_origin)
         if stored is None:
-            return _discarded_reply(f"the frame of point {index}")
+            return _make_discarded_reply(f"the frame of point {index}")
         return self.frame(stored, "point", point_origin)
 
     def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
         """Return the damaged bytes with a number, and the changes that would explain them."""
         piece = backlog.find_damaged(number)
         if piece is None:
-            return _discarded_reply(f"damaged piece {number}")
+            return _make_discarded_reply(f"damaged piece {number}")
         return {
             "is": "frame",
             "number": number,
-            "position": self._position(piece.at),
+            "position": self._find_position(piece.at),
             "hex": piece.data.hex(),
             "why": "damaged",
             "value": None,
@@ -209,7 +209,7 @@ class PageMessages:
     def _make_verdict(self, piece: DamagedBytes) -> str:
         return piece.verdict(self.broadcast.device.sensor)
 
-    def _position(self, at: int) -> float | None:
+    def _find_position(self, at: int) -> float | None:
         """Return the seconds from the first scan to the arrival time `at`."""
         began_ns = self.broadcast.began_ns
         if at <= 0 or not began_ns:
@@ -222,7 +222,7 @@ class PageMessages:
         return [
             {
                 "number": piece.number,
-                "position": self._position(piece.at),
+                "position": self._find_position(piece.at),
                 "offset": piece.offset,
                 "size": piece.size,
                 "verdict": self._verdict(piece),
@@ -240,7 +240,7 @@ def list_save_formats() -> list[str]:
     return suffixes
 
 
-def _discarded_reply(what: str) -> dict[str, Any]:
+def _make_discarded_reply(what: str) -> dict[str, Any]:
     """Return the reply for data that is no longer kept."""
     return {"is": "gone", "what": what}
 
@@ -257,7 +257,7 @@ def _is_planar(shown: ShownScan | None) -> bool:
     return is_flat(points[points.valid])
 
 
-def _duration(broadcast: Broadcast) -> float | None:
+def _find_duration(broadcast: Broadcast) -> float | None:
     """Return the duration of a file in seconds; None if it cannot be found quickly."""
     if not broadcast.can_seek:
         return None

@@ -44,8 +44,8 @@ class RateLimit:
     """Calculates how long to delay messages that arrive faster than allowed.
 
     Args:
-        at_once: number of messages that are not delayed after a pause.
-        per_second: number of messages per second.
+        at_once: number of messages that a page may send at once after a pause.
+        per_second: allowed number of messages per second.
     """
 
     def __init__(self, at_once: int, per_second: float) -> None:

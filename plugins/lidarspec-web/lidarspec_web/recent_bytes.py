@@ -67,13 +67,14 @@ class DamagedBytes:
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """One frame of the backlog.
+    """A frame that a page can explain.
 
     Attributes:
-        number: number of the frame, from 0; None if the frame is only stored in its scan.
-        frame: its type.
-        at: arrival, ns since 1970; -1 if it is unknown.
-        data: its bytes.
+        number: number of the frame, from 0; None if the bytes are from a scan, not from the
+            backlog.
+        frame: the frame type.
+        at: arrival time, ns since 1970; -1 if it is unknown.
+        data: the bytes.
     """
 
     number: int | None
@@ -211,8 +212,8 @@ class RecentBytes:
     def find_point_frame(self, point_origin: PointOrigin) -> StoredFrame | None:
         """Return the frame that contained a point.
 
-        Returns None if the frame is no longer stored, and the scan does not have its original bytes
-        either.
+        If the frame is no longer stored, its bytes are taken from the scan. Returns None if the
+        frame type has a wire form, because a scan does not have the bytes of such frames.
         """
         with self._lock:
             following = bisect_right(self._results, point_origin.offset, key=lambda one: one.offset)
@@ -281,10 +282,10 @@ class RecentBytes:
                 size = int(frames.gaps[index])
                 self._keep_damaged(end, size, at, b"", is_datagram=False)
             elif self._is_stream:
-                data = self._stream_bytes(begin, end)
+                data = self._copy_stream_bytes(begin, end)
                 self._keep_damaged(begin, end - begin, at, data, is_datagram=False)
             else:
-                for offset, data in self._datagrams(begin, end):
+                for offset, data in self._iter_datagrams(begin, end):
                     self._keep_damaged(offset, len(data), at, data, is_datagram=True)
 
     def _keep_damaged(
@@ -294,7 +295,7 @@ class RecentBytes:
         self._damaged.append(DamagedBytes(self.damaged, offset, size, at, data, is_datagram))
         self.damaged += 1
 
-    def _stream_bytes(self, begin: int, end: int) -> bytes:
+    def _copy_stream_bytes(self, begin: int, end: int) -> bytes:
         """Return the stored bytes of a stream from one offset to another."""
         parts = [
             bytes(
@@ -305,7 +306,7 @@ class RecentBytes:
         ]
         return b"".join(parts)
 
-    def _datagrams(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+    def _iter_datagrams(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
         """Yield offset and bytes of each datagram that begins in a range of offsets."""
         for stored_input in self._inputs:
             offsets = stored_input.offset + np.cumsum(stored_input.sizes) - stored_input.sizes

@@ -39,7 +39,7 @@ class ScanSaver:
 
     Args:
         folder: folder of the temporary files.
-        worker: runs the writing.
+        worker: provides the thread that writes the files.
         drop: closes the connection of a client that does not read its file.
     """
 

@@ -67,10 +67,10 @@ def make_scan_message(
         ],
     }
     text = json.dumps(header).encode()
-    text += b" " * _padding(_HEADER_LENGTH.size + len(text))
+    text += b" " * _count_padding(_HEADER_LENGTH.size + len(text))
     parts: list[Any] = [_HEADER_LENGTH.pack(len(text)), text]
     for column in columns.values():
-        parts += [column, bytes(_padding(column.nbytes))]
+        parts += [column, bytes(_count_padding(column.nbytes))]
     return b"".join(parts)
 
 
@@ -80,13 +80,13 @@ def thin_out(indices: NDArray[np.intp], max_points: int) -> NDArray[np.intp]:
     return indices[fractions < max_points / len(indices)][:max_points]
 
 
-def _padding(size: int) -> int:
+def _count_padding(size: int) -> int:
     """Return the number of padding bytes after a part of this size."""
     return -size % ALIGNMENT_BYTES
 
 
 def _take_columns(points: PointCloud, indices: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    """Return the columns of some points, little-endian, and their indices as `index`."""
+    """Return the little-endian columns of some points, and a column `index`."""
     columns: dict[str, NDArray[Any]] = {}
     for name in COLUMNS:
         column = getattr(points, name)

@@ -53,7 +53,7 @@ class PageSite:
         host: address to listen on.
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
-        page: the folder with the files of the page; by default the built one.
+        page: the folder with the files of the page; by default the folder in this package.
         report: called with a line for each page that is opened or closed.
 
     Attributes:
@@ -85,7 +85,7 @@ class PageSite:
         self._saves = ScanSaver(self._folder, self._workers.saves, self._connections.drop)
         self._socket = _listen(host, port)
         self._token = make_token()
-        name = _link_host(host)
+        name = _find_link_host(host)
         port = self._socket.getsockname()[1]
         self.link = f"http://{name}:{port}/?token={self._token}"
         guard = Guard(
@@ -129,10 +129,10 @@ class PageSite:
         )
 
     def opening_page(self) -> str:
-        """Return the URL of a file that leads to the link, to start a browser with.
+        """Write a file that redirects a browser to the link, and return the file's URL.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the file cannot be written.
         """
         return write_opening_page(self._folder.path, self.link).as_uri()
 
@@ -212,7 +212,7 @@ class PageSite:
         return self._saves.response(shown, suffix)
 
 
-def _link_host(host: str) -> str:
+def _find_link_host(host: str) -> str:
     """Return the host in the link to a server that listens on an address."""
     if host in ANY_ADDRESS:
         return socket.gethostname()

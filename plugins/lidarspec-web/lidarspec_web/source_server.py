@@ -29,7 +29,7 @@ class SourceServer:
         port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         report: called with a line for each page that is opened or closed.
-        page: the folder with the files of the page; by default the built one.
+        page: the folder with the files of the page; by default the folder in this package.
         folder: the folder for recordings of pages; by default the working directory.
 
     Raises:
@@ -96,10 +96,10 @@ class SourceServer:
         return self.switch.trouble
 
     def opening_page(self) -> str:
-        """Return the URL of a file that redirects to the link, for starting a browser.
+        """Write a file that redirects a browser to the link, and return the file's URL.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the file cannot be written.
         """
         return self.site.opening_page()
 
