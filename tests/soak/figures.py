@@ -193,7 +193,7 @@ def delay(share: float) -> Figure:
             for found in decoder.feed(data[spot : spot + 1]):
                 worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
     return Figure(
-        f"at most {worst_share:.2f} times the bytes of a longest frame must follow",
+        f"at most {worst_share:.2f} times the length of the longest frame, in bytes",
         worst_share < 1,
     )
 
@@ -315,7 +315,7 @@ def slowest(share: float) -> Figure:
     fat = max(held, key=lambda name: held[name])
     words = (
         f"{len(rates)} hostile streams: at least {rates[slow]:.2g} times as fast as the line"
-        f" ({slow}), at most {held[fat]:.0f} bytes kept for each byte ({fat})"
+        f" ({slow}), at most {held[fat]:.0f} bytes of memory for each byte ({fat})"
     )
     return Figure(words, rates[slow] >= 10 and held[fat] < 64)
 

@@ -65,7 +65,7 @@ EVERY = (
     ),
     Promise(
         "P6",
-        "to return a frame, fewer bytes must follow it than a longest frame has",
+        "the delay until a frame is returned is shorter than the longest frame",
         (LIMITS,),
         "",
         figures.delay,
@@ -148,7 +148,7 @@ EVERY = (
     Promise("P19", "a scan always ends", (SCANS,), "", figures.measure_blocked_rotors),
     Promise(
         "P20",
-        "decoding is 10 times as fast as the line, and keeps less than 64 bytes for each byte",
+        "decoding is 10 times as fast as the line, and needs less than 64 bytes for each byte",
         (RULE,),
         "",
         figures.slowest,
