@@ -43,7 +43,7 @@ LS102 the field name is reserved | `f.state` and `column.on` have another meanin
 LS103 the field name is not a public identifier | == ignores names that begin with _ | choose an identifier without a leading _
 LS104 two fields have the same name | the last one replaces the others | number the names: reserved_1, reserved_2
 LS105 the field has no name | its bytes are lost when a parsed frame is built again | declare "reserved" / Bytes(n)
-LS106 a part loses bytes | they are missing when a parsed frame is built again
+LS106 bytes of a part are lost | a parsed frame that is built again has other bytes
       | end the part with "rest" / GreedyBytes, or make it a named member of a Struct
 LS107 Flag is used for a whole byte | seven of its bits are lost when a parsed frame is built again | declare all eight bits in a BitStruct
 LS108 the struct contains FlagsEnum | bits without a name are lost when a parsed frame is built again | use a BitStruct
@@ -56,7 +56,7 @@ LS113 the struct contains Select or Optional | damaged bytes would select anothe
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
 LS115 an expression of the struct fails | it raises an undocumented exception | make it valid for every header
 LS116 the frame is not compiled | construct parses it, hundreds of times slower | declare fields whose offsets follow from the header
-LS117 a code is compared with its number | construct compares its name, so the condition never changes | compare with the name
+LS117 the number of a named value is compared | construct compares the name, so the result is always the same | compare with the name
 LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"); "" is a pure number
 LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section"
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame
@@ -65,12 +65,12 @@ LS205 the checksum does not cover a field | a flipped bit in the field is not de
 LS206 noise may be accepted as this frame | it becomes false points | declare plausible= or confirm=
 LS207 `plausible` does not test columns | an expression of construct is always true | use plausible=lambda f: f.angle < 360
 LS208 `points` cannot be compiled | it runs as ordinary NumPy, ten times slower | use ufuncs and functions of lidarspec.spec
-LS209 an acknowledgement has no finding or no reason | it would hide the next such finding | remove it, or give a reason
+LS209 an acknowledgement matches no finding, or has no reason | it would hide the next such finding | remove it, or give a reason
 LS210 the field cannot hold the range limit | the scale or the limit is wrong | compare both with the manual
 LS211 the declaration is incomplete | lidarspec cannot open, decode or detect the sensor | declare vendor, model, a data frame and a data link
 LS212 the checksum is not verified | damaged frames are accepted
       | use Checksummed (`lidarspec crc` finds the algorithm), or "crc" / Int16ul * "not checked: ..."
-LS213 a column is used as a condition of Python | a column has one truth value for each packet
+LS213 a column is used with if, and, or, or not | a column has one truth value for each packet
       | use & | ~ and np.where: (f.a < 1) & (f.b < 2)
 LS214 columns have different shapes | a point needs one value of each
       | give one value for each point or packet; name the axis of an array with along(...)
@@ -85,9 +85,9 @@ LS301 no example can be generated | the frame cannot be tested
       | declare Simulation(sweep=...), or strategies = {"frame.field": ...} in the test class
 LS302 parsing and building change the bytes | a replayed or edited frame differs | use fields that keep every bit
 LS303 a value is truncated, not rounded | int() loses a step if the float is slightly too small | use Scaled or round()
-LS304 building from values in units changes the bytes | the values cannot be written back | use Scaled with the correct scale and offset
+LS304 building from physical values changes the bytes | the values cannot be written back | use Scaled with the correct scale and offset
 LS305 a field does not keep a written value | the value read differs from the value set | use the width and sign of the wire
-LS306 a frame is parsed as another type | its fields get another meaning | declare constants that differ, or another order
+LS306 a frame is parsed as another type | its fields get another meaning | declare different constants, or frames in another order
 LS307 a truncated frame is accepted | missing values are invented | declare the length of every field
 LS308 an undocumented exception is raised | callers catch LidarSpecError only | make lambdas valid for all values
 LS310 the checksum misses a flipped bit | damaged frames are accepted | use a checksum that depends on every byte
@@ -95,7 +95,7 @@ LS311 examples are not repeatable or too long | a failure cannot be reproduced |
 LS312 a field that `Rebuild` fills in is not checked | a frame with another value is accepted, and built differently
       | compare it in `plausible`: f.length == f.size + 5
 LS401 a clean stream loses bytes | valid frames are lost without any damage | declare all parts of the frames
-LS404 scans depend on the split into packets | the same revolution is cut elsewhere | keep no state in `points`
+LS404 scans depend on the size of batches | the same revolution is cut at another place | keep no state in `points`
 LS414 a function of the plugin raises an error | its packets are counted, but lost | make it valid for every valid frame
 LS415 the same bytes give different results | results cannot be reproduced | use the fields only
 LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians; 0 is no return
@@ -114,7 +114,7 @@ LS511 points turn the other way | left and right are exchanged, or vendor_axes d
       | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds
-LS601 a command does not parse back | the sensor receives another command | use paths of its frame in values and args
+LS601 parsing a command returns other values | the sensor receives another command | use paths of its frame in values and args
 LS602 an argument is not limited to its range | the sensor receives invalid requests
       | declare args={name: (path, lowest, highest)}
 LS603 a reply cannot match | the command waits until its timeout | use fields of the reply in matches= and echoes=
@@ -141,7 +141,7 @@ LS713 a vector exceeds the range limits | its byte order, its scale or the limit
 LS801 an exception is ignored without a message | errors are neither reported nor counted | remove the try
 LS802 the wall clock is used | it jumps, and two runs differ | use the sensor's clock
 LS803 a partial write is ignored | the rest of a command is never sent | use sendall
-LS804 an expression with `this` is used as a condition of Python | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
+LS804 an expression with `this` is used with if, and, or, or not | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
 LS805 hasattr(this, ...) is used | it is always true | test a header field
 """
 RULES = {
