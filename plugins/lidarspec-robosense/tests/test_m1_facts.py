@@ -96,7 +96,7 @@ def test_the_load_of_the_network() -> None:
         "mask 255.255.255.0",
         "about 61 Mbit/s with single returns and twice as much with dual returns",
         "6 300 and 12 600 packets a second",
-        "the guide prints at least 58.2 and 116.4 Mbit/s",
+        "The guide prints at least 58.2 and 116.4 Mbit/s",
         "Clocks are synchronised by GPS (PPS), PTP or gPTP.",
     ],
 )
