@@ -184,7 +184,7 @@ class Sensor(SensorDescription):
         from lidarspec.framing.decoder import decode_all, is_stream
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        return [found for frames in decode_all(decoder, data) for found in frames.found()]
+        return [found for frames in decode_all(decoder, data) for found in frames.to_found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """Return the data frames, or the frames of another type, as columns.

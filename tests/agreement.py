@@ -93,7 +93,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     judges = sensor, by_construct(sensor)
     decoders = [judge.decoder(stream=is_stream(data)) for judge in judges]
     found = [decode_all(decoder, data) for decoder in decoders]
-    split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
+    split = [cuts(frame for frames in each for frame in frames.to_found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
         ours, theirs = (

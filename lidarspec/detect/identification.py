@@ -368,7 +368,7 @@ def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]
     """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
-    axis, _, rest = fields.within(path) or ("", "", path)
+    axis, _, rest = fields.split_part_path(path) or ("", "", path)
     if axis:
         parts = [part for part in _get_nested(parsed, axis) if rest.partition(".")[0] in part]
     else:
@@ -557,7 +557,7 @@ def _score(
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)
     # Decode all chunks in one call: one call per chunk takes ten times as long.
     if datagrams:
-        items = decoder.datagrams(chunks).found()
+        items = decoder.datagrams(chunks).to_found()
     else:
         items = decoder.feed(b"".join(chunks))
     items += decoder.finish()

@@ -592,7 +592,7 @@ class Device(ClosingContext):
         if self._is_checked or batch is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
             return batch
         for frames in batch.frames:
-            self._first_frames += frames.select(slice(0, _MAX_CHECKED_FRAMES)).found()
+            self._first_frames += frames.select(slice(0, _MAX_CHECKED_FRAMES)).to_found()
         return batch
 
     def _check_first_frames(self) -> list[str]:

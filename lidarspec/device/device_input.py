@@ -89,7 +89,7 @@ class DeviceInput(Protocol):
         rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
         if fact.where is not None:
             rows = rows[find_reporting(self.sensor, fact, name, frames.select(rows))]
-        for item in frames.select(rows[-1:]).found():
+        for item in frames.select(rows[-1:]).to_found():
             if not self._lacks_values(role, item):
                 self.info_frames = {**self.info_frames, role: item}
 
@@ -278,7 +278,7 @@ def select_frames(batches: Sequence[Frames], names: frozenset[str]) -> list[Foun
     selected = []
     for frames in batches:
         kinds = [index for index, name in enumerate(frames.names) if name in names]
-        selected += frames.select(np.isin(frames.kinds, kinds)).found()
+        selected += frames.select(np.isin(frames.kinds, kinds)).to_found()
     return selected
 
 

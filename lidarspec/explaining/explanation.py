@@ -284,7 +284,7 @@ def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]
     """
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
-    location = make_schema(frame.tree).within(path) if path else None
+    location = make_schema(frame.tree).split_part_path(path) if path else None
     if location is None:
         return []
     axis, kind_name, _ = location
@@ -292,7 +292,7 @@ def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]
     examined = examine(frame.tree, struct, frame.max_struct_bytes)
     node = make_schema(frame.tree).parts[axis]
     kind = next(kind for kind in node.kinds if kind.name == kind_name)
-    return [part.prefix for part in examined.parts_of(axis) if part.root is kind.root]
+    return [part.prefix for part in examined.list_parts_of(axis) if part.root is kind.root]
 
 
 def _find_point_numbers(

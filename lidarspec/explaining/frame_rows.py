@@ -16,7 +16,7 @@ from lidarspec.frames.plain import plain_fields
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
-from lidarspec.frames.wire_table import bit_text, format_hex
+from lidarspec.frames.wire_table import format_bits, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
 
@@ -190,7 +190,7 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
         info.unit,
         None if info.kind == "float" else _count_digits(info.scale, info.offset),
         info.labels.get(field.raw, "") if isinstance(field.raw, int) else "",
-        "" if field.bits is None else bit_text(field.bits),
+        "" if field.bits is None else format_bits(field.bits),
         info.docs,
         field.start,
         b"\xff" * size if field.bits is None else field.bits.masks(size),

@@ -17,7 +17,7 @@ from lidarspec.explaining.damage_search import find_changes
 from lidarspec.explaining.explanation import Explanation, explain
 from lidarspec.explaining.formatting import ExplainedRow
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.parse import identify, layout_of
+from lidarspec.frames.parse import find_frame_layout, identify
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Sensor
@@ -271,7 +271,7 @@ def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int
     size = frame_coder(sensor.frames[name]).find_size(data[start:])
     if size is not None:
         return start + size
-    layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
+    layout = find_frame_layout(sensor, name, data[start : start + sensor.frames[name].max_length])
     if not isinstance(layout, Layout):
         return following[0]
     whole = start + layout.size

@@ -19,10 +19,10 @@ from lidarspec.exports import ExportedFrame, list_frames
 from lidarspec.frames.wire_table import (
     INDICES,
     SizeFormula,
-    bit_text,
     describe_end,
     describe_field,
     extent,
+    format_bits,
     format_formula,
     frame_size,
     list_branches,
@@ -223,7 +223,7 @@ class _ItemBuilder:
             detail = unit_text(part.info)
         else:
             detail = numbers
-        return self._make_cell(part.info, name, width, detail, bit_text(part.bits), start)
+        return self._make_cell(part.info, name, width, detail, format_bits(part.bits), start)
 
     def _make_cell(
         self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: SizeFormula

@@ -68,10 +68,11 @@ class Batch:
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
             the last frame before each packet; -1 for a packet before the first frame.
         defaults: the declared defaults of state columns, by frame type and path.
-        carry: values from the previous batch, for each call of `previous` or `last`, by the number
-            of the call.
+        carry: for each call of `previous` or `last`, by its number, the values from the previous
+            batch.
         nominal: whether a declared default of a state column was used.
-        left: for each such call, a function that returns the values for the next batch.
+        left: for each call of `previous` or `last`, a function that returns the values for the next
+            batch.
     """
 
     table: Table
@@ -104,9 +105,9 @@ class Column(NDArrayOperatorsMixin):
     Attributes:
         array: the numbers, (n or 1, ...), with one axis for each level of arrays in the struct. The
             axis of an array that does not contain the field has length 1.
-        axes: the names of the axes after the first; None for an axis of length 1. If no field has
-            this axis, a "?" marks the name: it follows a name that was given by `along`, and
-            precedes a name that was guessed for a plain array.
+        axes: the names of the axes after the first; None for an axis of length 1. A name with "?"
+            is not the axis of a field: "name?" was given by `along`, "?name" was guessed for a
+            plain array.
         ready: the number of packets at the start of the batch with values that do not depend on
             later packets.
         source: the path of the field, if the column is an unchanged field, else "".
@@ -201,11 +202,11 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """Return the same values on other axes, which are named after arrays of the frame.
 
-        The column's own axes become the last of the named axes. Elements beyond the end of the
-        column are nan, for example in frames that lack the field.
+        The arrays of the column become the last of the named arrays. If a named array is longer
+        than the column, the missing elements are nan.
 
         Raises:
-            SpecError: for fewer axes than the column has, or an unknown array.
+            SpecError: if the column has more axes than are named, or if an array is unknown.
         """
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
@@ -270,12 +271,14 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return the rows of a table that the values select.
+        """For each value of the column, return the row of a table with this number.
 
-        The result has one more axis: the axis of the array in the frame that has k elements.
+        The result has one more axis, for the k numbers of a row: the axis of the array in the frame
+        that has k elements.
 
         Args:
-            table: (m + 1, k); the last row contains nan, and is used for indices out of range.
+            table: (m + 1, k); the rows for the values from 0 to m - 1, and a row of nan for all
+                other values.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -391,7 +394,11 @@ class FlatColumn:
         self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
 
     def unflatten(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return k values in stream order in the column's shape, padded with nan."""
+        """Return values in the shape of the column, padded with nan.
+
+        Args:
+            values: (k,) in stream order.
+        """
         if self._mask is None:
             return values.reshape(self._shape)
         full = np.full(self._mask.shape, np.nan)
@@ -489,10 +496,10 @@ def align(
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Cut each axis of arrays to its shortest length, so that they broadcast.
+    """Cut each axis of the arrays to its shortest length, so that they broadcast.
 
-    This is needed if there are no packets. An array of variable length is empty in that case, but a
-    plugin's table for the array is not. Axes of length 1 are not changed.
+    Without packets, a column of variable length is empty, but a table of the plugin for this column
+    is not. Axes of length 1 are not changed.
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
@@ -637,12 +644,14 @@ def align_points(
     """Align the coordinates and other columns that `points` returns.
 
     Returns:
-        The arrays, the names of their axes, the smallest `ready` of the columns, and the common
-        shape of the arrays, (n, ...).
+        The arrays, the names of their axes, the smallest `ready` of the columns (see `Column`), and
+        the common shape
+        of the arrays, (n, ...).
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
-            or if a plain array is along an axis that no field has.
+            or if plain arrays
+        vary along an axis, but no field does.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
@@ -672,8 +681,11 @@ def align_points(
 def _find_extent(table: Table, axis: str, length: int) -> int:
     """Return the length to use for values along an array.
 
-    It is `length`, unless an array that contains this array is empty in some frame. In this case,
-    it is at most the maximum length of this array in the frames.
+    This is `length`. If outer arrays are empty in some frame, it is at most the maximum length of
+    the array.
+
+    Args:
+        axis: the path of the array.
     """
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
@@ -762,11 +774,12 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
 def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
-    """Return at most `size` values before `end`, without values before the last loss.
+    """Return the last values before index `end`, without a loss between them.
 
     Args:
         values: the values in stream order.
-        edges: the indices of the values that follow a loss.
+        edges: the indices of the first values after losses.
+        size: the maximum number of values to return.
     """
     if end == 0 or size == 0:
         return np.empty(0)
@@ -810,7 +823,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
     if raw:
         array = table.raw(info.path)
     else:
-        array = physical(info, table)
+        array = load_physical(info, table)
     places = [table.schema.array_depths[axis] for axis in info.axes]
     if places and places[-1] >= len(places):  # an element of an array with nested arrays
         lengths = dict(zip(places, array.shape[1:], strict=True))
@@ -831,7 +844,7 @@ def _name_axis(name: str, length: int, table: Table, *, known: bool) -> str | No
     return None
 
 
-def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
+def load_physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     """Return a field in its unit, float64, (n, *lengths); nan if a frame lacks the field."""
     array = table.raw(info.path)
     if array.dtype == object:
@@ -901,13 +914,17 @@ class Fields:
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
     @property
-    def _is_other_type(self) -> bool:
-        """Whether the fields belong to another frame type."""
+    def _is_of_other_frames(self) -> bool:
+        """Whether the fields belong to frames other than the packets."""
         return bool(self._frame)
 
 
 def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
-    """Return the field paths of a batch, or of another frame type in its state."""
+    """Return the paths of the fields of one frame type.
+
+    Args:
+        frame: the name of a frame type in `batch.state`; "" for the type of the packets.
+    """
     if not frame:
         return batch.table.schema.columns
     table, _ = batch.state[frame]

@@ -107,10 +107,10 @@ class Node:
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """A pair for each argument, which shows how to read its value.
+        """A pair for each argument.
 
-        The pair is (True, the lengths of missing axes) for a node, and (False, the array) for a
-        constant.
+        For a node, it is True and the lengths of the axes that the node lacks. For a constant, it
+        is False and the constant as an array.
         """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
@@ -163,7 +163,9 @@ class Trace:
     ) -> TracedColumn:
         """Add a node, and return it as a traced column.
 
-        If the field was read before, the earlier node is returned.
+        Args:
+            path: the path of the field, if the node reads a field. If the trace already has a node
+                for this path, that node is returned.
         """
         if path in self._read:
             return TracedColumn(self._read[path], self)
@@ -234,7 +236,7 @@ class TracedColumn(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Any:
         """Record `Column.on`.
 
-        Returns nan if frames of this layout lack the column's array.
+        Returns nan if the sample packets have no elements of the column's array.
         """
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
@@ -264,7 +266,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return `Column.steps` of the sample packets, and record the number of indices."""
+        """Return `Column.steps` for the sample packets, and record its length."""
         indices = self.node.sample.steps()
         self._tape.steps.append((self.node, len(indices)))
         return indices
@@ -342,7 +344,7 @@ class TracedFields:
         if not value.frame:
             _check_raw(value.batch.table.schema, without_indices(path)[0])
         return self._tape.add(
-            "state" if self._real._is_other_type else "field", read, (), value, path
+            "state" if self._real._is_of_other_frames else "field", read, (), value, path
         )
 
     def __getitem__(self, index: Any) -> TracedFields:
@@ -656,7 +658,7 @@ def header_function(
 
 
 def split_condition(node: Node) -> Iterator[Node]:
-    """Yield the operands of a condition that combines conditions by "and"."""
+    """Split a condition at its "and" operators, and yield the operands."""
     both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
     if both and all(
         isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args
@@ -771,14 +773,17 @@ def split_sum(value: Any, width: int) -> list[Term]:
 def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """Multiply the terms of a sum by a factor.
 
-    If a term with a value for each point would be multiplied by a row of numbers, the whole product
-    is returned as one term.
+    Args:
+        value: the product of the sum and the factor. It is the only term of the result if the
+            factor is a row of numbers and a term of the sum has a value for each point.
+        parts: the terms of the sum.
+        factor: a number, or a row of numbers that all packets share.
     """
     if np.ndim(factor) and any(part.full is not None for part in parts):
         return [Term(np.ones(()), full=value)]
     return [part.times(factor) for part in parts]
 
 
-def last_axis(shape: tuple[int, ...]) -> int:
+def count_used_axes(shape: tuple[int, ...]) -> int:
     """Return the number of axes up to the last axis with a length above 1."""
     return max((index + 1 for index, length in enumerate(shape) if length > 1), default=0)

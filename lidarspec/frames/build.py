@@ -148,7 +148,7 @@ class _ValueChecker:
             for index, element in enumerate(value):
                 elements.append(self.check(element, path, f"{shown}[{index}]"))
             if info is not None and info.kind == "bytes":
-                return self._bytes(elements, shown)
+                return self._to_bytes(elements, shown)
             return elements
         if info is None or value is None:
             return value
@@ -167,8 +167,12 @@ class _ValueChecker:
             checked[name] = self.check(element, below, f"{shown}.{name}" if shown else name)
         return checked
 
-    def _bytes(self, numbers: list[Any], shown: str) -> bytes | list[Any]:
-        """Return numbers as a byte string; arrays of other values are returned unchanged."""
+    def _to_bytes(self, numbers: list[Any], shown: str) -> bytes | list[Any]:
+        """Return a list of numbers as bytes; return a list of other values unchanged.
+
+        Raises:
+            UsageError: for a number that is not an integer from 0 to 255.
+        """
         if not any(isinstance(part, int | str) for part in numbers):
             return numbers
         try:

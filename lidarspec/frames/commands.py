@@ -72,12 +72,12 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         if argument not in arguments:
             raise MissingField(argument, place=place)
         if declared.path in command.templates:
-            raw_argument(slot, declared.kind, arguments[argument], argument, place)
+            to_raw_argument(slot, declared.kind, arguments[argument], argument, place)
             continue
         values = put_value(
             values,
             split_path(declared.path),
-            raw_argument(slot, declared.kind, arguments[argument], argument, place),
+            to_raw_argument(slot, declared.kind, arguments[argument], argument, place),
         )
     for path, template in command.templates.items():
         text = _fill_template(template, arguments, place)
@@ -222,8 +222,8 @@ def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> A
     )
 
 
-def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, place: str) -> Any:
-    """Return the raw value of a field for the value of an argument.
+def to_raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, place: str) -> Any:
+    """Convert the value of an argument to the raw value of its field.
 
     Raises:
         UsageError: for a value that the argument does not accept.
@@ -306,4 +306,4 @@ def _resolve_filled(
     slot = _make_slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
         return _to_raw_value(slot, bytes(slot.length or 4))
-    return raw_argument(slot, value, given, path, f"{sensor.id} {name}")
+    return to_raw_argument(slot, value, given, path, f"{sensor.id} {name}")

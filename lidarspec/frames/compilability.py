@@ -72,9 +72,13 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
-    """Raise `NotCompilableError` if a part of measured size has the name of a different field.
+    """Check the names in alternatives that contain a part of measured size.
 
-    `build` measures the part before it knows which alternative the frame has.
+    `build` measures such a part before it selects an alternative. Therefore, a different field in
+    another alternative must not have the same name.
+
+    Raises:
+        NotCompilableError: if a different field has the same name.
     """
     alternatives = tree.children(node)
     for alternative in alternatives:

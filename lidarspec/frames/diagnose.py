@@ -166,9 +166,9 @@ def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
     yield from _iter_length_faults(examined, layout, row)
     yield from _iter_condition_faults(examined, layout, row)
     for axis in layout.regions:
-        for part in examined.parts_of(axis):
+        for part in examined.list_parts_of(axis):
             yield from _iter_layout_faults(part)
-        broken = examined.broken_part(axis)
+        broken = examined.find_broken_part(axis)
         if broken is not None:
             yield _describe_misfit(broken)
 
@@ -278,7 +278,7 @@ def _find_open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
     if isinstance(examined.known, HeaderWalk):
         for axis, region in examined.known.open_regions.items():
             if axis not in examined.known.regions and region.start <= len(examined.data):
-                return examined.broken_part(axis)
+                return examined.find_broken_part(axis)
     return None
 
 

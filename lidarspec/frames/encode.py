@@ -26,7 +26,7 @@ from lidarspec.frames.layout import Layout, Leaf, Seal
 from lidarspec.frames.layout_tree import TooLongError, find_kinds
 from lidarspec.frames.measured_size import FOUND, MeasuredSize
 from lidarspec.frames.parts import LayoutLookup
-from lidarspec.frames.schema import Schema, counting_field, make_schema
+from lidarspec.frames.schema import Schema, find_count_field, make_schema
 from lidarspec.spec.enum_values import find_code
 from lidarspec.spec.syntax import WireNaN, get_member
 from lidarspec.spec.tree import (
@@ -129,10 +129,10 @@ class _Encoder:
         return row.tobytes()
 
     def _measure_texts(self) -> None:
-        """Find the sizes of the texts that a mark ends.
+        """Find the sizes of the texts that end at a mark.
 
         Raises:
-            UsageError: for a value that is not a text, or that contains its own mark.
+            UsageError: for a value that is not bytes, or that contains the end mark.
         """
         for path, ending in self._schema.endings.items():
             info = self._schema.fields[path]
@@ -267,7 +267,7 @@ class _Encoder:
             case Block():
                 self._collect_block(node, value, path, shown)
             case Number() | Blob() if path and node.name:
-                self._add(node.info, path, shown, value, layout.leaves[path].size)
+                self._add_value(node.info, path, shown, value, layout.leaves[path].size)
 
     def _collect_struct(self, node: Struct, value: Any, shown: str, layout: Layout) -> None:
         if value is None:
@@ -319,7 +319,7 @@ class _Encoder:
                     found = None if found is None else found.get(key)
             if part.bits.flag and found is not None:
                 found = int(bool(found))
-            self._add(part.info, names, below, found, 0)
+            self._add_value(part.info, names, below, found, 0)
 
     def _get_element(self, array: Any, index: int, shown: str) -> Any:
         """Return an element of an array in a bit block."""
@@ -331,10 +331,11 @@ class _Encoder:
             raise MissingField(shown, place=self._place)
         return array[index]
 
-    def _add(self, info: FieldInfo, path: str, shown: str, value: Any, size: int) -> None:
-        """Add one value to the column of its field.
+    def _add_value(self, info: FieldInfo, path: str, shown: str, value: Any, size: int) -> None:
+        """Add one value to the values of its field.
 
         Args:
+            shown: the path for error messages.
             size: the size of a field of bytes, in bytes.
         """
         column = self._columns.setdefault(path, [])
@@ -355,11 +356,11 @@ class _Encoder:
         if info.adapter is not None:
             value = self._encode_adapted(info.adapter, shown, value, size)
         if info.kind == "bytes":
-            column.append(self._bytes(shown, value, size))
+            column.append(self._to_bytes(shown, value, size))
         elif info.kind == "float":
-            column.append(self._float(shown, value))
+            column.append(self._to_float(shown, value))
         else:
-            column.append(self._integer(info, shown, value))
+            column.append(self._to_integer(info, shown, value))
 
     def _encode_adapted(self, adapter: Adapter, shown: str, value: Any, size: int) -> Any:
         try:
@@ -372,7 +373,7 @@ class _Encoder:
                 f"{self._place}: {shown}: {value!r:.60} cannot be encoded: {reason}"
             ) from None
 
-    def _bytes(self, shown: str, value: Any, size: int) -> bytes:
+    def _to_bytes(self, shown: str, value: Any, size: int) -> bytes:
         if isinstance(value, int) and 0 <= value < 1 << 8 * size:
             value = value.to_bytes(size, "big")
         if not isinstance(value, bytes | bytearray):
@@ -381,12 +382,12 @@ class _Encoder:
             raise UsageError(f"{self._place}: {shown}: expected {size} bytes, got {len(value)}")
         return bytes(value)
 
-    def _float(self, shown: str, value: Any) -> float:
+    def _to_float(self, shown: str, value: Any) -> float:
         if not isinstance(value, int | float):
             raise self._make_value_error(shown, "a number", value)
         return value
 
-    def _integer(self, info: FieldInfo, shown: str, value: Any) -> int:
+    def _to_integer(self, info: FieldInfo, shown: str, value: Any) -> int:
         raw = value if info.adapter is not None else to_raw(info, value)
         if not isinstance(raw, int):
             if info.labels and isinstance(raw, str):
@@ -440,7 +441,11 @@ class _Encoder:
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
     ) -> None:
-        """Raise `UsageError` if parts contradict the header, or if a condition is false."""
+        """Check that the parts agree with the header, and that all conditions are true.
+
+        Raises:
+            UsageError: if the check fails.
+        """
         for axis, region in layout.regions.items():
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
@@ -523,7 +528,7 @@ def fill_counts(given: Container, table: Schema) -> None:
 
 def remove_held(formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]) -> None:
     """Remove the field that a formula depends on, if this field is always computed."""
-    path = None if formula is None else counting_field(formula, fields)
+    path = None if formula is None else find_count_field(formula, fields)
     if path is not None and fields[path].held:
         holder, name = _find_holder(given, path)
         holder.pop(name, None)
@@ -546,7 +551,7 @@ def fill_in(
     """
     if formula is None:
         return
-    path = counting_field(formula, fields)
+    path = find_count_field(formula, fields)
     if path is None:
         return
     holder, name = _find_holder(given, path)
@@ -575,9 +580,19 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Return the value of a count field with which a formula is equal to a length.
+    """Return the value of a count field for which a formula results in a given length.
 
-    To find this value, the field is set to one value after another.
+    The function tries one value after another.
+
+    Args:
+        count: the formula.
+        holder: the mapping with the count field, which is updated.
+        field: the name of the field in `holder`.
+        length: the result that the formula must have.
+        axis: the path of the array, for the error message.
+
+    Raises:
+        UsageError: if no value results in the length.
     """
     if info.kind == "int":
         top = int(info.limits[1])

@@ -76,7 +76,7 @@ class LayoutRows:
 
     Attributes:
         layout: the layout of the frames.
-        where: the indices of the frames in the table, (k,).
+        where: the indices of the frames in the table that contains them, (k,).
         rows: the bytes of the frames, one frame per row, (k, layout.size).
     """
 
@@ -167,7 +167,7 @@ class CompiledTable:
     def counts(self, axis: str) -> NDArray[np.intp]:
         sequence = self.schema.find_sequence(axis)
         if sequence is not None:
-            return self._counts_of_elements(sequence, axis)
+            return self._count_elements(sequence, axis)
         counts = np.zeros(len(self), np.intp)
         for group in self.groups:
             counts[group.where] = group.layout.lengths.get(axis, 0)
@@ -242,11 +242,12 @@ class CompiledTable:
         column[whole] = True
         return column
 
-    def _counts_of_elements(self, axis: str, path: str) -> NDArray[np.intp]:
+    def _count_elements(self, axis: str, path: str) -> NDArray[np.intp]:
         """Return the length of an array in each frame, (n,).
 
-        `axis` is an array of elements that differ in size. `path` is this array, or an array in its
-        elements.
+        Args:
+            axis: the path of an array of elements that differ in size.
+            path: the path of the same array, or of an array in its elements.
         """
         elements = self._elements(axis)
         if path == axis:
@@ -413,7 +414,8 @@ def _group_by_layout(
     """Group parts by layout.
 
     Args:
-        ranks: for each piece, the indices of its parts in the table of parts.
+        pieces: the parts that the search has found.
+        ranks: for each piece, the indices of its parts in the table of all parts.
     """
     members: dict[int, dict[int, list[tuple[_PartRows, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
@@ -427,7 +429,12 @@ def _group_by_layout(
 
 
 def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
-    """Return parts that have one layout and one buffer as a group, in stream order."""
+    """Return parts in stream order as `LayoutRows`.
+
+    Args:
+        parts: parts that have one layout and one buffer, and the indices of these parts in the
+            table.
+    """
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])
     first, _ = parts[0]

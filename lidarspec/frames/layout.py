@@ -276,10 +276,11 @@ class Leaf:
     def _read_contiguous_bits(
         self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]
     ) -> NDArray[Any] | None:
-        """Return the values of contiguous bits, each read as one word.
+        """Return the values of contiguous bits.
 
-        Each word ends with the last byte of the value. Returns None if the bits are not contiguous,
-        if they do not fit into a word, or if the word would begin before the frame.
+        Each value is read as one word, which ends with the last byte of the value. Returns None if
+        the bits are not contiguous, if the value does not fit into a word, or if the word would
+        begin before the frame.
         """
         if element.run is None:
             return None
@@ -449,13 +450,13 @@ class Seal:
         for leaf in self.leaves:
             values = leaf.load(rows).astype(np.uint64)
             if leaf.info.kind == "bytes":
-                values = np.bitwise_or.reduce(values << self._byte_shifts(leaf), axis=1)
+                values = np.bitwise_or.reduce(values << self._list_byte_shifts(leaf), axis=1)
             total |= values << np.uint64(shift)
             shift += leaf.info.bits
         return total
 
-    def _byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """Return the number of bits by which each byte of a field is shifted, (k,)."""
+    def _list_byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
+        """Return for each byte of a field the position of its lowest bit in the value."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
@@ -480,7 +481,7 @@ class Seal:
         for leaf in self.leaves:
             part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
             if leaf.info.kind == "bytes":
-                part = part[:, None] >> self._byte_shifts(leaf) & np.uint64(0xFF)
+                part = part[:, None] >> self._list_byte_shifts(leaf) & np.uint64(0xFF)
             leaf.store(rows, part)
             shift += leaf.info.bits
 

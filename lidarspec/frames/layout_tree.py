@@ -160,7 +160,7 @@ class HeaderWalk:
 
     def layout(self) -> Layout:
         """Return the layout that the walk found."""
-        held = self._find_held_bits()
+        held = self._find_size_bits()
         self.request = _raise_unknown  # the layout is known, so no other field may be requested
         seals = tuple(_order_seals(self.seals))
         following = tuple(self._iter_following())
@@ -180,12 +180,12 @@ class HeaderWalk:
         return Layout(*found, held, tuple(self.conditions.values()), derived)
 
     def read(self, path: str) -> int | None:
-        """Return the raw value of a field in a formula.
+        """Return the raw value of a field for a formula.
 
-        Returns None if the header omits the field.
+        Returns None if frames with this header do not have the field.
 
         Raises:
-            UnknownSelectorError: if the value of the field is not given.
+            UnknownSelectorError: if the walk does not have the value of the field.
         """
         if path.startswith("_."):
             return self.given[path[2:]]
@@ -227,16 +227,16 @@ class HeaderWalk:
         start = self.starts[path] = self.cursor
         match node:
             case tree.Struct():
-                self._struct(node, path, shape, strides)
+                self._add_struct(node, path, shape, strides)
             case tree.Sealed():
                 self.visit(node.body, path, shape, strides)
-                self._seal(node, start)
+                self._add_seal(node, start)
             case tree.Number() | tree.Blob() | tree.Block():
-                self._field(node, path, shape, strides)
+                self._add_field(node, path, shape, strides)
             case tree.Repeat():
-                self._array(node, path, shape, strides)
+                self._add_array(node, path, shape, strides)
             case tree.PartSequence():
-                self._parts(node, path)
+                self._add_parts(node, path)
             case tree.When():
                 self.branches[node] = node.then if self._value(node.condition) else node.otherwise
                 self.visit(self.branches[node], path, shape, strides)
@@ -258,7 +258,7 @@ class HeaderWalk:
         if path and not shape:
             self.places[path] = (start, self.cursor)
 
-    def _struct(
+    def _add_struct(
         self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         for member in node.members:
@@ -269,7 +269,7 @@ class HeaderWalk:
             self.visit(member, below, shape, strides)
             self.parts.setdefault(below, None)
 
-    def _array(
+    def _add_array(
         self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         count = self._count(node.count, path)
@@ -311,9 +311,9 @@ class HeaderWalk:
                 self.derived[path] = Leaf(info, start, *place, size, np.dtype("u1"))
                 self.lengths[info.axes[-1]] = 0 if 0 in shape else size
             case "peeked":
-                self._peek(node, path, shape, strides)
+                self._add_peeked_fields(node, path, shape, strides)
 
-    def _peek(
+    def _add_peeked_fields(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         """Add fields at the cursor without moving it.
@@ -329,11 +329,10 @@ class HeaderWalk:
         self.leaves = leaves
         self.cursor = start
 
-    def _parts(self, node: tree.PartSequence, path: str) -> None:
+    def _add_parts(self, node: tree.PartSequence, path: str) -> None:
         """Add a sequence of parts.
 
-        If no header field contains their total size, the size is requested in the same way as the
-        value of a header field.
+        If no header field contains the total size of the parts, `request` has to return it.
         """
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
         rule = PartRule(
@@ -368,10 +367,7 @@ class HeaderWalk:
     def _add_empty_array(
         self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add the fields of the element type of an empty array.
-
-        Their bytes and constants are not added, and conditions on these fields apply to no element.
-        """
+        """Add the fields of an array without elements, which has no bytes and constants."""
         start = self.cursor
         constants = dict(self.constants)
         try:
@@ -384,7 +380,7 @@ class HeaderWalk:
             self.cursor = start
             self.constants = constants
 
-    def _field(
+    def _add_field(
         self,
         node: tree.Number | tree.Blob | tree.Block,
         path: str,
@@ -469,7 +465,7 @@ class HeaderWalk:
         if leaf.shape and (leaf.info.kind == "bytes" or is_in_block):
             self.lengths[leaf.info.axes[-1]] = 0 if 0 in leaf.shape[:-1] else leaf.shape[-1]
 
-    def _seal(self, node: tree.Sealed, start: int) -> None:
+    def _add_seal(self, node: tree.Sealed, start: int) -> None:
         leaves = tuple(self.leaves[path] for path in node.fields)
         if node.over is not None:
             spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
@@ -479,10 +475,13 @@ class HeaderWalk:
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
-    def _find_held_bits(self) -> dict[int, tuple[int, int]]:
-        """Return the bits of fields that contain the sizes of parts.
+    def _find_size_bits(self) -> dict[int, tuple[int, int]]:
+        """Return the bits of the fields that contain the sizes of parts.
 
-        They are constant within one layout.
+        All frames of one layout have the same values in these fields.
+
+        Returns:
+            A mask and the value of the masked bits, by byte offset.
         """
         rows = np.zeros((2, self.cursor), np.uint8)
         held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.held]
@@ -590,7 +589,7 @@ class HeaderNode:
         """Return the representative of all values with the same layout as `value`."""
         if self.value_classes is None:
             return value
-        return self.value_classes.representative(value)
+        return self.value_classes.to_representative(value)
 
     def child(self, value: int) -> HeaderNode:
         """Return the child node of a value, and add it if it is missing."""
@@ -632,10 +631,10 @@ class _ValueClasses:
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
-        """Return the classes of the values of a field.
+        """Group the values of a header field by their effect on the layout.
 
-        They are derived from the formulas of the frame. If that is impossible, each value is a
-        class of its own.
+        The formulas of the frame determine this effect. If they are too complicated, no values are
+        grouped.
         """
         (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [
@@ -679,10 +678,8 @@ class _ValueClasses:
                     )
                 )
             firsts, lasts = zip(*spans, strict=True)
-            # alone.
-            # The refusal of a frame with too many parts depends also on the parts, not only on
-            # their number.
-            # alone.
+            # The refusal of a frame with too many parts depends on the parts, not only on their
+            # number.
             if any(isinstance(node, tree.PartSequence) for node, _ in asking):
                 rises = None
             else:
@@ -692,13 +689,16 @@ class _ValueClasses:
             )
         return cls(info.limits, low, high)
 
-    def mark_too_long(self, value: int) -> _ValueClasses:
-        """Return the classes after a value has made the frame too long."""
+    def limit_to(self, value: int) -> _ValueClasses:
+        """Return classes that map all larger values to `value`, which is too large itself.
+
+        If a larger value may make the frame shorter, the classes are not changed.
+        """
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
         return self
 
-    def representative(self, value: int) -> int:
+    def to_representative(self, value: int) -> int:
         """Return the representative of a value."""
         if self.keys:
             if value in self.keys:
@@ -706,8 +706,8 @@ class _ValueClasses:
             return self.other
         return min(max(value, self.low), self.high)
 
-    def representatives(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the representative of each value, with the shape and dtype of `values`."""
+    def to_representatives(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Replace each value by its representative; keep the shape and the dtype."""
         if (self.low, self.high) == self.limits and not self.keys:
             return values
         if self.keys:
@@ -728,7 +728,7 @@ def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
     """Return whether a formula of a node counts bytes, elements or parts.
 
     If so, all numbers larger than the maximum frame size have the same result, because each part
-    has at least one byte (`HeaderWalk._parts`), and an array with more elements is refused.
+    has at least one byte (`HeaderWalk._add_parts`), and an array with more elements is refused.
     """
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
@@ -921,7 +921,7 @@ class HeaderTree:
             there, values = read(node, which)
             which = which if there is None else which[there]
             if node.value_classes is not None:
-                values = node.value_classes.representatives(values)
+                values = node.value_classes.to_representatives(values)
             if not len(which):
                 continue
             if np.count_nonzero(values == values[0]) == len(values):
@@ -933,7 +933,7 @@ class HeaderTree:
                 ]
         return groups
 
-    def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
+    def find_fixed_fields(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
         """Return the fields and constants at offsets that depend on no header field."""
         self._explore(self._root)
         if isinstance(self._root.result, Layout):
@@ -959,7 +959,7 @@ class HeaderTree:
                 return None
             values = leaf.load(rows)
             if node.value_classes is not None:
-                values = node.value_classes.representatives(values)
+                values = node.value_classes.to_representatives(values)
             if np.count_nonzero(values == values[0]) < len(rows) or (
                 isinstance(leaf, MeasuredSize) and values[0] < 0
             ):
@@ -1018,7 +1018,10 @@ class HeaderTree:
     def _find_end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Return the last node for a header, starting from a node, as `_explore` does."""
+        """Follow a header down the tree from a node, and return the last node.
+
+        Missing nodes are added, see `_explore`.
+        """
         while node.leaf is not None:
             value = node.leaf.read_first(data)
             if value is None:
@@ -1087,7 +1090,7 @@ class HeaderTree:
             and isinstance(node.result, LayoutRefusal)
             and not node.result.error
         ):
-            above.value_classes = above.value_classes.mark_too_long([*node.values.values()][-1])
+            above.value_classes = above.value_classes.limit_to([*node.values.values()][-1])
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:

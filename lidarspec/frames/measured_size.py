@@ -66,7 +66,7 @@ class MeasuredSize(ABC):
         """
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return the size as `Leaf.read_first` does."""
+        """Return the size, given the first bytes of a frame; None if they are too few."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
         if len(values):
             return int(values[0])
@@ -95,7 +95,7 @@ class TextSize(MeasuredSize):
         if stops is None:
             stops = np.full(len(offsets), len(buffer))
         ends = np.minimum(stops, offsets + self.limit)
-        values = self._find(buffer, offsets + self.start, ends)
+        values = self._find_sizes(buffer, offsets + self.start, ends)
         is_missing = values < 0
         if not np.count_nonzero(is_missing):
             return None, values
@@ -114,28 +114,31 @@ class TextSize(MeasuredSize):
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
         offsets = np.arange(len(rows)) * rows.strides[0]
-        values = self._find(view_span(rows), offsets + self.start, offsets + rows.shape[1])
+        values = self._find_sizes(view_span(rows), offsets + self.start, offsets + rows.shape[1])
         values[values < 0] = -CUT_OFF
         return values
 
-    def _find(self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets) -> NDArray[np.int64]:
-        """Return the number of bytes up to the mark, (n,); -1 without a mark before the end."""
+    def _find_sizes(
+        self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
+    ) -> NDArray[np.int64]:
+        """Return the size of the text of each frame, (n,); -1 if it has no end mark.
+
+        Args:
+            starts: the offset of each text in the buffer.
+            ends: the offset at which the search for the end mark of each text stops.
+        """
         step = len(self.ending.mark)
         if not step:
             return np.asarray(np.maximum(ends - starts, -1), np.int64)
         most = max(MAX_WINDOW_BYTES // (step * FIRST_WINDOW_MARKS), 1)
         blocks = [slice(first, first + most) for first in range(0, len(starts), most)]
-        found = [self._find_few(buffer, starts[block], ends[block]) for block in blocks]
+        found = [self._find_sizes_of_few(buffer, starts[block], ends[block]) for block in blocks]
         return np.concatenate([np.empty(0, np.int64), *found])
 
-    def _find_few(
+    def _find_sizes_of_few(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find` for a few frames.
-
-        Most texts end within the first window of each frame. For all other frames, the bytes that
-        they share are searched once.
-        """
+        """Return the result of `_find_sizes` for a few frames."""
         step = len(self.ending.mark)
         reach = np.arange(FIRST_WINDOW_MARKS * step)
         offsets = starts[:, None] + reach
@@ -145,18 +148,19 @@ class TextSize(MeasuredSize):
         has_mark = is_mark.any(axis=1)
         content = is_mark.argmax(axis=1) + self.ending.is_content
         sizes = np.where(has_mark, step * content, -1)
+        # The bytes that longer texts share are searched once.
         open_ended = np.flatnonzero(~has_mark & (starts + len(reach) + step <= ends))
         for phase in np.unique(starts[open_ended] % step).tolist():
             own = open_ended[starts[open_ended] % step == phase]
-            sizes[own] = self._find_shared(buffer, starts[own], ends[own])
+            sizes[own] = self._find_sizes_together(buffer, starts[own], ends[own])
         return sizes
 
-    def _find_shared(
+    def _find_sizes_together(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find` for frames whose texts have the same marks.
+        """Return the result of `_find_sizes` for texts with equally aligned end marks.
 
-        Their starts differ by multiples of the size of the mark.
+        The offsets of these texts differ by multiples of the size of the mark.
         """
         step = len(self.ending.mark)
         begin = int(starts.min())
@@ -168,7 +172,11 @@ class TextSize(MeasuredSize):
         return np.where(found + step <= ends, sizes, -1)
 
     def _match(self, units: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return whether units of the size of the mark, (..., size), are the mark, (...)."""
+        """Return whether each unit is the end mark, (...).
+
+        Args:
+            units: groups of as many bytes as the mark has, (..., size).
+        """
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)
         matches: NDArray[np.bool_] = ((units & mask) == mark).all(axis=-1)

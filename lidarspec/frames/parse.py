@@ -519,7 +519,7 @@ def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Re
         _add_labels(part.info, _make_bits_reader(part.bits, runs))
         for part, runs in zip(node.parts, numbers, strict=True)
     ]
-    parts = _group_parts(
+    parts = _combine_readers(
         [(part.bits.keys, reader) for part, reader in zip(node.parts, readers, strict=True)], count
     )
     code = {1: "B", 2: "H", 4: "I", 8: "Q"}.get(node.size)
@@ -562,7 +562,10 @@ def _find_bit_runs(
 
 
 def _make_bits_reader(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
-    """Return a function that extracts a value from blocks that were read as numbers."""
+    """Return a function that extracts one value from each of several bit blocks.
+
+    The function receives the blocks as integers.
+    """
     low, mask, target = runs[0]
     if len(runs) > 1 or field.signed or field.flag or target:
         return functools.partial(_join_runs, field, runs)
@@ -587,14 +590,19 @@ def _join_runs(
     return values
 
 
-def _group_parts(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
-    """Return a reader of the structs and arrays of a bit block."""
+def _combine_readers(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
+    """Combine the readers of the numbers of a bit block into one reader.
+
+    Args:
+        parts: for each number, its names and indices in the block, and its reader.
+        count: the number of blocks in a frame.
+    """
     if not parts[0][0]:
         return parts[0][1]
     groups: dict[str | int, list[tuple[tuple[str | int, ...], Reader]]] = {}
     for (key, *below), reader in parts:
         groups.setdefault(key, []).append((tuple(below), reader))
-    readers = tuple((key, _group_parts(group, count)) for key, group in groups.items())
+    readers = tuple((key, _combine_readers(group, count)) for key, group in groups.items())
     if isinstance(readers[0][0], str):
         return functools.partial(_read_containers, readers, count)  # type: ignore[arg-type]
     return functools.partial(_read_rows, tuple(reader for _, reader in readers))
@@ -604,7 +612,9 @@ def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContaine
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | LayoutRefusal | None:
+def find_frame_layout(
+    sensor: SensorDescription, name: str, data: bytes
+) -> Layout | LayoutRefusal | None:
     """Return the layout of one frame, or the refusal of its header.
 
     Returns None if the frame type cannot be compiled, or if the header is incomplete.
@@ -616,13 +626,14 @@ def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Lay
 
 
 def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
-    """Return a sort key that is higher if the fault is later in the frame.
+    """Return a sort key, which is higher for a fault that is later in the frame.
 
-    The key is highest for a complete frame with trailing bytes, or with a wrong checksum only.
+    The highest keys are those of trailing bytes, and of a wrong checksum in an otherwise complete
+    frame.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset
-    layout = layout_of(sensor, fault.frame, fault.data)
+    layout = find_frame_layout(sensor, fault.frame, fault.data)
     fits = isinstance(layout, Layout) and layout.size == len(fault.data)
     is_complete = fault.kind == diagnose.TRAILING or (fits and fault.kind == diagnose.CHECKSUM)
     if is_complete:

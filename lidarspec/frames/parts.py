@@ -356,9 +356,9 @@ class _PartWalk:
         self._errors += [refused.error] if refused.error else []
 
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the next part declares its sizes correctly.
+        """Return the frames in which the next part has the sizes that it declares.
 
-        This sets the status of all other frames.
+        Sets the status of all other frames.
         """
         if not layout.held:
             return which
@@ -405,7 +405,7 @@ class _PartWalk:
     def _evaluate_all(
         self, layout: Layout, formula: tree.Formula, offsets: Offsets
     ) -> NDArray[np.int64]:
-        """Return the value of a formula in each part; -1 if the formula raises an error."""
+        """Return the value of a formula for the part at each offset; -1 if it fails."""
         asked = tree.refs(formula)
         is_simple = isinstance(formula, tree.Ref) or (
             isinstance(formula, tree.Op) and all(map(_fits_columns, tree.iter_subformulas(formula)))

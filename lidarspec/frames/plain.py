@@ -27,7 +27,7 @@ MAX_BUILDS = 4
 
 
 def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any, int]:
-    """Return the values and the size of the frame at the start of some bytes.
+    """Parse the frame at the start of the bytes; return its values and its size.
 
     Raises:
         construct.ConstructError: if the bytes do not begin with a frame.
@@ -75,11 +75,9 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
-    """Return values with construct's strings in place of the numbers of an Enum.
+    """Replace each number that has a label by the string that construct uses for it.
 
-    Such a string is the name of the number, and contains the number as well.
-
-    When construct builds a struct, `Const` and `Switch` compare these names.
+    When construct builds a struct, `Const` and `Switch` compare these strings.
     """
     if isinstance(value, Mapping):
         return Container(
@@ -107,7 +105,11 @@ def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
 def _iter_fields(
     struct: Any, prefix: str, data: bytes, infos: Mapping[str, FieldInfo]
 ) -> Iterator[WireField]:
-    """Yield the fields of a parsed struct, which contains the spans of its members."""
+    """Yield the fields of a parsed struct.
+
+    Args:
+        struct: the values of the struct, with the offsets of its members in `_spans`.
+    """
     for name, (start, end) in struct["_spans"].items():
         path = f"{prefix}.{name}".strip(".")
         value = struct[name]

@@ -169,9 +169,13 @@ def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans)
 def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return masks of the low and the high bytes in `number` words of `load_words`.
+    """Return the masks of the low and the high bytes of each word.
 
-    Each item has the indices of words with equal masks, and their masks (low, high).
+    Args:
+        number: the number of words, as returned by `load_words`.
+
+    Returns:
+        The indices of the words with equal masks, and these masks (low, high), as pairs.
     """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
@@ -261,12 +265,14 @@ def load_words(
 def _plan_words(
     spans: Spans, size: int, zeros_first: bool
 ) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
-    """Return how to assemble the words of a row from the bytes of the spans.
+    """Return how to copy the bytes of the spans of a row to words.
 
     Returns:
-        The number of words; the runs of whole words, as (first word, number of words, offset in the
-        row); and the parts of words, as (word, offset of the eight bytes that contain the part,
-        right shift, mask or None, left shift), in the order of these operations.
+        The number of words; the copies of whole words, as (first word, number of words, offset in
+        the row); and the
+        copies of parts of a word, as (word, offset of eight bytes in the row, right shift, mask or
+        None, left shift).
+        The shifts and the mask are applied in this order.
     """
     total = _count_bytes(spans)
     number = -(-total // 8)
@@ -355,12 +361,10 @@ def gather_spans(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
 
 
 def _compute_by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
-    """Return `compute_registers` of CRC-32, computed by `zlib` row by row.
-
-    zlib inverts the register at the start and at the end.
-    """
+    """Return the CRC-32 register after each row, computed by `zlib`, (n,)."""
     if rows.strides[1] != 1:
         rows = np.ascontiguousarray(rows)
+    # zlib inverts the register at the start and at the end.
     return np.fromiter(
         map(zlib.crc32, rows, itertools.repeat(start ^ 0xFFFFFFFF)), np.uint32, len(rows)
     ) ^ np.uint32(0xFFFFFFFF)
@@ -442,7 +446,7 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return for each row one word with the same register as the row, (n,).
+    """Return a word for each row, whose register equals that of the row, (n,).
 
     The polynomial `poly` must have eight bits.
     """
@@ -464,10 +468,9 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word the sums that it is XORed into, as the bits of a number.
+    """Return for each word a mask of the sums that it is XORed into.
 
-    Bit n of the number, from 0 to 7, stands for the sum of `_sum_words` that is advanced by n
-    bytes.
+    Bit n of the mask, from 0 to 7, stands for the sum that `_sum_words` advances by n bytes.
     """
     found = [1]
     while len(found) < number:
@@ -481,7 +484,7 @@ def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
 def _compute_wide(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """Return `compute_registers` of any width."""
+    """Return the result of `compute_registers` for registers of any width."""
     rows = gather_spans(rows, spans)
     (count, length), table = rows.shape, _make_word_table(width, poly, refin)
     # A power of two. It is small, because many segments share the cost of a NumPy call.

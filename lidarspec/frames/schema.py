@@ -151,7 +151,7 @@ class Schema:
         The value is None if there is no such field.
         """
         return {
-            axis: None if count is None else counting_field(count, self.fields)
+            axis: None if count is None else find_count_field(count, self.fields)
             for axis, count in self.arrays.items()
         }
 
@@ -171,7 +171,7 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The parts with columns of their own, by path; not the elements of arrays."""
+        """The sequences of parts by path, without arrays of elements that differ in size."""
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 
     @cached_property
@@ -196,13 +196,14 @@ class Schema:
             for kind in node.kinds
         }
 
-    def within(self, path: str) -> tuple[str, str, str] | None:
-        """Split the path of a field in parts into axis, kind and remaining path.
+    def split_part_path(self, path: str) -> tuple[str, str, str] | None:
+        """Split a path into a sequence of parts, a kind of part, and a field in the part.
 
-        Returns None if the path does not lead into parts.
+        Returns None if the path is not in a sequence of parts.
 
         Raises:
-            UnknownField: if there are several kinds of parts and the path has no name of a kind.
+            UnknownField: if the sequence has several kinds of parts, and the path does not name
+                one.
         """
         for axis, node in self.separate_parts.items():
             if path == axis or path.startswith(f"{axis}."):
@@ -282,8 +283,8 @@ def _apply_adapter(info: FieldInfo) -> FieldInfo:
     )
 
 
-def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
-    """Return the path of the first field in the formula of a count; None without one."""
+def find_count_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
+    """Return the path of the first field in a count formula; None without fields."""
     asked = refs(formula)
     return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
 
@@ -346,7 +347,7 @@ def _add_struct_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> d
 def _make_element(
     arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]
 ) -> FieldInfo | None:
-    """Return an element of a field as a field; None if no frame has it.
+    """Return the declaration of one element of a field; None if no frame has it.
 
     The element is optional if the number of elements varies.
     """

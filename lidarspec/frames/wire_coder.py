@@ -71,7 +71,8 @@ class Coder:
         """Return the frame for the bytes of a struct.
 
         Args:
-            spelling: another encoded frame, which is returned if it has the same struct.
+            spelling: the frame from which the values were parsed; it is returned if it decodes to
+                `struct`.
 
         Returns:
             The encoded frame; None if the wire form cannot encode one of the values.
@@ -79,9 +80,12 @@ class Coder:
         return struct
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
-        """Return parsed values; add the original frame if `encode` cannot restore it.
+        """Add the encoded frame to parsed values, if `encode` cannot restore it.
 
-        It is added under the name `SPELLING`.
+        Args:
+            values: the parsed values; the frame is added under the name `SPELLING`.
+            struct: the bytes of the struct.
+            data: the encoded frame.
         """
         return values
 
@@ -150,7 +154,7 @@ class FormCoder(Coder):
         self.begins = _join_bytes(self.prefix)
 
     def _find_prefix(self) -> dict[int, int]:
-        leaves, constants = self.tree.first()
+        leaves, constants = self.tree.find_fixed_fields()
         known = {offset: value for offset, (mask, value) in constants.items() if mask == 0xFF}
         texts = list[list[int | None]]()
         offset = 0
@@ -185,8 +189,8 @@ class FormCoder(Coder):
             return size
         return None
 
-    def refusal(self, struct: bytes) -> LayoutRefusal | None:
-        """Return the refusal of a struct without a layout; None if it may have a layout."""
+    def find_refusal(self, struct: bytes) -> LayoutRefusal | None:
+        """Return why a struct cannot have a layout; None if it may have one."""
         result = self.tree.header(struct).result
         if isinstance(result, LayoutRefusal):
             return result
@@ -221,7 +225,7 @@ class FormCoder(Coder):
                     [self.form.largest(size) for size in run.sizes.tolist()], np.uint64
                 )
                 for row in part:
-                    values = _limit_values(run.from_bytes(row.tobytes()), largest)
+                    values = _wrap_values(run.from_bytes(row.tobytes()), largest)
                     if isinstance(self.form, DrawsValues):
                         values = self.form.to_encodable(run, values)
                     row[:] = np.frombuffer(run.to_bytes(values), np.uint8)
@@ -297,7 +301,7 @@ def frame_coder(frame: Frame) -> Coder:
 
 
 def list_runs(layout: Layout) -> Sequence[Run]:
-    """Return the fields of a struct with this layout, as runs for a wire form.
+    """Return the fields of a struct with this layout, grouped into runs.
 
     A run is one text field, or several consecutive numbers.
     """
@@ -306,7 +310,7 @@ def list_runs(layout: Layout) -> Sequence[Run]:
 
 @functools.lru_cache(maxsize=1024)
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
-    """Return the fields between two offsets of a struct, as runs for a wire form.
+    """Return the fields between two offsets of a struct, grouped into runs.
 
     Bytes between fields, such as constants without a name, are treated as a text field.
     """
@@ -396,7 +400,11 @@ def _join_bytes(bytes_by_offset: dict[int, int]) -> bytes:
     )
 
 
-def _limit_values(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return values modulo their largest value plus 1."""
+def _wrap_values(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return each value modulo its largest value plus 1.
+
+    Args:
+        largest: the largest allowed value for each column of `values`.
+    """
     count = largest + np.uint64(1)  # wraps to 0 if all values of eight bytes are allowed
     return np.where(count == 0, values, values % np.maximum(count, 1))

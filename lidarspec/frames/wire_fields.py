@@ -123,7 +123,7 @@ class ExaminedFrame:
 
     @property
     def layout(self) -> Layout | None:
-        """The layout; None if the bytes do not lead to one."""
+        """The layout; None if the bytes do not determine it."""
         if isinstance(self.known, Layout):
             return self.known
         return None
@@ -148,7 +148,7 @@ class ExaminedFrame:
         if isinstance(self.known, HeaderWalk):
             axes += [axis for axis in self.known.open_regions if axis not in axes]
         for axis in axes:
-            for part in self.parts_of(axis):
+            for part in self.list_parts_of(axis):
                 yield from part.seals()
 
     def region(self, axis: str) -> Region | None:
@@ -159,12 +159,12 @@ class ExaminedFrame:
             return self.known.open_regions.get(axis)
         return None
 
-    def parts_of(self, axis: str) -> list[ExaminedFrame]:
-        """Return the parts at a path, up to the first invalid part."""
+    def list_parts_of(self, axis: str) -> list[ExaminedFrame]:
+        """Return the parts of a sequence, up to the first invalid part."""
         return self._get_parts(axis).parts
 
-    def broken_part(self, axis: str) -> ExaminedFrame | None:
-        """Return the invalid part at a path; None if all parts are valid."""
+    def find_broken_part(self, axis: str) -> ExaminedFrame | None:
+        """Return the invalid part of a sequence of parts; None if all parts are valid."""
         examined = self._get_parts(axis)
         if examined.is_whole:
             return None
@@ -331,7 +331,7 @@ class _Cursor:
     def _parts(self, node: tree.PartSequence) -> Iterator[WireField]:
         region = self._examined.region(node.axis)
         if region is not None:
-            for part in self._examined.parts_of(node.axis):
+            for part in self._examined.list_parts_of(node.axis):
                 yield from part.fields()
         if region is None or region.size is None or region.start + region.size > len(self._data):
             self._is_over = True

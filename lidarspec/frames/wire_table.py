@@ -139,7 +139,12 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
 
 
 def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
-    """Return a declared length; "size(...)" if the length is None."""
+    """Return a size as `SizeFormula`.
+
+    Args:
+        size: the declared size; None if it is unknown, which is written as "size(...)".
+        shown: the path between these parentheses.
+    """
     if isinstance(size, int):
         return SizeFormula(size)
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
@@ -265,7 +270,7 @@ def _describe_bits(part: tree.Part) -> tuple[str, str]:
             str(size),
             f"{'int' if part.bits.signed else 'uint'}{8 * size} {'be' if order == '>' else 'le'}",
         )
-    return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
+    return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", format_bits(part.bits)
 
 
 def _describe_type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
@@ -297,7 +302,7 @@ def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
 
 
 def describe_end(node: tree.PartSequence) -> str:
-    """Return a description of how the last part of a sequence of parts is determined."""
+    """Describe what determines the end of a sequence of parts."""
     if node.count is not None:
         return f"{format_formula(node.count)} parts of variable size"
     if node.within is not None:
@@ -342,8 +347,8 @@ def _is_enclosed(text: str) -> bool:
     return text.startswith("(") and depths.index(0) == len(text) - 1
 
 
-def bit_text(bits: BitField) -> str:
-    """Return the bits of a value in its block, the most significant first.
+def format_bits(bits: BitField) -> str:
+    """Return a text for the bits of a value in its block, the most significant first.
 
     An example is "byte 1 bits 1-0, byte 0 bits 7-2".
     """

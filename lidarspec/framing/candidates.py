@@ -145,7 +145,7 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return a filter for some types, by all constant bytes except the first two."""
+        """Return a filter that compares the constants of some types, except the first two."""
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -159,8 +159,8 @@ class Framing:
         """Return whether a frame of a type changes the active types."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
-    def switching(self, mode: SearchState) -> NDArray[np.bool_]:
-        """Return whether a frame of each type changes the active types, (types + 1,).
+    def find_switching_types(self, mode: SearchState) -> NDArray[np.bool_]:
+        """Return which frame types change the active types, (types + 1,).
 
         The index is the type. The last value, for the index -1, is False.
         """
@@ -431,9 +431,9 @@ class Candidates:
             self.checked[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
-        """Return the number of candidates, from the first on, that can be checked.
+        """Return how many candidates can be checked now.
 
-        Later candidates have to wait, because their constants have not all arrived.
+        The candidates after them wait, because their constants have not all arrived.
         """
         if not len(offsets) or self.final or self._framing.is_weak(kind):
             return len(offsets)

@@ -92,7 +92,7 @@ class _DatagramBatch:
         return self._piece
 
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
-        """Return the types of datagrams from `position` on.
+        """Find the types of the datagrams from index `position` on.
 
         The result ends with the first frame that changes the active types, or with the last
         datagram.
@@ -100,9 +100,8 @@ class _DatagramBatch:
         if mode.after not in self._known:
             frames, reasons = self._check(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
-                rows = (
-                    np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position
-                ).tolist()
+                is_switch = self._framing.find_switching_types(mode)[frames.kinds]
+                rows = (np.flatnonzero(is_switch) + position).tolist()
             else:
                 rows = []
             self._known[mode.after] = position, frames, reasons, rows
@@ -125,10 +124,15 @@ class _DatagramBatch:
         return frames
 
     def _check(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """Return the type and layout of each datagram, and why a datagram is invalid.
+        """Find the type and the layout of each datagram.
 
-        All datagrams are checked with the active types of `mode`. The reason is 0 for datagrams
-        without the constants of any type, and `PLUGIN` for datagrams that must be checked alone.
+        Args:
+            mode: the search state, which determines the active types.
+
+        Returns:
+            The datagrams as frames, and for each invalid datagram the reason. The reason is a
+            status, 0 if the datagram
+            has the constants of no type, or `PLUGIN` if it must be checked alone.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -186,7 +190,7 @@ class _DatagramBatch:
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
 
     def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
-        """Return the result of checking datagrams as frames of one type."""
+        """Check datagrams as frames of one type, and return them with their status."""
         steady = self._steady
         self._steady = None
         if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):

@@ -142,7 +142,7 @@ class Decoder:
             data: the next bytes of the stream, or one datagram.
             at: the arrival time of the bytes, ns; None if unknown.
         """
-        return [found for frames in self.frames(data, at) for found in frames.found()]
+        return [found for frames in self.frames(data, at) for found in frames.to_found()]
 
     def idle(self) -> list[Found]:
         """Reject incomplete candidates, because no data has arrived for a while.
@@ -150,7 +150,7 @@ class Decoder:
         Returns:
             The frames that are found when the bytes of these candidates are searched again.
         """
-        return [found for frames in self.take_pending() for found in frames.found()]
+        return [found for frames in self.take_pending() for found in frames.to_found()]
 
     def finish(self) -> list[Found]:
         """Reject incomplete candidates, because the input has ended.
@@ -305,9 +305,13 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: JoinedMessages | None,
     ) -> NDArray[np.int64]:
-        """Count invalid bytes in datagrams, and return their number before each frame.
+        """Count the skipped bytes in datagrams, and return their number before each frame.
 
-        Fillers are not included in these numbers.
+        Args:
+            good: whether each datagram is a frame.
+
+        Returns:
+            The number of skipped bytes before each frame, without fillers.
         """
         lost = self._count_skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         if joined is not None:
@@ -458,7 +462,11 @@ def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | Non
 
 
 def _compute_offsets(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
-    """Return the offsets of consecutive pieces of these sizes, from `first` on."""
+    """Return the offsets of consecutive pieces, given their sizes.
+
+    Args:
+        first: the offset of the first piece.
+    """
     if size := broadcast_value(sizes):
         return range(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)

@@ -89,21 +89,21 @@ def random_frame(
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.has_measured_sizes:
-        return make_of_values(sensor, frame, source, drawn)
-    _, row = random_row(sensor, frame, source, drawn)
+        return draw_frame(sensor, frame, source, drawn)
+    _, row = draw_row(sensor, frame, source, drawn)
     data = frame_coder(engine.frame).encode(row.tobytes())
-    assert data is not None  # `random_row` has checked it
+    assert data is not None  # `draw_row` has checked it
     return data
 
 
-def random_row(
+def draw_row(
     sensor: SensorDescription,
     frame: str,
     source: random.Random,
     drawn: Drawn = NOTHING,
     tries: int = MAX_TRIES,
 ) -> tuple[Layout, NDArray[np.uint8]]:
-    """Return the layout of a random header, and a valid struct with it, (size,).
+    """Draw a random header; return its layout and a valid struct, (size,).
 
     Args:
         frame: the name of a frame type with layouts and without parts.
@@ -126,7 +126,7 @@ def random_row(
         _store_drawn(layout, rows, chosen, drawn, source)
         rows = _fill_headers(rows, layout, chosen)
         rows = rows[valid_mask(sensor, frame, layout, rows)]
-        row = _first_encodable(sensor, frame, rows)
+        row = _find_encodable(sensor, frame, rows)
         if row is not None:
             return layout, row
     return _make_along_sweep(sensor, frame, engine, source, drawn, tries)
@@ -229,19 +229,23 @@ def _make_random_rows(
     return rows
 
 
-def make_of_values(
+def draw_frame(
     sensor: SensorDescription,
     frame: str,
     source: random.Random,
     drawn: Drawn,
     tries: int = LARGEST_BATCH * MAX_TRIES,
 ) -> bytes:
-    """Return a valid frame after drawing its values one by one.
+    """Draw the values of a frame one by one, and return a valid frame.
 
     This is used for frames with parts, and for frames without layouts.
 
+    Args:
+        drawn: functions that draw the raw values of certain fields, by path.
+        tries: the maximum number of attempts.
+
     Raises:
-        SpecError: if all attempts, whose number is `tries`, result in invalid frames.
+        SpecError: if all attempts result in invalid frames.
     """
     engine = get_codec(sensor.frames[frame])
     for _ in range(tries):
@@ -336,7 +340,7 @@ def valid_mask(
     return mask
 
 
-def _first_encodable(
+def _find_encodable(
     sensor: SensorDescription, frame: str, rows: NDArray[np.uint8]
 ) -> NDArray[np.uint8] | None:
     """Return the first struct that the wire form can encode; None if it can encode none."""
@@ -377,7 +381,7 @@ def _make_along_sweep(
         _store_drawn(layout, rows, chosen, drawn, source)
         rows = _fill_headers(rows, layout, chosen)
         rows = rows[valid_mask(sensor, frame, layout, rows)]
-        row = _first_encodable(sensor, frame, rows)
+        row = _find_encodable(sensor, frame, rows)
         if row is not None:
             return layout, row
     raise SpecError(
@@ -416,7 +420,11 @@ def _store_drawn(
 
 
 def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return functions that return the raw values of a sweep for header fields, by path."""
+    """Return a function for each header field of a sweep, which returns its raw value.
+
+    Args:
+        values: the values of the sweep in units, by path.
+    """
     fields = engine.schema.fields
     draws: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():

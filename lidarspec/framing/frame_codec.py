@@ -102,15 +102,16 @@ class Codec:
     def make_checker(self, layout: Layout) -> CandidateChecker:
         """Return the checker for candidates of one layout.
 
-        The checker does not check `_checked_constants` again.
+        It does not compare the constants in `_checked_constants`.
         """
         checker = layout.notes.get(CandidateChecker)
         if checker is None:
             self._conditions = self._conditions or StructConditions(
                 self.frame.plausible, self.schema, layout
             )
-            tests = self._conditions.make_struct_conditions(layout), self._conditions.checks(layout)
+            met = self._conditions.make_struct_conditions(layout)
+            checks = self._conditions.make_checks(layout)
             checker = layout.notes[CandidateChecker] = CandidateChecker(
-                self.frame, self.schema, layout, self._checked_constants, *tests
+                self.frame, self.schema, layout, self._checked_constants, met, checks
             )
         return checker

@@ -193,7 +193,7 @@ class CompiledCodec(Codec):
             return []
         is_undecided = np.zeros(len(which), np.bool_)
         is_undecided[is_whole] = status[whole] == VALID
-        return together.by_layout(is_undecided)
+        return together.group_by_layout(is_undecided)
 
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
@@ -271,7 +271,7 @@ class CompiledCodec(Codec):
                 self.schema, [LayoutRows(frames.layout, count_up(len(rows)), rows)]
             )
         known = (
-            frames.by_layout()
+            frames.group_by_layout()
             if frames.layouts
             else self.tree.classify(frames.buffer, frames.starts, self._find_stops(frames))
         )

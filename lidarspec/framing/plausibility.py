@@ -132,7 +132,8 @@ class CandidateChecker:
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
         """Set the status of candidates that have a wrong constant or a wrong length.
 
-        All candidates are valid so far.
+        Args:
+            status: the status of each candidate, `VALID` before the call; it is updated.
         """
         held = match_constants(self._constants, rows) if len(rows) else None
         if held is not None:
@@ -277,7 +278,7 @@ class StructConditions:
         )
         return [self._check(condition, leaves) for condition, leaves in every]
 
-    def checks(self, layout: Layout) -> list[Check] | None:
+    def make_checks(self, layout: Layout) -> list[Check] | None:
         """Return the checks on rows of bytes that frames of a layout have to pass.
 
         Returns None if the plausibility function has to be called.
@@ -354,11 +355,13 @@ class ConditionGroup:
 
 @dataclass(frozen=True, eq=False)
 class _LookupTable:
-    """The values of one or two bytes, read as an integer, for which a condition is true.
+    """The values of one or two bytes for which a condition is true.
+
+    Two bytes are read as one integer.
 
     Attributes:
-        limits: the first and the last value for which the condition is true; None if there are
-            other values between them.
+        limits: the first and the last value for which the condition is true, if it is true for all
+            values between them; else None.
         bits: (mask, allowed values) of the bits that the condition depends on; None if `limits` is
             given, or if more than two values are allowed.
         listed: for each value, whether the condition is true.
@@ -463,9 +466,15 @@ def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _Look
 
 
 def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
-    """Return the bits that a table depends on, and their allowed values.
+    """Return the bits on which a lookup table depends, and their allowed values.
 
-    Returns None if more than two values are allowed.
+    Returns None unless one or two values are allowed.
+
+    Args:
+        listed: whether each value of the table is allowed.
+
+    Returns:
+        A mask of the bits, and the allowed values of the masked bits.
     """
     values = np.arange(len(listed))
     mask = sum(

@@ -29,10 +29,12 @@ DISTINCTIVE_CONSTANTS = 4
 def find_regular_frames(
     framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
 ) -> PieceResult | None:
-    """Return the frames of a piece from its first byte on; None if it must be searched.
+    """Return the frames that follow one another from the start of a piece.
+
+    Returns None if the piece must be searched.
 
     Args:
-        buffer: the undecided bytes and the bytes after them.
+        buffer: the bytes that the last search left undecided, and the new bytes.
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
     """
@@ -89,13 +91,14 @@ def find_regular_datagrams(
 def check_rows(
     framing: Framing, kind: int, buffer: NDArray[np.uint8], rows: Bytes2D, first: int
 ) -> Frames | None:
-    """Check rows with the constants of a type as candidates of one layout.
+    """Check rows as candidates of one type and one layout.
 
     Returns None if the rows do not have a common layout.
 
     Args:
+        kind: the index of the type, whose constants match in all rows.
         rows: the rows, which are at equal distances in the buffer.
-        first: the offset of the first row.
+        first: the offset of the first row in the buffer.
     """
     survey = framing.codecs[kind].survey_rows(rows, sums=framing.sums)
     if survey is None:
@@ -213,19 +216,19 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
             continue
         constants = framing.marks[kind][:DISTINCTIVE_CONSTANTS]
         if all(first[offset] & mask == value for offset, mask, value in constants):
-            if any(_has_both(framing, other, kind, rows) for other in before):
+            if any(_may_have_constants(framing, other, kind, rows) for other in before):
                 return None
             return kind
         before.append(kind)
     return None
 
 
-def _has_both(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether any row may have the constants of two types.
+def _may_have_constants(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
+    """Return whether any row has the constants of a second frame type.
 
     Args:
-        kind: the index of a type.
-        other: the index of the type whose constants the rows have.
+        kind: the index of the second type.
+        other: the index of the type that the first row matches.
     """
     if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False

@@ -134,9 +134,12 @@ class Counters:
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
-        """Return the first error of a plugin, with the number of packets that failed.
+        """Return the first error of a plugin; the message has the number of all errors.
 
         Returns None if there was no error.
+
+        Args:
+            sensor: the id of the sensor, for the message.
         """
         if not self.failures:
             return None
@@ -338,7 +341,7 @@ class Frames:
             places = _select(self.places, which)
         return self._replace(**chosen, rows=rows, _starts=starts, places=places)
 
-    def by_layout(self) -> list[tuple[Layout, Indices]]:
+    def group_by_layout(self) -> list[tuple[Layout, Indices]]:
         """Return pairs of a layout and the indices of its frames, (k,).
 
         Frames without a known layout are left out.
@@ -406,7 +409,7 @@ class Frames:
         """Return the bytes of one frame."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
-    def found(self) -> list[Found]:
+    def to_found(self) -> list[Found]:
         """Return the frames as a list of `Found`."""
         rows = zip(
             self.kinds.tolist(),

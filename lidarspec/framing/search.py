@@ -41,10 +41,10 @@ def find_frames(
     """Find the frames in one piece of a stream.
 
     Args:
-        buffer: the undecided bytes and the bytes after them.
+        buffer: the bytes that the last search left undecided, and the new bytes.
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
-        final: whether no bytes follow, so that incomplete candidates are rejected.
+        final: whether the stream ends with this piece; incomplete candidates are then rejected.
     """
     candidates = Candidates(framing, buffer, mode, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
@@ -83,8 +83,7 @@ class _FrameWalk:
     """Accepts the candidates of a piece for one set of active types.
 
     Args:
-        live: the candidates that are valid or incomplete. An incomplete candidate extends to the
-            end of the piece.
+        live: the valid and incomplete candidates.
         base: the offset of the piece in the stream.
     """
 
@@ -114,7 +113,7 @@ class _FrameWalk:
                 stops |= self._after != np.arange(1, len(frames) + 1)
         self._changes = bytes(len(frames))
         if framing.named:
-            changes = framing.switching(mode)[frames.kinds] & (frames.status == VALID)
+            changes = framing.find_switching_types(mode)[frames.kinds] & (frames.status == VALID)
             self._changes = changes.tobytes()
             stops |= changes
         self._stops: list[int] = np.flatnonzero(stops).tolist()
@@ -193,7 +192,7 @@ class _FrameWalk:
         for kind, runs in self._runs.items():
             if self._framing.names[kind] != self._mode.run or self._is_earlier(kind, position):
                 continue
-            row = runs.row_at(position)
+            row = runs.find_row(position)
             if row is not None:
                 self._continued.append((kind, position))
                 position = runs.ends.item(row)
@@ -224,9 +223,10 @@ def _list_rows(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
-    """Store in `mode` whether the frames are at equal distances.
+    """Store the size of the frames, and whether they follow one another without gaps.
 
-    Only frames since the last change of the active types count.
+    Args:
+        since: the offset at which the active types last changed; earlier frames are ignored.
     """
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):

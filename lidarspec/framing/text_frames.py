@@ -105,9 +105,10 @@ class TextCodec(Codec):
         }
 
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
-        """Return the status and the struct of a complete candidate.
+        """Decode a complete candidate; return its status and its struct.
 
-        If the struct is not None, the caller has to check it, and replaces the returned status.
+        If the struct is not None, the caller has to check it, and the returned status is
+        preliminary.
         """
         try:
             decoded = self._coder.decode_whole(data)
@@ -115,7 +116,7 @@ class TextCodec(Codec):
                 return LENGTH, decoded.struct
             if decoded.problem.is_checksum:
                 return CHECKSUM, None
-            refusal = self._coder.refusal(decoded.struct)
+            refusal = self._coder.find_refusal(decoded.struct)
         except SpecError:
             raise
         except Exception as error:

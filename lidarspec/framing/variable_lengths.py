@@ -104,7 +104,7 @@ class LayoutFamilies:
     def find_family(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
         """Return the family of a layout.
 
-        Returns None if its candidates cannot be checked together with candidates of other layouts.
+        Returns None if candidates of this layout cannot be checked together with other candidates.
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, checker)
@@ -112,7 +112,7 @@ class LayoutFamilies:
         return family
 
     def _find(self, layout: Layout, checker: CandidateChecker) -> LayoutFamily | None:
-        if layout.regions or not all(_is_extended(seal) for seal in layout.seals):
+        if layout.regions or not all(_ignores_trailing_zeros(seal) for seal in layout.seals):
             return None
         constants = tuple(sorted(layout.constants.items()))
         lengths = tuple(sorted(layout.held.items()))
@@ -126,8 +126,8 @@ class LayoutFamilies:
         return LayoutFamily(self._numbers[key], tuple(map(_find_length, checker.checks)))
 
 
-def _is_extended(seal: Seal) -> bool:
-    """Return whether zeros after the covered bytes do not change a checksum."""
+def _ignores_trailing_zeros(seal: Seal) -> bool:
+    """Return whether zeros after the covered bytes leave a checksum unchanged."""
     return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
 
 
@@ -187,8 +187,8 @@ class JointChecker:
             isinstance(check, LookupCondition) for check in first.checks
         )
 
-    def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
-        """Return some of the candidates with their layouts.
+    def group_by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
+        """Return the chosen candidates, grouped by layout.
 
         Args:
             chosen: a mask that selects the candidates in `self.which`, (n,).

@@ -68,8 +68,8 @@ class WeakRuns:
         heads.status = np.where(is_short[is_head], SHORT, VALID)
         return heads
 
-    def row_at(self, offset: int) -> int | None:
-        """Return the row of the valid candidate at an offset; None without one."""
+    def find_row(self, offset: int) -> int | None:
+        """Return the index of the valid candidate at an offset; None without one."""
         row = int(self.frames.starts.searchsorted(offset))
         if row == len(self.frames) or self.frames.starts.item(row) != offset:
             return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.columns import Batch, Fields, physical
+from lidarspec.expressions.columns import Batch, Fields, load_physical
 from lidarspec.frames.frame_table import Table
 from lidarspec.packets.packet_type import find_clock
 from lidarspec.packets.packets import Packets
@@ -51,4 +51,4 @@ def frame_status(status: ClockStatus, frames: Table) -> Values:
     info = frames.schema.columns.get(status.source)
     if info is None or info.axes:
         return np.full(len(frames), np.nan)
-    return physical(info, frames)
+    return load_physical(info, frames)

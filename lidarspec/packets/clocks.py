@@ -293,7 +293,7 @@ def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | No
     for path in fields:
         if path in schema.fields:
             continue
-        place = schema.within(path)
+        place = schema.split_part_path(path)
         if place is not None:
             axis, kind, _ = place
             places.add((axis, kind))

@@ -131,6 +131,6 @@ def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     having = [
         name
         for name, schema in schemas.items()
-        if path in schema.fields or schema.within(path) is not None
+        if path in schema.fields or schema.split_part_path(path) is not None
     ]
     return frame in having or not having

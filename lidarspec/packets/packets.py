@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
-from lidarspec.expressions.columns import AROUND, Batch, physical
+from lidarspec.expressions.columns import AROUND, Batch, load_physical
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import Counters, Numbers, to_array
@@ -133,7 +133,7 @@ class Packets:
             raise UnknownField(
                 path, self.table.schema.columns, place=f"{self.sensor.id} {self.frame}"
             )
-        return physical(info, self.table)
+        return load_physical(info, self.table)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.table.schema.columns)
@@ -276,7 +276,7 @@ class Packets:
             UnknownField: if the frame does not have these parts, or if it has several kinds and the
                 path does not name one.
         """
-        place = self.table.schema.within(path)
+        place = self.table.schema.split_part_path(path)
         if place is None:
             raise UnknownField(
                 path, self.table.schema.separate_parts, place=f"{self.sensor.id} {self.frame}"

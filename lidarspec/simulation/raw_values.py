@@ -31,7 +31,7 @@ class PartRows(CompiledTable):
     """
 
     def __init__(self, frames: CompiledTable, path: str) -> None:
-        parts = frames.schema.within(path)
+        parts = frames.schema.split_part_path(path)
         if parts is None or parts[2]:
             raise SpecError("the frame has no such parts", path=path)
         self.place = parts[:2]

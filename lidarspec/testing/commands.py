@@ -9,7 +9,7 @@ from typing import Any
 from lidarspec.device.session import PendingReply, Reply, Session, get_nested, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.formatting import format_argument_type
-from lidarspec.frames.commands import argument_slot, raw_argument
+from lidarspec.frames.commands import argument_slot, to_raw_argument
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
@@ -93,7 +93,7 @@ def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, flo
             read = texts[argument].encode()
             if isinstance(declared.kind, Range):
                 read = float(read)
-        raw = raw_argument(slot, declared.kind, value, argument, name)
+        raw = to_raw_argument(slot, declared.kind, value, argument, name)
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
             assert abs(read - value) <= abs(slot.info.scale) * 0.5001, (

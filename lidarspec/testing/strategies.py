@@ -36,7 +36,7 @@ from lidarspec.frames.layout import Leaf
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.framing.example_frames import LOW_NUMBERS, make_of_values, switch_keys
+from lidarspec.framing.example_frames import LOW_NUMBERS, draw_frame, switch_keys
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scan import Scan
@@ -538,7 +538,7 @@ def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> b
     source = _DrawnNumbers(draw, ranges_of_values(sensor, frame))
     drawn = {path: functools.partial(_draw_own, strategy) for path, strategy in fields.items()}
     try:
-        return make_of_values(sensor, frame, source, drawn, tries=TRIES)
+        return draw_frame(sensor, frame, source, drawn, tries=TRIES)
     except SpecError:
         if fields or is_often_valid(sensor, frame):
             reject()

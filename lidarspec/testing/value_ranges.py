@@ -26,7 +26,7 @@ from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.frames.layout_tree import UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.framing.example_frames import make_of_values, random_row, return_raw, valid_mask
+from lidarspec.framing.example_frames import draw_frame, draw_row, return_raw, valid_mask
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import VALID
 from lidarspec.sensor_operations import Sensor
@@ -99,7 +99,7 @@ class LayoutRanges:
             elements = itertools.cycle(value.flat)
             fixed[path] = functools.partial(_return_next, elements)
         with contextlib.suppress(SpecError):
-            layout, row = random_row(self._sensor, self._frame, random.Random(0), fixed)
+            layout, row = draw_row(self._sensor, self._frame, random.Random(0), fixed)
             return LayoutRanges(self._sensor, self._frame, layout, self._header, row)
         return None
 
@@ -308,7 +308,7 @@ def ranges_of(
         return LayoutRanges(sensor, frame, layout, values, rows[0])
     fixed = {path: functools.partial(return_raw, value) for path, value in header}
     with contextlib.suppress(SpecError):
-        layout, row = random_row(sensor, frame, random.Random(0), fixed, tries=TRIES)
+        layout, row = draw_row(sensor, frame, random.Random(0), fixed, tries=TRIES)
         return LayoutRanges(sensor, frame, layout, values, row)
     return None
 
@@ -322,7 +322,7 @@ def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...
     """
     sizes: dict[tuple[tuple[str, int], ...], int] = {}
     for seed in range(KNOWN_HEADERS):
-        layout, row = random_row(sensor, frame, random.Random(seed))
+        layout, row = draw_row(sensor, frame, random.Random(seed))
         sizes[_header_of(sensor, frame, row.tobytes())] = layout.size
     return sorted(sizes, key=lambda header: (sizes[header], header))
 
@@ -368,7 +368,7 @@ def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
     frames: set[bytes] = set()
     with contextlib.suppress(SpecError):
         for seed in range(KNOWN_FRAMES):
-            frames.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=MAX_WALKS))
+            frames.add(draw_frame(sensor, frame, random.Random(seed), {}, tries=MAX_WALKS))
     return sorted(frames, key=lambda data: (len(data), data))
 
 
@@ -380,7 +380,7 @@ def is_often_valid(sensor: Sensor, frame: str) -> bool:
 
 def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
     try:
-        make_of_values(sensor, frame, random.Random(seed), {}, tries=1)
+        draw_frame(sensor, frame, random.Random(seed), {}, tries=1)
     except SpecError:
         return False
     return True

@@ -52,7 +52,7 @@ def make_damaged_frames(name: str) -> NDArray[np.uint8]:
 
 
 def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
-    return [(found.frame, found.offset, found.data, found.gap) for found in spans.found()]
+    return [(found.frame, found.offset, found.data, found.gap) for found in spans.to_found()]
 
 
 @each_shape

@@ -143,7 +143,7 @@ def test_the_same_is_found_however_datagrams_are_handed_over(together: int) -> N
     found = [
         decoder.datagrams(sent[start : start + together]) for start in range(0, len(sent), together)
     ]
-    frames = [(one.offset, one.data, one.gap) for frames in found for one in frames.found()]
+    frames = [(one.offset, one.data, one.gap) for frames in found for one in frames.to_found()]
     assert frames == [(one.offset, one.data, one.gap) for one in SENSOR.split(sent)]
     assert len(frames) > 8
 

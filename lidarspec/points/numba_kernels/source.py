@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import (
     FACTORS,
     Node,
+    count_used_axes,
     get_only_field,
     is_full,
     is_nan_where,
-    last_axis,
     traverse,
 )
 from lidarspec.frames.layout import Leaf
@@ -190,7 +190,7 @@ class Expressions(KernelWriter):
                 ("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table)
             )[0]
         )
-        return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
+        return self.let(1 + count_used_axes(node.shape), f"at({name}, {start.text} + {place})")
 
     def is_shared(self, node: Node) -> bool:
         """Return whether an expression depends only on frames of other types.

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import FACTORS, Node, last_axis, make_key, traverse
+from lidarspec.expressions.graph import FACTORS, Node, count_used_axes, make_key, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.lookup_tables import CHEAP, find_window, raw_values, tabulate_values
@@ -301,7 +301,7 @@ class KernelWriter:
         self.shape = shape
         self.width = math.prod(shape)
         self.varying = varying
-        self.inner = 1 + last_axis(shape)
+        self.inner = 1 + count_used_axes(shape)
         self.wanted = KernelArguments()
         self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
         self.angles: list[KernelValue] = []
@@ -369,7 +369,7 @@ class KernelWriter:
         )
         element: KernelValue = self.get_or_make(
             ("element", name, shape),
-            lambda: self.let(1 + last_axis(shape), f"at({name}, {self.index_text(shape)})"),
+            lambda: self.let(1 + count_used_axes(shape), f"at({name}, {self.index_text(shape)})"),
         )
         return element
 
@@ -385,7 +385,7 @@ class KernelWriter:
         found = self.get_or_make(
             ("given", node),
             lambda: self.let(
-                1 + last_axis(node.shape),
+                1 + count_used_axes(node.shape),
                 f"at(g{name}, p * s{name} + {self.index_text(node.shape)})",
             ),
         )
@@ -409,14 +409,14 @@ class KernelWriter:
             four = self._read(leaf, place, "four_at").text
             kind = "int32" if mask >> 31 == 0 else "int64"
             return self.let(
-                1 + last_axis(leaf.shape),
+                1 + count_used_axes(leaf.shape),
                 f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} &"
                 f" np.uint32({mask}))",
             )
         text = write_integer(leaf, lambda offset: self.byte(leaf, offset).text)
         if text is None:
             return None
-        return self.let(1 + last_axis(leaf.shape), text)
+        return self.let(1 + count_used_axes(leaf.shape), text)
 
     def _float(self, leaf: Leaf) -> KernelValue | None:
         if leaf.wire is None or leaf.wire.kind != "f" or leaf.wire.itemsize < 4:
@@ -440,7 +440,7 @@ class KernelWriter:
             reader: the name of the function in `arithmetic`.
         """
         shape = leaf.shape[: len(leaf.strides)]
-        level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
+        level = 1 + count_used_axes(leaf.shape[: len(leaf.strides)])
         steps = self.get_or_make(
             ("element", shape, leaf.strides),
             lambda: self.let(level, f"base + {self.format_index(shape, self._strides(leaf))}"),

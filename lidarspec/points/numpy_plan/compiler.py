@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import (
     Node,
     Term,
+    count_used_axes,
     get_only_field,
     is_full,
-    last_axis,
     make_key,
     split_sum,
 )
@@ -320,7 +320,7 @@ class Compiler:
         """
         index, table = node.args
         inner = table.shape[1]
-        inner_shape = self._shape[last_axis(index.shape) :]
+        inner_shape = self._shape[count_used_axes(index.shape) :]
         if is_full(index, self._width) or inner != int(np.prod(inner_shape)):
             return None
         self.low.append(index)
