@@ -13,7 +13,7 @@ from fractions import Fraction
 from typing import Any
 
 from lidarspec.errors import OutOfRange, UnknownCommand, UnknownField, UsageError
-from lidarspec.frames.commands import argument_slot
+from lidarspec.frames.commands import find_argument_slot
 from lidarspec.frames.encode import read_given
 from lidarspec.frames.field_paths import Steps, is_index, put_value, split_path
 from lidarspec.frames.schema import Schema
@@ -190,7 +190,7 @@ def parse_arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> di
             raise UsageError(f"{sensor.id} {name}: {text!r} is not argument=value")
         if argument not in command.args or command.frame is None:
             raise UnknownField(argument, command.args, place=f"{sensor.id} {name}")
-        slot = argument_slot(sensor, name, argument)
+        slot = find_argument_slot(sensor, name, argument)
         kind = command.arguments[argument].kind
         place = f"{sensor.id} {name}: {argument}"
         if isinstance(kind, Range) and slot.info.labels and not _begins_a_number(value.strip()):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
-from lidarspec.frames.commands import argument_slot, has_only_names, list_choices
+from lidarspec.frames.commands import find_argument_slot, has_only_names, list_choices
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
 from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
@@ -405,7 +405,7 @@ def describe_argument(sensor: Sensor, command: str, argument: str, between: str 
     """Return the values that an argument accepts as text: names, a range, or both."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
-        choices = list_choices(argument_slot(sensor, command, argument).info, kind)
+        choices = list_choices(find_argument_slot(sensor, command, argument).info, kind)
         if has_only_names(kind, choices):
             return "|".join(choices)
         return "|".join([*choices, format_argument_type(kind, between)])

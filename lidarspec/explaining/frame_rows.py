@@ -12,7 +12,7 @@ from lidarspec.errors import WireError
 from lidarspec.explaining.formatting import ExplainedRow, FieldValue
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout_tree import frame_layouts
-from lidarspec.frames.plain import plain_fields
+from lidarspec.frames.plain import list_plain_fields
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
@@ -74,7 +74,7 @@ class FrameRows:
         Returns None if the frame type is not compiled and construct cannot parse the bytes.
         """
         if isinstance(frame_layouts(frame), NotCompilableError):
-            return plain_fields(frame, struct)
+            return list_plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.max_struct_bytes)
         with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
             self._verdicts = {seal.path: _describe_checksum(seal) for seal in examined.seals()}

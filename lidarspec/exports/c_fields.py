@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from lidarspec.exports import ExportedFrame, ExportError, find_references
-from lidarspec.frames.wire_table import SizeFormula, describe_field, unit_text
+from lidarspec.frames.wire_table import SizeFormula, describe_field, format_unit
 from lidarspec.spec import tree
 
 #: The C code of each operation. Comparisons contain a function call, because compilers warn of a
@@ -551,7 +551,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
         f"#define {name.upper()}_{identifier(label).upper()} {value}"
         for value, label in first.info.labels.items()
     )
-    yield comment(unit_text(first.info), describe_field(first.info))
+    yield comment(format_unit(first.info), describe_field(first.info))
     if isinstance(first.node, tree.Blob):
         kind = ""
         sizes = [

@@ -24,9 +24,9 @@ from lidarspec.frames.wire_table import (
     extent,
     format_bits,
     format_formula,
+    format_unit,
     frame_size,
     list_branches,
-    unit_text,
 )
 from lidarspec.spec import Sensor, tree
 
@@ -160,7 +160,7 @@ class _ItemBuilder:
         short = {"uint": "u", "int": "s", "float": "float "}[
             node.kind
         ] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
-        detail = " ".join(filter(None, (short, unit_text(node.info))))
+        detail = " ".join(filter(None, (short, format_unit(node.info))))
         if node.info.const is not None:
             if isinstance(node.info.const, int):
                 detail = f"{node.info.const:#0{2 * node.size + 2}x}"
@@ -220,7 +220,7 @@ class _ItemBuilder:
         else:
             numbers = f"{low}"
         if width == part.bits.width:
-            detail = unit_text(part.info)
+            detail = format_unit(part.info)
         else:
             detail = numbers
         return self._make_cell(part.info, name, width, detail, format_bits(part.bits), start)
@@ -240,7 +240,7 @@ class _ItemBuilder:
         description = (
             info.path,
             kind,
-            unit_text(info),
+            format_unit(info),
             describe_field(info),
             seal.algorithm.describe() if seal else "",
         )

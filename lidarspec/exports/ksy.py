@@ -28,7 +28,7 @@ from lidarspec.exports import (
     list_frames,
     make_prefix,
 )
-from lidarspec.frames.wire_table import describe_field, unit_text
+from lidarspec.frames.wire_table import describe_field, format_unit
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
@@ -597,7 +597,7 @@ class _KaitaiWriter:
             unchecked = "a length, which is not checked here"
         else:
             unchecked = ""
-        text = "; ".join(filter(None, (unit_text(info), describe_field(info), unchecked, sealed)))
+        text = "; ".join(filter(None, (format_unit(info), describe_field(info), unchecked, sealed)))
         if text:
             return {"doc": text}
         return {}

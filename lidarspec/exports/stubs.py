@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from lidarspec.exports import ExportedFrame, ExportError, list_frames
-from lidarspec.frames.commands import argument_slot, list_choices
+from lidarspec.frames.commands import find_argument_slot, list_choices
 from lidarspec.frames.schema import make_schema
-from lidarspec.frames.wire_table import describe_field, unit_text
+from lidarspec.frames.wire_table import describe_field, format_unit
 from lidarspec.spec import Sensor
 from lidarspec.spec.arguments import Address, Octets, Port, Range, Text
 from lidarspec.spec.tree import (
@@ -147,7 +147,9 @@ class _StubClasses:
             else:
                 infos = []
         description = "; ".join(
-            filter(None, (text(info) for info in infos[:1] for text in (unit_text, describe_field)))
+            filter(
+                None, (text(info) for info in infos[:1] for text in (format_unit, describe_field))
+            )
         )
         line = f"    {name}: {kind}" + (
             "  # a keyword: getattr()" if keyword.iskeyword(name) else ""
@@ -273,7 +275,7 @@ def _write_command(sensor: Sensor, name: str) -> str:
 def _argument_type(sensor: Sensor, command: str, argument: str) -> str:
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
-        choices = list_choices(argument_slot(sensor, command, argument).info, kind)
+        choices = list_choices(find_argument_slot(sensor, command, argument).info, kind)
         if choices:
             return f"float | Literal[{', '.join(map(repr, choices))}]"
     return ARGUMENT_TYPES[type(kind)]

@@ -437,7 +437,8 @@ def align(
     """Align columns and other arrays, so that they broadcast.
 
     Returns:
-        The arrays, the names of their common axes, and the smallest `ready` of the columns.
+        The arrays, the names of their common axes, and the smallest `ready` of the columns (see
+        `Column`).
 
     Raises:
         SpecError: if the values belong to different arrays of the frame.
@@ -515,7 +516,9 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
     """Return the common name of an axis of two values.
 
-    A name is None if the axis has no name in that value.
+    Args:
+        first: the name of the axis in the first value; None without a name.
+        name: the name of the axis in the second value; None without a name.
 
     Raises:
         SpecError: if the names belong to different arrays, and neither was guessed.

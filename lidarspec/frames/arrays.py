@@ -52,7 +52,7 @@ def count_up(count: int) -> NDArray[np.int64]:
     return np.arange(count)
 
 
-def is_counted(numbers: NDArray[np.int64]) -> bool:
+def is_count_up(numbers: NDArray[np.int64]) -> bool:
     """Return whether an array is from `count_up`, so that its values ascend."""
     return numbers.base is _shared_numbers() and numbers.strides[0] > 0
 

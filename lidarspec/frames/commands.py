@@ -68,7 +68,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
             filled = copy.deepcopy(value)
         values = put_value(values, split_path(path), filled)
     for argument, declared in command.arguments.items():
-        slot = argument_slot(sensor, name, argument)
+        slot = find_argument_slot(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
         if declared.path in command.templates:
@@ -115,7 +115,7 @@ class ArgumentSlot:
     in_template: bool = False
 
 
-def argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
+def find_argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
     """Return the field that an argument of a command is written to.
 
     Raises:
@@ -126,7 +126,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     slot = _make_slot(sensor, name, declared.path, place)
     template = sensor.commands[name].templates.get(declared.path)
     if template is not None:
-        return _template_slot(sensor, template, declared, argument, place)
+        return _find_template_slot(sensor, template, declared, argument, place)
     if isinstance(declared.kind, Range):
         takes = {"int", "float"}
     else:
@@ -157,7 +157,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     return slot
 
 
-def _template_slot(
+def _find_template_slot(
     sensor: SensorDescription, template: Template, declared: Argument, argument: str, place: str
 ) -> ArgumentSlot:
     """Return the slot of an argument that is a part of a template."""

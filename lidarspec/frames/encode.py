@@ -233,7 +233,7 @@ class _Encoder:
         for index in reversed(range(len(parts))):
             kind = kinds[index]
             part = parts[index]
-            fill_in(kind.following, part, following, make_schema(kind.root).fields, node.axis)
+            set_count(kind.following, part, following, make_schema(kind.root).fields, node.axis)
             prefix = self._make_shown_path(f"{node.axis}[{index}]")
             encoder = _Encoder(layouts[kind], part, self._place, prefix, around)
             encoded.insert(0, encoder.encode())
@@ -243,8 +243,8 @@ class _Encoder:
         rules = ((node.count, len(encoded)), (node.size, following), (node.within, total))
         for formula, value in rules:
             if node.is_array and formula is not None:
-                remove_held(formula, self._given, fields)
-            fill_in(formula, self._given, value, fields, node.axis)
+                remove_computed_count(formula, self._given, fields)
+            set_count(formula, self._given, value, fields, node.axis)
         return encoded
 
     def _collect(self, node: Node, value: Any, path: str, shown: str, layout: Layout) -> None:
@@ -522,26 +522,28 @@ def fill_counts(given: Container, table: Schema) -> None:
         counted.add(path)
         if axis in table.branched and get_member(given, path, None) is not None:
             continue  # the branch, and so the formula of the length, is not known yet
-        remove_held(count, given, table.fields)
-        fill_in(count, given, len(array), table.fields, axis)
+        remove_computed_count(count, given, table.fields)
+        set_count(count, given, len(array), table.fields, axis)
 
 
-def remove_held(formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]) -> None:
-    """Remove the field that a formula depends on, if this field is always computed."""
+def remove_computed_count(
+    formula: Formula | None, given: Container, fields: Mapping[str, FieldInfo]
+) -> None:
+    """Remove the count field of a formula from the values, if it is always computed."""
     path = None if formula is None else find_count_field(formula, fields)
     if path is not None and fields[path].held:
         holder, name = _find_holder(given, path)
         holder.pop(name, None)
 
 
-def fill_in(
+def set_count(
     formula: Formula | None,
     given: Container,
     value: int,
     fields: Mapping[str, FieldInfo],
     axis: str,
 ) -> None:
-    """Set the field that a formula depends on, so that the formula has a given value.
+    """Set the count field of a formula, so that the formula has a given value.
 
     A field that already has a value is not changed.
 

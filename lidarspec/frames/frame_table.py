@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.arrays import add_axes, count_up, is_counted, repeat
+from lidarspec.frames.arrays import add_axes, count_up, is_count_up, repeat
 from lidarspec.frames.layout import Bytes2D, Derivation, Layout, Leaf, gather_rows
 from lidarspec.frames.schema import Schema, make_schema, without_indices
 from lidarspec.spec.syntax import get_member, iter_leaves
@@ -114,7 +114,7 @@ class CompiledTable:
         info = self.schema.columns[path]
         sequence = self.schema.find_sequence(path)
         if sequence is not None:
-            return self._raw_of_elements(sequence, path)
+            return self._load_elements(sequence, path)
         dtype = info.dtype or np.dtype(object)  # a computed constant may be any object
         if len(self.groups) == 1:
             group = self.groups[0]
@@ -155,7 +155,7 @@ class CompiledTable:
             return None
         sequence = self.schema.find_sequence(path)
         if sequence is not None:
-            return self._present_of_elements(sequence, path)
+            return self._find_present_elements(sequence, path)
         there = np.zeros(len(self), np.bool_)
         for group in self.groups:
             is_empty = any(
@@ -195,7 +195,7 @@ class CompiledTable:
             self._arrays[axis] = _Elements(table, owners, ranks, counts)
         return self._arrays[axis]
 
-    def _raw_of_elements(self, axis: str, path: str) -> NDArray[Any]:
+    def _load_elements(self, axis: str, path: str) -> NDArray[Any]:
         """Return the raw values of a field in an array of elements that differ in size."""
         base, indices = without_indices(path)
         if indices:
@@ -208,7 +208,7 @@ class CompiledTable:
         elements.store(column, elements.table.raw(path[len(axis) + 1 :]))
         return column
 
-    def _present_of_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
+    def _find_present_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
         """Return which frames have a field in an array of elements that differ in size.
 
         The result is (n,) if each frame has the field in all of its elements or in none. A frame
@@ -217,7 +217,7 @@ class CompiledTable:
         """
         base, indices = without_indices(path)
         if indices:
-            return _present_element(self, base, indices)
+            return _has_element(self, base, indices)
         elements = self._elements(axis)
         there = elements.table.present(path[len(axis) + 1 :])
         if there is None:
@@ -493,7 +493,7 @@ def _address(array: NDArray[Any]) -> int:
 
 def is_ascending(where: NDArray[np.intp]) -> bool:
     """Return whether indices ascend strictly."""
-    return is_counted(where) or bool(
+    return is_count_up(where) or bool(
         np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0)
     )
 
@@ -544,7 +544,7 @@ class ParsedTable:
             return None
         axes, (base, indices) = self.schema.columns[path].axes, without_indices(path)
         if indices:
-            return _present_element(self, base, indices)
+            return _has_element(self, base, indices)
         there = [
             _find_present(_collect_values(parsed, path.split("."), len(axes)))
             for parsed in self._parsed
@@ -651,7 +651,7 @@ def _take_element(
     return np.where(add_axes(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
 
 
-def _present_element(table: Table, path: str, indices: Mapping[str, int]) -> NDArray[np.bool_]:
+def _has_element(table: Table, path: str, indices: Mapping[str, int]) -> NDArray[np.bool_]:
     """Return whether each frame has one element of a field's arrays, (n,)."""
     base_present = table.present(path)
     is_of_frames = base_present is None or base_present.ndim == 1

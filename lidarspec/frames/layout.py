@@ -138,7 +138,7 @@ class Leaf:
         columns = [self._read_bits(rows, element) for element in self.elements]
         return np.stack(columns, axis=-1)
 
-    def scalar(self, frame: bytes | memoryview) -> int:
+    def read_scalar(self, frame: bytes | memoryview) -> int:
         """Return the raw value of an integer field outside arrays in one frame."""
         if self.elements:
             return self.elements[0].value(frame[self.offset : self.offset + self.size])
@@ -179,7 +179,7 @@ class Leaf:
         Returns None if the bytes end before the end of the field.
         """
         if self.offset + self.size <= len(frame):
-            return self.scalar(frame)
+            return self.read_scalar(frame)
         return None
 
     def store(self, rows: Bytes2D, values: Any) -> None:
@@ -500,7 +500,7 @@ class Seal:
                     << shift
                 )
             else:
-                stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
+                stored |= (leaf.read_scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
         covered = [frame[start:end] for start, end in self.spans]
         return stored in self.absent or stored == self._single(

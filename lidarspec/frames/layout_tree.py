@@ -501,7 +501,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield (field, value) for values that follow from constants and header fields."""
+        """Yield pairs of a field and its value, if the value follows from the header."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -890,13 +890,13 @@ class HeaderTree:
     def group_by_layout(
         self, number: int, read: Reader, places: _CandidateSet | None = None
     ) -> list[Group]:
-        """Group candidates by layout, as `classify` does.
+        """Group candidates by layout.
 
         Args:
             number: the number of candidates.
             read: a function that reads the field of a node for some candidates.
-            places: the candidates in their buffer, for reading single headers. If None, only `read`
-                is used.
+            places: the candidates, whose bytes are used for single headers; None to use only
+                `read`.
         """
         self._limit_cache()
         groups: list[Group] = []
@@ -942,7 +942,7 @@ class HeaderTree:
             leaves = self._root.before
         return tuple(leaves.values()), find_prefix(self.root, self.limit)
 
-    def common(self, rows: NDArray[np.uint8]) -> Layout | None:
+    def find_common_layout(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of rows of bytes; None if their layouts differ.
 
         If rows have different values of a header field, the values must be equivalent
@@ -969,10 +969,10 @@ class HeaderTree:
             return node.result
         return None
 
-    def header(
+    def find_node(
         self, frame: bytes, *, since: HeaderNode | None = None, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Return the node that the available bytes of a header lead to.
+        """Return the last node that the available bytes of a header determine.
 
         The node has a result, or a header field that is not completely available.
 

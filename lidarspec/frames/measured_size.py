@@ -52,14 +52,21 @@ class MeasuredSize(ABC):
     def read(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> tuple[Offsets | None, NDArray[Any]]:
-        """Return sizes as `Leaf.read` does.
+        """Find the size in the candidates at these offsets.
 
-        If the content cannot be valid, the size is the status of the frame with a minus sign.
+        Args:
+            stops: the offset after the last byte of each candidate; by default the end of the
+                buffer.
+
+        Returns:
+            The indices of the candidates in which the size was found (None for all candidates), and
+            the sizes. If the content cannot be
+            valid, the size is the status of the frame with a minus sign.
         """
 
     @abstractmethod
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return sizes as `Leaf.load` does.
+        """Return the size in each frame, given as a row of bytes, (n,).
 
         If the content is incomplete or invalid, the size is the status of the frame with a minus
         sign.

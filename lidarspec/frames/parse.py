@@ -24,7 +24,7 @@ from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Derivation, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
-from lidarspec.frames.plain import parse_plain, plain_fault
+from lidarspec.frames.plain import find_plain_fault, parse_plain
 from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import ExaminedFrame, examine
@@ -172,7 +172,7 @@ def _find_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     """Return the first fault of an invalid frame as an error."""
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilableError):
-        return plain_fault(sensor, name, data)
+        return find_plain_fault(sensor, name, data)
     decoded = frame_coder(frame).decode(data)
     problem = decoded.problem
     if problem is not None:
@@ -259,7 +259,7 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
         try:
             return parse_plain(frame, data, verify=False)[0]
         except Exception:
-            raise plain_fault(sensor, name, data) from None
+            raise find_plain_fault(sensor, name, data) from None
     decoded = frame_coder(frame).decode(data)
     examined = examine(frame.tree, decoded.struct, frame.max_struct_bytes)
     shortage = _run_search(sensor, name, diagnose.find_shortage, examined)

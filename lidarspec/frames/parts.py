@@ -369,9 +369,9 @@ class _PartWalk:
         return which[matches]
 
     def _check_bounds(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the next part is complete and has the announced size.
+        """Return the frames in which the next part is complete and has the right size.
 
-        This sets the status of all other frames.
+        Sets the status of all other frames.
         """
         ends = self._ends[which] + layout.size
         announced = self._announced[which]
@@ -434,7 +434,7 @@ class _PartWalk:
             leaf = layout.leaves.get(path)
             if leaf is None:
                 return None
-            return leaf.scalar(part)
+            return leaf.read_scalar(part)
 
         try:
             return min(int(tree.evaluate(formula, read)), self._region.limit + 1)
@@ -444,9 +444,9 @@ class _PartWalk:
 
 
 def _fits_columns(formula: tree.Formula) -> bool:
-    """Return whether columns of 64 bits represent a part of a formula exactly.
+    """Return whether 64-bit columns represent a part of a formula exactly.
 
-    This is so for fields, for numbers, and for comparisons of both.
+    This is true for fields, for comparisons, and for numbers that are not too large.
     """
     if isinstance(formula, tree.Op):
         return formula.symbol in tree.COMPARISONS
@@ -512,10 +512,6 @@ class PartsSize(MeasuredSize):
     def read(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> tuple[Offsets | None, NDArray[Any]]:
-        """Return sizes as `Leaf.read` does.
-
-        If the parts cannot be valid, the size is the status of the frame with a minus sign.
-        """
         walked = self.region.walk(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
         cut_off = walked.status == CUT_OFF
@@ -530,9 +526,5 @@ class PartsSize(MeasuredSize):
         return there, values[there]
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return sizes as `Leaf.load` does.
-
-        If not all parts were found, the size is the status of the frame with a minus sign.
-        """
         walked = self.region.find_parts(rows)[1]
         return np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))

@@ -92,7 +92,7 @@ def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
     return EnumIntegerString.new(value, info.labels[value])
 
 
-def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
+def list_plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
     """Return the fields of the frame at the start of some bytes; None if parsing fails."""
     try:
         values = frame.prepared.parse(data, _verify=False)
@@ -147,7 +147,7 @@ def _has_spans(value: Any, start: int, end: int) -> bool:
     return bool(min(spans)[0] >= start and max(stop for _, stop in spans) <= end)
 
 
-def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
+def find_plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     """Return the first fault of bytes that are not a valid frame of this type.
 
     Raises:

@@ -107,7 +107,7 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Return whether computing row by row is faster than NumPy for all rows."""
+    """Return whether computing the rows one by one is faster than all at once."""
     if not isinstance(algorithm, Crc):
         return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
@@ -418,7 +418,7 @@ def make_place_tables(
 def _compute_narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
-    """Return `compute_registers` of registers of at most one byte, as uint8."""
+    """Return the result of `compute_registers` for registers of at most one byte."""
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)

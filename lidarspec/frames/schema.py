@@ -245,9 +245,9 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the array of parts at a path, or around the field at a path.
+        """Return the array of parts that a path leads to, or through.
 
-        Returns None if there is no such array.
+        Returns None if the path leads to no array of parts.
         """
         if not self.parts:
             return None

@@ -105,10 +105,10 @@ class _FieldFinder:
 
     def __init__(self, tree: HeaderTree) -> None:
         self._tree = tree
-        self._node = tree.header(b"")
+        self._node = tree.find_node(b"")
 
     def __call__(self, struct: bytes) -> Sequence[Run]:
-        self._node = self._tree.header(struct, since=self._node)
+        self._node = self._tree.find_node(struct, since=self._node)
         if isinstance(self._node.leaf, MeasuredSize):
             raise SpecError(
                 "frames of text cannot contain parts",
@@ -191,7 +191,7 @@ class FormCoder(Coder):
 
     def find_refusal(self, struct: bytes) -> LayoutRefusal | None:
         """Return why a struct cannot have a layout; None if it may have one."""
-        result = self.tree.header(struct).result
+        result = self.tree.find_node(struct).result
         if isinstance(result, LayoutRefusal):
             return result
         return None
@@ -201,7 +201,7 @@ class FormCoder(Coder):
             known = self.decode(spelling)
             if known.problem is None and known.struct == struct:
                 return spelling
-        layout = self.tree.header(struct, is_whole_frame=True).result
+        layout = self.tree.find_node(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
         data = self.form.encode(struct, list_runs(layout))
@@ -250,7 +250,7 @@ class FormCoder(Coder):
         if decoded.problem is not None and decoded.problem.reason:
             return decoded.problem
         struct = decoded.struct
-        node = self.tree.header(struct, is_whole_frame=True)
+        node = self.tree.find_node(struct, is_whole_frame=True)
         is_layout = isinstance(node.result, Layout) and node.result.size == len(struct)
         if decoded.problem is None and is_layout:
             return None

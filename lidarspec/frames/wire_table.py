@@ -105,8 +105,8 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
     """Return the size of a part.
 
     Args:
-        shown: the path of the part. It is used for a size that only the bytes of the part
-            determine, as in "size(points[i].text)".
+        shown: the path of the part. If only the bytes of the part determine its size, the result
+            contains this path: "size(points[i].text)".
     """
     match node:
         case tree.Number() | tree.Block():
@@ -250,7 +250,7 @@ def _make_row(
     seals: Mapping[str, str],
 ) -> WireRow:
     says = "; ".join(filter(None, (condition, describe_field(info), seals.get(info.path, ""))))
-    return WireRow(offset, size, kind, shown, unit_text(info), says)
+    return WireRow(offset, size, kind, shown, format_unit(info), says)
 
 
 def _make_part_path(shown: str, part: tree.Part) -> str:
@@ -362,7 +362,7 @@ def format_bits(bits: BitField) -> str:
     return ("signed, " if bits.signed else "") + ", ".join(parts)
 
 
-def unit_text(info: tree.FieldInfo) -> str:
+def format_unit(info: tree.FieldInfo) -> str:
     """Return scale, unit and offset of a field, such as "0.01 deg - 327.68"."""
     if not info.scaled:
         return info.unit

@@ -186,9 +186,9 @@ class FragmentAssembler:
             payload = datagram[leaf.offset : leaf.offset + leaf.size]
         else:
             payload = datagram[layout.size :]
-        key = tuple(layout.leaves[path].scalar(datagram) for path in rule.keys)
-        index = layout.leaves[rule.index].scalar(datagram) - rule.first
-        count = layout.leaves[rule.count].scalar(datagram)
+        key = tuple(layout.leaves[path].read_scalar(datagram) for path in rule.keys)
+        index = layout.leaves[rule.index].read_scalar(datagram) - rule.first
+        count = layout.leaves[rule.count].read_scalar(datagram)
         is_whole = len(datagram) == layout.size or not rule.payload
         if is_whole and 0 <= index < count:
             return _Fragment(key, index, count, payload)

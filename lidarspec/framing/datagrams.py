@@ -38,7 +38,7 @@ from lidarspec.framing.results import (
 def sort_datagrams(
     framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: SearchState
 ) -> PieceResult:
-    """Return the type of each datagram.
+    """Find the type of each datagram.
 
     Args:
         buffer: the bytes that contain the datagrams.
@@ -80,7 +80,7 @@ class _DatagramBatch:
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
     def sort(self, mode: SearchState) -> PieceResult:
-        """Return the type of each datagram."""
+        """Find the type of each datagram."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
@@ -217,7 +217,7 @@ class _DatagramBatch:
                 frames = frames.select(slice(0, begun))
                 break
         counted = (reasons != PLUGIN) & (lost < len(frames))
-        self._count(reasons[counted], frames.sizes[lost[counted]], mode)
+        self._count_by_reason(reasons[counted], frames.sizes[lost[counted]], mode)
         if parts:
             return Frames.join([*parts, frames.select(slice(begun, None))])
         return frames
@@ -243,14 +243,16 @@ class _DatagramBatch:
                 )
             rejected = max(rejected, int(frame.status[0]) or LENGTH)
             self._piece.errors += frame.errors
-        self._count(np.array([rejected], np.uint8), size, mode)
+        self._count_by_reason(np.array([rejected], np.uint8), size, mode)
         return None
 
-    def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState) -> None:
-        """Count datagrams as rejected.
+    def _count_by_reason(
+        self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState
+    ) -> None:
+        """Count rejected datagrams by reason.
 
-        A datagram without the constants of a frame counts as `bad_constant`, or as `bad_length` if
-        it is too short to have them.
+        The reason is `bad_constant` if a datagram has the constants of no type, or `bad_length` if
+        it is too short for them.
         """
         least = min(self._framing.ends[kind] for kind in self._framing.active_types(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))

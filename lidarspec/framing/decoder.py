@@ -397,9 +397,13 @@ class Decoder:
         )
 
     def _count_gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """Count skipped bytes in a piece, and return their number before each frame.
+        """Count skipped bytes in a piece; return their number before each frame.
 
-        Fillers are not included in these numbers. The piece ends at `end`.
+        Args:
+            end: the offset of the end of the piece.
+
+        Returns:
+            The number of skipped bytes before each frame, without fillers.
         """
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
@@ -416,7 +420,7 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count skipped bytes, and return the number of non-fillers at each place, (n,).
+        """Count skipped bytes; return their number at each place, without fillers, (n,).
 
         Args:
             buffer: the bytes.

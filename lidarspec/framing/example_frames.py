@@ -434,5 +434,5 @@ def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
 
 
 def return_raw(raw: int, _: random.Random) -> int:
-    """Return a given raw value. It is used in place of functions that draw values."""
+    """Return `raw`; this is used as a function that draws a value."""
     return raw

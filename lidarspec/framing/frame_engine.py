@@ -147,9 +147,9 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse candidates that are too long.
+        """Refuse candidates that are too long, and all candidates in a stream.
 
-        This is for frame types that extend to the end of the datagram. A stream has none of them.
+        This is used for frame types that extend to the end of the datagram.
         """
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:
@@ -198,7 +198,7 @@ class CompiledCodec(Codec):
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        layout = self.layout or self.tree.common(rows)
+        layout = self.layout or self.tree.find_common_layout(rows)
         if layout is None or layout.size != rows.shape[1]:
             return None
         errors: list[PluginError] = []

@@ -119,7 +119,7 @@ class Counters:
         """Return the counters by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
-    def error(self, failure: PluginError, number: int) -> None:
+    def count_error(self, failure: PluginError, number: int) -> None:
         """Count packets for which a function of the plugin raised an error.
 
         The first few errors are kept.

@@ -278,14 +278,13 @@ def _have_valid_checksums(
 ) -> NDArray[np.bool_]:
     """Return whether each candidate has the right checksum, (n,).
 
-    The rows have the size of the longest layout. In each row, the bytes after the covered bytes,
-    such as the stored checksum, are first moved to the end of the row.
-
     Args:
         seal: the checksum in the longest layout.
+        rows: the candidates, in rows of the size of the longest layout.
         sizes: the sizes of the candidates, (n,).
         sums: a function that computes checksums.
     """
+    # The bytes after the covered bytes, such as the stored checksum, move to the end of the row.
     size = rows.shape[1]
     tail = size - seal.spans[-1][1]
     stops = sizes - tail

@@ -169,7 +169,7 @@ class ClockMonitor:
             events = self._read_status(packets)
             readings = clock_ns(packet_type.timed_sensor, packets.batch())
         except Exception as error:  # the plugin's functions
-            packets.stats.error(PluginError.of(error, "clock"), len(packets))
+            packets.stats.count_error(PluginError.of(error, "clock"), len(packets))
             return []
         self._device_ns = packets.time_ns.item(-1)
         known = packets.host_ns > 0

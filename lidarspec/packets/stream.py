@@ -188,7 +188,7 @@ class PacketStream:
         try:
             return function(batch, *args)
         except Exception as error:
-            self.stats.error(PluginError.of(error, declaration), len(batch))
+            self.stats.count_error(PluginError.of(error, declaration), len(batch))
             return fallback
 
     def _read_times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
@@ -411,7 +411,7 @@ def read_imu(packets: Packets) -> ImuSamples:
     try:
         return packets.imu()
     except SpecError as error:
-        packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
+        packets.stats.count_error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
         return join_samples([])
 
 

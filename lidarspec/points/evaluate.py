@@ -224,7 +224,7 @@ def evaluate_guarded(
     try:
         points = evaluate(packets, carry, final=final, epoch=epoch)
     except SpecError as error:
-        packets.stats.error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
+        packets.stats.count_error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None
     packets.stats.nominal |= bool(points.source.nominal)
     return points

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.encode import fill_in, find_kind
+from lidarspec.frames.encode import find_kind, set_count
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
@@ -254,7 +254,7 @@ class FrameMaker:
             raw: dict[str, Any] = {}
             for path in paths[1:]:
                 set_nested(raw, path, self._raw(values, path))
-            fill_in(formula, raw, number, self.schema.fields, axis)
+            set_count(formula, raw, number, self.schema.fields, axis)
             values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
     def _layout(self, values: Values) -> Layout:

@@ -9,7 +9,7 @@ from typing import Any
 from lidarspec.device.session import PendingReply, Reply, Session, get_nested, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.formatting import format_argument_type
-from lidarspec.frames.commands import argument_slot, to_raw_argument
+from lidarspec.frames.commands import find_argument_slot, to_raw_argument
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.results import Found
@@ -39,7 +39,7 @@ def arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, An
 
 
 def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
-    slot = argument_slot(sensor, name, key)
+    slot = find_argument_slot(sensor, name, key)
     kind = sensor.commands[name].arguments[key].kind
     match kind:
         case Choice(names=names):
@@ -84,7 +84,7 @@ def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, flo
             f"{path} is {get_nested(parsed, path)}, expected {value}"
         )
     for argument, value in arguments_given.items():
-        slot = argument_slot(sensor, name, argument)
+        slot = find_argument_slot(sensor, name, argument)
         declared = command.arguments[argument]
         read = get_nested(parsed, declared.path)
         if declared.path in command.templates:

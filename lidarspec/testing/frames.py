@@ -183,7 +183,7 @@ def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> Non
         ]
         for leaf, step in ((leaf, step) for leaf in leaves for step in (1, -1)):
             rows = np.frombuffer(data, np.uint8).reshape(1, -1).copy()
-            leaf.store(rows, leaf.scalar(data) + step)
+            leaf.store(rows, leaf.read_scalar(data) + step)
             for seal in layout.seals:
                 seal.fill(rows)
             other = rows.tobytes()
@@ -193,8 +193,8 @@ def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> Non
                 require(
                     built == other,
                     "LS312",
-                    f"the value {leaf.scalar(other)} is accepted when parsing, but building"
-                    f" writes {leaf.scalar(built)}",
+                    f"the value {leaf.read_scalar(other)} is accepted when parsing, but building"
+                    f" writes {leaf.read_scalar(built)}",
                     path,
                 )
 

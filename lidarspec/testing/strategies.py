@@ -31,7 +31,7 @@ from hypothesis.strategies import DrawFn, SearchStrategy
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownCommand, UnknownFrame, UsageError
-from lidarspec.frames.commands import ArgumentSlot, argument_slot
+from lidarspec.frames.commands import ArgumentSlot, find_argument_slot
 from lidarspec.frames.layout import Leaf
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
@@ -163,7 +163,7 @@ def commands(sensor: str | Sensor, name: str | None = None) -> SearchStrategy[Co
 
 def _command(sensor: Sensor, name: str) -> SearchStrategy[Command]:
     arguments = {
-        argument: _argument_values(argument_slot(sensor, name, argument), declared.kind)
+        argument: _argument_values(find_argument_slot(sensor, name, argument), declared.kind)
         for argument, declared in sensor.commands[name].arguments.items()
     }
     return st.tuples(st.just(name), st.fixed_dictionaries(arguments))

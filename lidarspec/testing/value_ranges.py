@@ -336,7 +336,7 @@ def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, in
         except UnknownSelectorError as unknown:
             leaf = unknown.leaf
             if isinstance(leaf, Leaf):
-                values[leaf.info.path] = leaf.scalar(struct)
+                values[leaf.info.path] = leaf.read_scalar(struct)
         else:
             return tuple(values.items())
 

@@ -7,7 +7,7 @@ from typing import Any
 from lidarspec import Sensor
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.exports.reference import effect
-from lidarspec.frames.commands import argument_slot, has_only_names, list_choices
+from lidarspec.frames.commands import find_argument_slot, has_only_names, list_choices
 from lidarspec.spec.arguments import Range
 
 
@@ -54,7 +54,7 @@ def _find_group(sensor: Sensor, name: str) -> str:
 def _describe_argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
     """Return the description of the input field for an argument."""
     kind = sensor.commands[name].arguments[argument].kind
-    info = argument_slot(sensor, name, argument).info
+    info = find_argument_slot(sensor, name, argument).info
     field = {"name": argument, "unit": info.unit, "default": None}
     if not isinstance(kind, Range):
         text = ": ".join(filter(None, (info.docs, format_argument_type(kind))))
