@@ -30,7 +30,7 @@ from construct import (
 )
 
 from lidarspec import SpecError
-from lidarspec.exports import messages
+from lidarspec.exports import list_frames
 from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
@@ -222,7 +222,7 @@ def test_one_field_has_one_unit() -> None:
 def test_exports_omit_unreachable_branches() -> None:
     (found,) = [
         node
-        for node in nodes(messages(sensor(CHOICES["names and numbers"]))[0].root)
+        for node in nodes(list_frames(sensor(CHOICES["names and numbers"]))[0].root)
         if isinstance(node, Select)
     ]
     assert [key for key, _ in found.cases] == [2, 3]
