@@ -1,4 +1,4 @@
-"""Functions that make simple arrays quickly, and settings of the memory allocator.
+"""Functions that make simple arrays quickly, find equal values, and set the memory allocator.
 
 The arrays have one repeated value, consecutive numbers, or selected rows of another array.
 """
@@ -88,8 +88,32 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
         return [(value, np.flatnonzero(values == value)) for value in sorted(values_found)]
     order = np.argsort(values, kind="stable")
     ordered = values[order]
-    edges = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist(), len(values)]
-    return [(ordered.item(start), order[start:stop]) for start, stop in pairwise(edges)]
+    return [(ordered.item(run.start), order[run]) for run in split_runs(ordered)]
+
+
+def mark_changes(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return a mask of the rows that differ from the row before, (n,).
+
+    The first row counts as different.
+
+    Args:
+        columns: one or more arrays, (n,) each. A row has one value of each.
+    """
+    is_changed = np.zeros(len(columns[0]), np.bool_)
+    is_changed[:1] = True
+    for column in columns:
+        is_changed[1:] |= column[1:] != column[:-1]
+    return is_changed
+
+
+def split_runs(*columns: NDArray[Any]) -> list[slice]:
+    """Return slices of consecutive rows in which no column changes.
+
+    Args:
+        columns: one or more arrays, (n,) each.
+    """
+    bounds = [*np.flatnonzero(mark_changes(*columns)).tolist(), len(columns[0])]
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
 def take_rows(

@@ -29,11 +29,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from lidarspec.frames.arrays import split_runs
 
 Times = NDArray[np.int64]
 
@@ -371,21 +372,6 @@ def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
         for index in hull
     )
     return ClockLine(last.device, last.delay + round(height), slope)
-
-
-def split_runs(*columns: NDArray[Any]) -> list[slice]:
-    """Return slices of consecutive rows in which no column changes.
-
-    Args:
-        columns: one or more arrays, (n,) each.
-    """
-    count = len(columns[0])
-    is_start = np.zeros(count, np.bool_)
-    is_start[:1] = True
-    for column in columns:
-        is_start[1:] |= column[1:] != column[:-1]
-    bounds = [*np.flatnonzero(is_start).tolist(), count]
-    return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
 def lower_hull(samples: Sequence[ClockSample]) -> list[int]:

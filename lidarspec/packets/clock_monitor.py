@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
+from lidarspec.frames.arrays import split_runs
 from lidarspec.leap_seconds import read_leap_seconds
-from lidarspec.packets.clock_estimate import ClockJump, DeviceClock, split_runs
+from lidarspec.packets.clock_estimate import ClockJump, DeviceClock
 from lidarspec.packets.clock_findings import ClockFinding
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.clocks import clock_ns

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
+from lidarspec.frames.arrays import split_runs
 from lidarspec.leap_seconds import TAI_MINUS_GPS_S, read_leap_seconds
-from lidarspec.packets.clock_estimate import DeviceClock, split_runs
+from lidarspec.packets.clock_estimate import DeviceClock
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS, FIRST_DATE_NS, HOUR_S, Clock, ClockState

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
+from lidarspec.frames.arrays import mark_changes
 from lidarspec.points.cloud import PointCloud
 
 #: A choice among the returns of each firing.
@@ -47,7 +48,7 @@ def group_firings(cloud: PointCloud) -> NDArray[np.intp]:
     rings = np.zeros(count, np.uint16) if cloud.ring is None else cloud.ring
     occurrences = _count_occurrences(columns, rings, numbers)
     order = np.lexsort((occurrences, rings, columns))
-    is_first = _find_changes(columns[order], rings[order], occurrences[order])
+    is_first = mark_changes(columns[order], rings[order], occurrences[order])
     firings = np.full((int(is_first.sum()), size), MISSING, np.intp)
     firings[np.cumsum(is_first) - 1, numbers[order]] = order
     first_points = np.where(firings == MISSING, count, firings).min(axis=1)
@@ -57,24 +58,12 @@ def group_firings(cloud: PointCloud) -> NDArray[np.intp]:
 def _count_occurrences(*keys: NDArray[Any]) -> NDArray[np.intp]:
     """Return how many earlier points have the same keys, (n,)."""
     order = np.lexsort(keys)  # stable
-    starts = np.flatnonzero(_find_changes(*(key[order] for key in keys)))
+    starts = np.flatnonzero(mark_changes(*(key[order] for key in keys)))
     positions = np.arange(len(order))
     positions -= np.repeat(starts, np.diff(starts, append=len(order)))
     occurrences = np.empty(len(order), np.intp)
     occurrences[order] = positions
     return occurrences
-
-
-def _find_changes(*keys: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return a mask of the points with another key than the point before, (n,).
-
-    The key of a point consists of its values in all the arrays.
-    """
-    changes = np.ones(len(keys[0]), np.bool_)
-    changes[1:] = False
-    for key in keys:
-        changes[1:] |= key[1:] != key[:-1]
-    return changes
 
 
 def choose_returns(
