@@ -115,9 +115,9 @@ class BoundedQueue:
         The list is empty if no event arrives in time, or if the queue is closed and empty.
 
         Args:
-            timeout: seconds to wait.
-            until: a time of `time.monotonic` until which events are collected, at most for
-                `timeout` seconds.
+            timeout: maximum time to wait, in seconds.
+            until: a time of `time.monotonic`. Before this time, the method does not return, so that
+                more events are returned together. It still waits for at most `timeout`.
             chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
@@ -227,9 +227,13 @@ class CaptureThread:
         self.transport.close()
 
     def record(self, log: TrafficLog | None) -> None:
-        """Start or replace the recording, and discard the events in the queue.
+        """Start or replace the recording.
 
-        All events that are taken from the queue afterwards are in the recording.
+        Events that wait in the queue are discarded. Therefore, all events that are taken from the
+        queue later are in the recording.
+
+        Args:
+            log: the new recording; None to stop recording.
         """
         while not self._recording_lock.acquire(timeout=POLL_S):
             self._queue.take(0.0)  # the thread may wait for room in the queue

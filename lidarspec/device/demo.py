@@ -74,8 +74,8 @@ def demonstrate(
 
     Args:
         turns: the number of complete scans.
-        errors: for a stream, the share of damaged bytes, limited to one byte in the length of the
-            longest data frame; for datagrams, the share of lost datagrams.
+        errors: the share of lost datagrams, or of damaged bytes in a stream. In a stream, at most
+            one byte per frame is damaged on average.
         seed: the seed of the errors and the scene.
 
     Raises:

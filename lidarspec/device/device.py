@@ -349,8 +349,8 @@ class Device(ClosingContext):
             SourceError: if the input has ended or the device was closed.
         """
         deadline = time.monotonic() + wait
-        mark = self._input.mark()
-        while not (self._unseen_scans and self._input.has_decoded_until(mark)):
+        arrived = self._input.count_arrived()
+        while not (self._unseen_scans and self._input.has_decoded_until(arrived)):
             if self._input.ended:
                 raise SourceError(
                     f"{self.source}: no further scan arrives, because the input is"
@@ -359,7 +359,7 @@ class Device(ClosingContext):
             batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
             if batch is not None:
                 self._find_whole_scans(batch)
-            has_no_more = batch is None or self._input.has_decoded_until(mark)
+            has_no_more = batch is None or self._input.has_decoded_until(arrived)
             if not self._unseen_scans and has_no_more and time.monotonic() >= deadline:
                 return None
         if not self.is_live:
@@ -378,10 +378,11 @@ class Device(ClosingContext):
     def make_selector(
         self, select: Selection, skip: Callable[[int], bool] | None = None
     ) -> ScanSelector:
-        """Return a selector for the scans of this device; `warnings` includes its warnings.
+        """Return a selector for the scans of this device, whose warnings `warnings` includes.
 
         Args:
-            skip: as for `ScanSelector`.
+            select: the scans to select.
+            skip: the argument of `ScanSelector`.
         """
         self._selector = ScanSelector(select, self.source, skip)
         return self._selector
@@ -403,8 +404,8 @@ class Device(ClosingContext):
     def delay_decoding(self, until: float) -> None:
         """Collect arriving data until a time, and decode it together.
 
-        Decoding more data at a time needs less processor time. An iterator with `wait` delays its
-        data by at most `wait` seconds. For a file, this method has no effect.
+        This saves processor time. An iterator with `wait` still returns data after at most `wait`
+        seconds. For a file, this method has no effect.
 
         Args:
             until: a time of `time.monotonic`.
@@ -412,12 +413,13 @@ class Device(ClosingContext):
         self._input.delay_decoding(until)
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about `size` bytes from now on.
+        """Set how many bytes of a file are read and decoded at a time.
 
-        With small portions, the counters and a `DecoderObserver` are hardly ahead of the packets
-        that were returned last. A viewer needs this to show a file at its recorded speed. A size of
-        0, the default of a device, selects the fastest size. For a live source, this method has no
-        effect.
+        A viewer that shows a file at its recorded speed sets a small size, because counters and
+        observers include everything that was read. For a live source, this method has no effect.
+
+        Args:
+            size: the number of bytes; 0, the default, for the fastest size.
         """
         self._input.read_ahead(size)
 
@@ -556,10 +558,10 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_batch_of_latest(self) -> FrameBatch | None:
-        """Return the batch in which `latest` found the last returned scan of a file.
+        """Return the batch of a file with the scan that `latest` returned last, if any.
 
-        A new iterator begins with this batch, so the other scans of the batch are no longer kept
-        for `latest`.
+        A new iterator begins with this batch. `latest` therefore forgets the scans that it has
+        found in the batch but not returned.
 
         Raises:
             SourceError: if the file has been read to its end.
@@ -682,9 +684,9 @@ def open(
 
 
 def _describe_nominal(sensor: Sensor) -> str:
-    """Return a warning that the calibration is nominal.
+    """Return a warning that points use the model's nominal calibration.
 
-    It names the option that sets the calibration of the unit.
+    The warning names the option that sets the calibration of the device.
     """
     text = f"{sensor.id}: points use the nominal calibration of the model, not that of the device"
     files = [name for name in sensor.configure.files if name not in sensor.options]

@@ -54,7 +54,7 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    Methods that are implemented in this class have the behaviour for sources that are not live.
+    A method with an implementation here does what is right for a file. `LiveInput` overrides it.
 
     Attributes:
         is_live: whether data arrives from a live source, not from a file.
@@ -62,8 +62,7 @@ class DeviceInput(Protocol):
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
-        info_frames: for each fact of `Sensor.info`, by name, the last frame from any link that
-            contained it.
+        info_frames: for each name in `Sensor.info`, the last frame with this information.
     """
 
     is_live: bool = False
@@ -74,9 +73,9 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Keep the latest frame that contains each fact of `Sensor.info`.
+        """Store the last frame with each piece of information that `Sensor.info` names.
 
-        A frame with parts is ignored if it lacks facts that the stored frame contains.
+        A frame with optional parts is ignored if it has less information than the stored frame.
         """
         for frames in batches:
             for role, fact in self.sensor.reported.items():
@@ -85,7 +84,7 @@ class DeviceInput(Protocol):
                         self._store_info_frame(role, fact, name, frames)
 
     def _store_info_frame(self, role: str, fact: Reported, name: str, frames: Frames) -> None:
-        """Keep the last frame of a type that contains a fact."""
+        """Store the last frame of a type that reports a fact, such as the serial number."""
         rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
         if fact.where is not None:
             rows = rows[find_reporting(self.sensor, fact, name, frames.select(rows))]
@@ -94,9 +93,9 @@ class DeviceInput(Protocol):
                 self.info_frames = {**self.info_frames, role: item}
 
     def _lacks_values(self, role: str, item: Found) -> bool:
-        """Return whether a frame lacks facts that the stored frame contains.
+        """Return whether a frame has less information than the stored frame.
 
-        Only a frame with parts can lack facts.
+        This is possible only for frames with optional parts.
         """
         earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
@@ -141,9 +140,9 @@ class DeviceInput(Protocol):
         return False
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about `size` bytes from now on.
+        """Set how many bytes of a file are read and decoded at a time; 0 for the fastest size.
 
-        A size of 0 selects the fastest size. For a live source, this has no effect.
+        For a live source, this has no effect.
         """
 
     def delay_decoding(self, until: float) -> None:
@@ -177,15 +176,12 @@ class DeviceInput(Protocol):
             UsageError: if several sensors send frames in one file.
         """
 
-    def mark(self) -> int:
-        """Return a mark for `has_decoded_until`: a count of the data that has arrived."""
+    def count_arrived(self) -> int:
+        """Return the number of chunks that have arrived so far; 0 for a file."""
         return 0
 
-    def has_decoded_until(self, mark: int) -> bool:
-        """Return whether all data that arrived before a mark has been decoded.
-
-        Always True for a file.
-        """
+    def has_decoded_until(self, arrived: int) -> bool:
+        """Return whether the first `arrived` chunks have been decoded; True for a file."""
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
@@ -207,10 +203,7 @@ class DeviceInput(Protocol):
         """
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that are used from the first packet on.
-
-        A live sensor has no such frames.
-        """
+        """Return the frames that are applied from the first packet on; none for a live source."""
         return FirstFrames()
 
     def close(self) -> None:
@@ -260,12 +253,12 @@ def _decode_stream(
 def _set_arrival(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
-    """Return frames with the arrival time of the chunk that contains their last byte.
+    """Return frames with the arrival time of the datagram that contains their last byte.
 
     Args:
         batches: the frames.
-        ends: the ends of the pieces of input, (n,) bytes from the start of the input.
-        times: the arrival times of the pieces, (n,) ns since 1970; -1 if unknown.
+        ends: the end of each datagram, (n,) bytes from the start of the input.
+        times: the arrival time of each datagram, (n,) ns since 1970; -1 if unknown.
     """
     return [
         frames.with_arrivals(times[ends.searchsorted(frames.offsets + frames.sizes)])
@@ -374,7 +367,7 @@ class FileInput(DeviceInput):
         self._frame_batches = iter(())  # the old generator holds this object and the read data
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that are used from the first packet of the file on.
+        """Return the frames that are applied from the first packet of the file on.
 
         This opens and reads the file a second time. It returns no frames if the sensor needs none,
         or if the source cannot be read twice, such as standard input.

@@ -46,7 +46,7 @@ _PLAIN_TYPES = (bool, int, float, str, bytes, type(None), type)
 class FileScans(ClosingContext):
     """The scans of a file, as an iterable.
 
-    `survey` only counts the scans of the next piece, which is faster.
+    `survey` counts scans without computing points, and returns a bookmark from which to continue.
 
     Args:
         source: the file.
@@ -104,12 +104,12 @@ class FileScans(ClosingContext):
         """Read the next piece of the file and count its scans.
 
         Args:
-            size: minimum size of the piece, in bytes.
+            size: minimum size of the piece, in bytes. The piece is longer if the state of the
+                reader cannot be stored there.
 
         Returns:
-            The number of scans that begin in the piece, and a bookmark of its end. If no bookmark
-            can be made, the piece extends to the end of the file. The bookmark is None at the end
-            of the file.
+            The number of scans that begin in the piece, and a bookmark of its end; None instead of
+            the bookmark at the end of the file.
         """
         scan_count = 0
         end = self._offset + size
@@ -197,7 +197,7 @@ def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], A
 def _name_parts(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Add a value and its parts to `names`; a name is the path of attributes and keys."""
+    """Store a value and its parts in `names`, by the attributes and keys that lead to them."""
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return
     names[name] = value
@@ -235,10 +235,10 @@ class _StatePickler(pickle.Pickler):
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Return how a table, packets or a `struct.Struct` are pickled.
+        """Return how to pickle a table, packets or a `struct.Struct`.
 
-        A table is pickled as the bytes of its frames. With packets, only the frames of other types
-        that they use are pickled.
+        A table is pickled as the bytes of its frames. Packets are pickled with the frames in
+        `state` that they need, and without all others.
         """
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:

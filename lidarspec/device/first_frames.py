@@ -1,7 +1,7 @@
-"""Find the frames of a file that are used from its first packet on.
+"""Search a file for frames that packets need, but that may arrive after the first packets.
 
-They are the first frame of each type in `Sensor.state`, and the first frame that provides a date
-for the clock.
+They are the first frame of each type in `Sensor.state`, such as a calibration, and the first frame
+that provides a date for the clock. They are applied from the first packet of the file on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ REFERENCE_SEARCH_BYTES = 64 << 20
 
 @dataclass
 class FirstFrames:
-    """The frames that are used from the first packet on.
+    """The frames that are applied from the first packet of a file on.
 
     Attributes:
         state: the first frame of each type that `points` depends on, by name.
@@ -35,16 +35,16 @@ class FirstFrames:
 
 
 def needs_first_frames(sensor: Sensor) -> bool:
-    """Return whether packets may need frames that arrive later in the file."""
+    """Return whether packets of a sensor need frames that may arrive after them."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
 def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
-    """Return the frames that are used from the first packet of a file on.
+    """Return the frames that are applied from the first packet of a file on.
 
     Args:
         sensor: the sensor that sent the frames.
-        batches: the frames of the file; iterated only as far as needed.
+        batches: the frames of the file. The iteration ends when all needed frames are found.
     """
     first = FirstFrames()
     missing = set(sensor.state)

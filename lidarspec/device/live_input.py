@@ -138,7 +138,7 @@ class LiveInput(DeviceInput):
 
     @property
     def state(self) -> str:
-        """The state of the link, as in `LinkState`; "closed" after `close`."""
+        """The name of the `LinkState`; "closed" after `close`."""
         if self._closed:
             return "closed"
         return self._link_state.name
@@ -254,11 +254,11 @@ class LiveInput(DeviceInput):
     def read_ahead(self, size: int) -> None:
         """Do nothing: live data cannot be read ahead."""
 
-    def mark(self) -> int:
+    def count_arrived(self) -> int:
         return self.queue.produced
 
-    def has_decoded_until(self, mark: int) -> bool:
-        return not self._ready and self.queue.consumed + self.queue.dropped >= mark
+    def has_decoded_until(self, arrived: int) -> bool:
+        return not self._ready and self.queue.consumed + self.queue.dropped >= arrived
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         if name in self.sensor.commands:
@@ -295,7 +295,7 @@ class LiveInput(DeviceInput):
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _set_own_endpoint(self, name: str) -> None:
-        """Set `host` and `port` of the session, if a command contains them."""
+        """Tell the session this computer's address and port, if a command contains them."""
         command = self.sensor.commands.get(name)
         if command is not None and command.has_own_port:
             self._session.port = self._captures["data"].transport.own_port
@@ -317,7 +317,7 @@ class LiveInput(DeviceInput):
             self._write(OutgoingData(link, bytes(data)))
 
     def _await_sender(self, link: str, seconds: float) -> None:
-        """Wait for a datagram if the sensor's address is only known from a first datagram."""
+        """Wait for a datagram of the sensor, unless the sensor's address is already known."""
         data = self._captures["data"].transport
         is_known = (
             link in self._captures
@@ -390,9 +390,9 @@ class LiveInput(DeviceInput):
     def _pump(self, wait: float) -> None:
         """Decode data that arrives within `wait` seconds, and run the session.
 
-        Before a request times out, all data that has arrived is searched for its reply. If its
-        deadline passed more than `MAX_PUMP_S` ago, the computer is busy and the reply may be late
-        as well. In this case, the method waits for the full time before the request times out.
+        Usually, the wait ends at the deadline of the current request. If this deadline passed more
+        than `MAX_PUMP_S` ago, this computer is overloaded and the reply may be in data that was
+        not read yet. The method then waits for the full time before the request times out.
         """
         with self._session_lock:
             deadline = self._session.deadline
@@ -451,15 +451,15 @@ class LiveInput(DeviceInput):
         if chunks[0].gap:
             self._deliver(link, decoder.take_pending(), interrupted=True)
         if link == "data" and chunks[0].sender is not None:  # then all chunks have a sender
-            self._decode_senders(chunks)
+            self._decode_sensor_chunks(chunks)
             return
         if link in self._broadcast_senders:
             chunks = self._select_first_sender(link, chunks)
         if chunks:
             self._deliver(link, decode_chunks(decoder, chunks))
 
-    def _decode_senders(self, chunks: list[Chunk]) -> None:
-        """Decode those chunks of the data link that the sensor sent; drop all others."""
+    def _decode_sensor_chunks(self, chunks: list[Chunk]) -> None:
+        """Decode the chunks of the data link that the sensor sent, and drop all other chunks."""
         chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return
@@ -475,7 +475,8 @@ class LiveInput(DeviceInput):
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
 
-        If another sensor is selected now, incomplete frames of the previous sensor are discarded.
+        The chunks may show that another sender is the sensor. Incomplete frames of the previous
+        sender are then discarded.
         """
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
@@ -505,7 +506,7 @@ class LiveInput(DeviceInput):
         return self._captures["data"].transport.peer() or next(iter(replying_hosts), None)
 
     def _deliver(self, link: str, batches: list[Frames], *, interrupted: bool = False) -> None:
-        """Pass frames to the session, and frames of the data link to `next`."""
+        """Pass frames to the session, and queue frames of the data link for `next`."""
         self.store_info_frames(batches)
         with self._session_lock:
             awaited = self._session.awaited_frames(link)
@@ -545,7 +546,7 @@ class LiveInput(DeviceInput):
                 self._failure = error
 
     def _request_port_again(self) -> None:
-        """Send the opening commands again after a pause."""
+        """Repeat the opening commands, whose reply contains the port, after a pause."""
         if time.monotonic() >= self._repeat_due_s:
             self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
             self._restart_sensor()
@@ -562,9 +563,9 @@ class LiveInput(DeviceInput):
             self._send_outgoing()
 
     def _warn_if_changed(self) -> None:
-        """Warn if the reconnected sensor reports other options than before.
+        """Warn if a reconnected sensor reports other options than before the disconnection.
 
-        It may be another unit.
+        It may be another device of the same model.
         """
         done = [pending for pending in self._restart_replies if pending.done]
         self._restart_replies = [pending for pending in self._restart_replies if not pending.done]
@@ -634,7 +635,10 @@ def _is_broadcast(link: Link | None) -> bool:
 
 
 def _join_chunks(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
-    """Return events, with consecutive chunks of a link in one list; a gap ends a list."""
+    """Return the events, but with consecutive chunks of the same link joined in one list.
+
+    A chunk after a gap begins a new list.
+    """
     joined: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
     run: list[Chunk] = []  # the last list of chunks; empty after another event
     for link, item in events:

@@ -134,10 +134,7 @@ class PacketReader:
         return stream.add([])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the last packets and samples.
-
-        An unpickled reader continues with the next batch.
-        """
+        """Return the state to pickle, without packets and samples that were already returned."""
         return {**vars(self), "last": None, "imu_samples": join_samples([])}
 
     def _make_stream(self, frame: str) -> PacketStream:

@@ -62,7 +62,7 @@ class SenderCheck:
                 raise self._make_error(other, sender)
 
     def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
-        """Return another port whose frames of a type alternate with frames of `sender`.
+        """Return another port that sends the same frame type at the same time as `sender`.
 
         If there is no such port, returns None and stores `sender` as the current port.
         """
@@ -128,13 +128,13 @@ class SenderFilter(SenderCheck):
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Select a sender that replied on another link, unless the sensor is known."""
+        """Treat a sender as the sensor, unless the sensor's address is already certain."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
     @property
     def warnings(self) -> list[str]:
-        """A warning about another sender on the same port."""
+        """A list with a warning if another sender sends to the same port; else empty."""
         if self.other_sender is None or self._owner is None:
             return []
         text = (
@@ -258,8 +258,8 @@ class SenderFilter(SenderCheck):
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
     """Return the type and the sender of each frame found in datagrams.
 
-    If one sender sent all datagrams, each type is listed once. The result is empty if a sender is
-    unknown.
+    If all datagrams have the same sender, each type is listed once. If a datagram has no known
+    sender, the result is empty.
 
     Args:
         chunks: the datagrams.

@@ -6,13 +6,13 @@ request. Further requests wait in a queue until the current request is done and 
 settled. All frames that arrive on the link, including data frames, are compared with the expected
 reply.
 
-A late reply must not be used as the reply to the next request. If no reply to a command arrives in
-time, the session still expects the reply until twice the timeout has passed. If this late reply
-could also be the reply to the next request, the next request is held back. This is the case if both
-replies have the same frame type, and no field has to differ. If the late reply arrives, it is
-counted in `late`, and the next request is sent. A frame that arrived before a request was sent is
-not its reply. After twice the timeout, late replies are no longer expected. Then only the fields in
-`matches` or `echoes` distinguish a late reply from the next reply.
+A late reply must not be taken for the reply to the next request. If no reply to a command arrives
+in time, the session therefore expects it until twice the timeout has passed. During this time, a
+request is not sent if the late reply could also be its reply: if both replies have the same frame
+type, and no field in which they must differ. If the late reply arrives, it is counted in `late`,
+and the waiting request is sent. After twice the timeout, only the fields in `matches` or `echoes`
+distinguish a late reply from the reply to a later request. A frame that arrived before a request
+was sent is never its reply.
 
 A running number (`Count`) is filled in when a request is made, so a command that is sent again has
 the same number. With `echoes`, this number distinguishes the reply from all other replies. A value
@@ -150,8 +150,9 @@ class ExpectedReply:
     """The frames that can be the reply to one request.
 
     Attributes:
-        tables: frame type -> fields by path.
-        values: path -> required value; paths that a type does not have are ignored.
+        tables: the fields of each frame type that can be the reply: frame type -> path -> field.
+        values: the values that the reply must have: path -> value. Paths that a frame type does
+            not have are ignored.
         refusal: the frame type with which the sensor refuses; None if there is no such type.
     """
 
@@ -323,8 +324,8 @@ class Session:
     """The commands of one sensor on its links.
 
     Pass every arriving frame to `receive`, including the frames that `Decoder.idle` returns when
-    the link falls silent. This is needed if a device stops in the middle of a frame. The decoder
-    then treats the reply as the rest of this frame, until `idle` is called.
+    the link falls silent. If a device stops sending in the middle of a data frame, the decoder
+    takes the reply for the rest of this frame until `idle` is called.
 
     Attributes:
         sensor: the sensor.
@@ -638,13 +639,13 @@ class Session:
     def _free_link(
         self, line: _LinkQueue, request: _PendingCommand, *, reply_count: int, since: int
     ) -> None:
-        """Free the link of the current request.
+        """Free the link of the current request for the next request.
 
-        Each sending without a reply may still get a late reply.
+        A request may have been sent several times. Replies to it may still arrive late.
 
         Args:
             reply_count: number of replies that arrived, 0 or 1.
-            since: the time from which the device settles, ns.
+            since: the time at which the settling time of the device begins, ns.
         """
         line.current = None
         line.quiet_until = since + _to_ns(request.command.settle)

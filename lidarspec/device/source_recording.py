@@ -55,7 +55,7 @@ def make_recorder(
         overwrite: whether the file may exist.
 
     Raises:
-        UnknownFormat, UsageError, SourceError: as `open_recorder` raises them.
+        UnknownFormat, UsageError, SourceError: the errors of `open_recorder`.
     """
     if isinstance(opened, RecordingTransport):
         header = opened.header
@@ -113,7 +113,7 @@ class TimedLog:
         return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record sent data, and received data until the time limit."""
+        """Record a sent chunk, or a received chunk if it arrived before the time limit."""
         if direction == "in" and chunk.at is not None:
             if self.first is None:
                 self.first = chunk.at
@@ -272,7 +272,7 @@ class SourceRecording:
             yield from source.warnings
 
     def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
-        """Count the data that a thread records, and discard it."""
+        """Record in a separate thread, and count the recorded datagrams."""
         queue = BoundedQueue()
         with contextlib.closing(CaptureThread(source, queue, log=log)) as capture:
             try:
@@ -294,10 +294,10 @@ class SourceRecording:
     def _count_queued(
         self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float
     ) -> list[LinkEvent]:
-        """Take all events from the queue, and count the recorded datagrams.
+        """Take everything from the queue, and count the recorded datagrams.
 
         Returns:
-            The other events, such as a lost device.
+            The events that are not data, such as a lost device.
         """
         events = list[LinkEvent]()
         for _, item in queue.take(wait):
