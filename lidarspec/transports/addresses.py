@@ -47,10 +47,8 @@ class SourceAddress:
         """Return the parts of a live SOURCE.
 
         Args:
-            text: the SOURCE, such as "udp://:2368?src=10.0.0.5". If `scheme` is given, the scheme
-                may be
-                omitted.
-            scheme: a scheme that replaces the scheme of the text.
+            text: the SOURCE, such as "udp://:2368?src=10.0.0.5".
+            scheme: the scheme; "" to take it from `text`.
         """
         if "://" in text:
             written_scheme, _, rest = text.partition("://")

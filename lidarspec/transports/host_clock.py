@@ -64,9 +64,9 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return how far the wall clock is ahead of this clock, ns, if it was set.
+        """Return how far the wall clock is ahead of this clock, in ns, after it was set.
 
-        Returns None if it was not set. Each step of more than 50 ms is reported once.
+        Returns None if the wall clock was not set since the last call, or by 50 ms or less.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns

@@ -322,7 +322,10 @@ class UdpLine(OutletLine):
             opened.close()
 
     def _listen_for_commands(self) -> None:
-        """Receive commands; for a local listener, add the port to the SOURCE."""
+        """Receive commands from now on.
+
+        If the listener is on this computer, its SOURCE gets the port to send commands to.
+        """
         self.takes_commands = True
         if self._host == LOCALHOST:
             self._sockets[0].bind((LOCALHOST, 0))
@@ -357,10 +360,10 @@ class UdpLine(OutletLine):
         return False
 
     def _may_succeed_later(self, error: OSError) -> bool:
-        """Return whether sending again may succeed; wait after a temporary error.
+        """Return whether sending again may succeed, after a pause if one is needed.
 
         Raises:
-            SourceError: for any other error, if the user has named the receiver.
+            SourceError: if it cannot succeed, and the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)
@@ -549,7 +552,7 @@ class PtyLine(OutletLine):
         return []
 
     def plug(self) -> None:
-        """Create a terminal in raw mode."""
+        """Create the pseudo-terminal, in raw mode."""
         if not has_terminals():
             raise _missing_terminal_error("this system has no pseudo-terminals")
         try:

@@ -98,7 +98,7 @@ class Format:
         holds: the names of optional features that the format supports:
             "organized": points in rows and columns. `write` then accepts `organized=True` with one
             scan.
-            "scans": each scan is stored separately, and organized if its points are.
+            "scans": each scan is stored separately, in rows and columns if it has them.
             "beams": planar scans are also written as LaserScan messages.
             "frame-id": messages contain a frame_id.
             "packets": raw packets, which `write` accepts as `packets=`.

@@ -100,7 +100,7 @@ class Replay:
         loop: whether to start again at the end. Each listener receives the file from the beginning.
         source: the transport of the file if it is already open, for example standard input. It is
             used for the first pass, and then closed.
-        times: the range of arrival times to send, as in `Selection`.
+        times: the range of arrival times to send, as for `Selection(times=...)`.
 
     Attributes:
         chunks: number of chunks sent so far.

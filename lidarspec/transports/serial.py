@@ -2,7 +2,7 @@
 
 A port is opened exclusively. When a device that was unplugged is back, its port can be opened
 again. If the device disappears, pyserial raises SerialException, OSError or `termios.error`, which
-is not an OSError. It raises TypeError if the port is closed at the same time.
+is not an OSError. If another thread closes the port during a read, pyserial raises TypeError.
 
 On POSIX systems, the port is read through its descriptor. After each read, the thread pauses, so
 that it does not wake up for every byte of a fast line.
@@ -57,7 +57,8 @@ class SerialTransport(StreamTransport):
         baud: the baud rate.
         dtr: level of the control line DTR while the port is open; None does not set it.
         rts: level of the control line RTS while the port is open; None does not set it.
-        sensor: the sensor; None if unknown. Its longest frame determines `silence`.
+        sensor: the sensor; None if unknown. Its longest frame determines after how many seconds
+            without data the line counts as silent.
 
     Raises:
         SourceError: if the port is missing or in use, if the user may not open it, or if it does

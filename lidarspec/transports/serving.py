@@ -54,11 +54,11 @@ class VirtualClock:
         return self._now_ns < self._end_ns
 
     def advance(self, seconds: float) -> None:
-        """Let later calls of `step` advance the clock by some seconds."""
+        """Let later calls of `step` move the clock by `seconds` in total."""
         self.advance_to(self._end_ns + int(seconds * SECOND))
 
     def advance_to(self, end_ns: int) -> None:
-        """Let later calls of `step` advance the clock to a time."""
+        """Let later calls of `step` move the clock until it reaches `end_ns`."""
         self._end_ns = max(self._end_ns, end_ns)
 
     def step(self) -> None:
@@ -80,10 +80,10 @@ class FairLock:
 
     @contextlib.contextmanager
     def hold(self, stop: threading.Event) -> Iterator[bool]:
-        """Hold the lock in the context; yield False if `cancel` was called instead.
+        """Hold the lock in the context; yield False if `cancel` ended the waiting.
 
         Args:
-            stop: an event by which `cancel` identifies the waiting thread.
+            stop: an event of the calling thread, which another thread passes to `cancel`.
         """
         ticket = threading.Event()
         with self._lock:
@@ -400,7 +400,7 @@ class Served(ClosingContext):
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Call the queued functions; report the calls of the previous pass as done."""
+        """Call the queued functions, after releasing the threads that wait for earlier calls."""
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

@@ -163,8 +163,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
 
     Args:
         address: the SOURCE.
-        sensor: the sensor that decodes the data. If it has the id in the SOURCE, this sensor, with
-            its options, is also simulated.
+        sensor: the sensor that decodes the data. It is simulated with its options if the SOURCE has
+            its id or no id. Otherwise, the sensor with the id in the SOURCE is simulated.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.

@@ -80,7 +80,7 @@ def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
 
 
 def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Transfer]:
-    """Yield the data of a device over the data link, and the commands that open it."""
+    """Open a simulated device; yield the commands sent to it, and the data that it sends."""
     sensor = device.sensor
     start_ns = time.time_ns()
     opening = _commands_on_open(sensor)

@@ -140,10 +140,10 @@ def list_usb_devices(platform: str = sys.platform) -> list[UsbDevice]:
     if platform.startswith("linux"):
         return list(read_sysfs(Path("/sys/bus/usb/devices")))
     if platform == "darwin":
-        listed = _run("ioreg", "-p", "IOUSB", "-a", "-l")
+        listed = _read_output("ioreg", "-p", "IOUSB", "-a", "-l")
         return list(parse_ioreg(listed, list_usb_ids()))
     if platform == "win32":
-        listed = _run("powershell", "-NoProfile", "-Command", _WINDOWS_QUERY)
+        listed = _read_output("powershell", "-NoProfile", "-Command", _WINDOWS_QUERY)
         return list(parse_windows(listed))
     return []
 
@@ -193,7 +193,7 @@ def parse_windows(listed: bytes) -> Iterator[UsbDevice]:
             yield UsbDevice(ids[0], ids[1], entry["ConfigManagerErrorCode"] == 0)
 
 
-def _run(*command: str) -> bytes:
+def _read_output(*command: str) -> bytes:
     """Return the output of a program; empty if it fails or does not exist."""
     try:
         done = subprocess.run(command, capture_output=True, timeout=LIST_TIMEOUT_S, check=True)

@@ -113,5 +113,5 @@ def test_doctor_reports_missing_drivers(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_program_that_does_not_exist_lists_nothing() -> None:
-    assert usb_adapters._run("no-such-program-anywhere") == b""
+    assert usb_adapters._read_output("no-such-program-anywhere") == b""
     assert usb_adapters.list_usb_devices("plan9") == []
