@@ -1,6 +1,6 @@
 """Draw scans: in a terminal, as pictures in files, in notebooks and in the Rerun viewer.
 
-The input is a device or points, the output pictures. The page in a browser belongs to the
+The input is a device or points. The output is pictures. The page in a browser belongs to the
 distribution `lidarspec-web`. Modules in reading order:
 
 * `terminal_window`: a window in the terminal that shows a running sensor and reads keys.

@@ -114,7 +114,7 @@ def sgr(ink: int, depth: Depth) -> str:
 
 
 def style(ink: int) -> str:
-    """Return an ink as a style of rich."""
+    """Return the style of the library rich for an ink."""
     chosen = INKS[ink]
     if chosen.rgb is None:
         colour = ""
@@ -157,9 +157,11 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy another picture into this one; the cell gets its upper left corner.
+        """Copy another picture into this one.
 
-        Parts outside this picture are omitted.
+        Args:
+            row, column: the cell for the upper left corner of the other picture.
+            other: the other picture. Parts that would lie outside this picture are omitted.
         """
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
@@ -235,8 +237,12 @@ class Canvas:
         order = np.argsort(RAMP_STEPS - steps if self.ramp == "range" else steps, kind="stable")
         self.steps[down[order] // DOTS_DOWN, across[order] // DOTS_ACROSS] = steps[order]
 
-    def line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
-        """Set dots of rings and axes."""
+    def draw_line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
+        """Set the dots of a ring or an axis. Points cover these dots.
+
+        Args:
+            column, row: fractional coordinates in dots, (n,).
+        """
         across, down, _ = self._to_dots(column, row)
         self.lines[down, across] = True
 

@@ -64,9 +64,10 @@ class LiveFrames:
         return np.sort(arrivals[arrivals > 0])
 
     def read(self, until: float) -> None:
-        """Read batches until a time of `time.monotonic`, at least one.
+        """Read batches of frames, at least one, until a time or the end of the input.
 
-        Also returns at the end of the input.
+        Args:
+            until: a time of `time.monotonic`.
 
         Raises:
             LidarSpecError: if the source fails.
@@ -77,6 +78,6 @@ class LiveFrames:
             self.packets = [] if batch is None else batch.values()
             for packets in self.packets:
                 self.clock.add(packets)
-            self.meter.frames(sum(map(len, self.packets)), self.times_ns)
+            self.meter.add_frames(sum(map(len, self.packets)), self.times_ns)
             if time.monotonic() >= until:
                 return

@@ -116,9 +116,10 @@ class LiveScans:
         return self.packets.time_ns
 
     def read(self, until: float) -> None:
-        """Read batches until a time of `time.monotonic`, at least one.
+        """Read batches of packets, at least one, until a time or the end of the input.
 
-        Also returns at the end of the input.
+        Args:
+            until: a time of `time.monotonic`.
 
         Raises:
             LidarSpecError: if the source fails.
@@ -179,7 +180,7 @@ class LiveScans:
         self.packets = selected
         if len(selected):
             self.meter = meter
-            self.meter.packets(selected)
+            self.meter.add_packets(selected)
             self.clock.add(selected)
             self._has_counted = True
         self._store_scans(self._stream.add(packets))
@@ -194,7 +195,12 @@ class LiveScans:
             raise self._sieve.make_missing_error()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
-        """Adjust the size of later reads so that they contain `ahead` seconds of data."""
+        """Change the size of reads step by step, until a read has about `ahead` seconds of data.
+
+        Args:
+            packets: the packets of the last read.
+            ahead: the duration of the data to read at a time, in seconds.
+        """
         portion = self._portion
         duration_s = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9
         if duration_s < ahead / 2 and portion < BATCH_BYTES:
@@ -232,7 +238,7 @@ class LiveScans:
                 self._show(selected)
 
     def _show(self, scan: Scan) -> None:
-        self.meter.scan(scan)
+        self.meter.add_scan(scan)
         self.scans.append(scan)
         if scan.whole or self.scan is None or not self.scan.whole:
             self.scan = scan

@@ -82,9 +82,9 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Return a figure of a scan to scale, seen from above; the sensor faces up.
+    """Return a figure of a scan, seen from above with forward up.
 
-    If `look` is not flat, the figure also has a view from the right side.
+    The figure also has a view from the right side, unless `look` says that the cloud is flat.
     """
     cloud = scan.points[scan.points.valid]
     column: Any

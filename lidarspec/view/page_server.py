@@ -44,9 +44,10 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
         """The reason why the last recording could not be written; "" if it was written."""
 
     def opening_page(self) -> str:
-        """Write a file that redirects to `link`, and return its URL for a browser.
+        """Write a file that redirects to `link`, and return the URL of the file.
 
-        The command line of a browser is visible to other users, so it must not contain the token.
+        Other users can see the command line of a browser, so it must not contain the token in
+        `link`.
 
         Raises:
             OSError: if the file cannot be written.

@@ -68,7 +68,9 @@ def _draw_from_above(cloud: PointCloud, width: int, height: int, look: CloudAppe
         turn = np.linspace(
             0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP_DOTS), 8), endpoint=False
         )
-        canvas.line(across + radius * scale * np.sin(turn), down - radius * scale * np.cos(turn))
+        canvas.draw_line(
+            across + radius * scale * np.sin(turn), down - radius * scale * np.cos(turn)
+        )
     home = (math.floor(down) // DOTS_DOWN, math.floor(across) // DOTS_ACROSS)
     canvas.label(*home, "▲", STRONG, over=True)
     _label_directions(canvas, home)
@@ -134,7 +136,7 @@ def _draw_from_side(
         line = level - number * step * scale * larger
         gap = RING_GAP_DOTS if number == 0 else 4 * RING_GAP_DOTS
         columns = np.arange(0, canvas.dots.shape[1], gap, dtype=np.float64)
-        canvas.line(columns, np.full(len(columns), line))
+        canvas.draw_line(columns, np.full(len(columns), line))
         canvas.label(
             math.floor(line) // DOTS_DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m"
         )

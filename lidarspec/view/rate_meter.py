@@ -186,7 +186,7 @@ class RateMeter:
         self._recent = RateTally(counters)
         self._all = RateTally(counters)
 
-    def packets(self, packets: Packets) -> None:
+    def add_packets(self, packets: Packets) -> None:
         """Count a batch of packets."""
         arrivals = packets.host_ns[packets.host_ns > 0]
         if len(arrivals):
@@ -194,7 +194,7 @@ class RateMeter:
         else:
             self._add(len(packets), packets.time_ns, by_host=False)
 
-    def frames(self, count: int, arrivals: NDArray[np.int64]) -> None:
+    def add_frames(self, count: int, arrivals: NDArray[np.int64]) -> None:
         """Count frames of several types.
 
         Args:
@@ -212,7 +212,7 @@ class RateMeter:
         for tally in (self._recent, self._all):
             tally.add_packets(count, gaps, by_host=by_host)
 
-    def scan(self, scan: Scan) -> None:
+    def add_scan(self, scan: Scan) -> None:
         """Count a scan. Incomplete scans are ignored, because they have fewer points."""
         if not scan.whole:
             return

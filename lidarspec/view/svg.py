@@ -143,7 +143,7 @@ class _ViewDrawer:
         return self.side / 2 / self.look.reach
 
     def draw_from_above(self) -> _View:
-        """Draw range rings, axes, points and the sensor, from above with forward up."""
+        """Draw range rings, axes, points and the sensor, seen from above; forward is up."""
         scale = self._scale
         side = self.side
         forward, left = self.look.middle
@@ -191,7 +191,7 @@ class _ViewDrawer:
         return _View("seen from above, forward is up", parts, top, bottom - top, dots)
 
     def draw_from_side(self) -> _View:
-        """Draw height lines, points and the sensor, from the side with forward right."""
+        """Draw height lines, points and the sensor, seen from the side; forward is right."""
         scale = self._scale
         side = self.side
         lowest, highest = find_bounds(self.cloud)
@@ -232,10 +232,10 @@ class _ViewDrawer:
     def _draw_dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
     ) -> tuple[int, list[str]]:
-        """Return the number of dots, and for each colour an SVG path that draws its dots.
+        """Return the number of dots, and SVG elements that draw them, one path per colour.
 
-        The dots are on the finest grid of `GRIDS_PX` with which their number does not exceed the
-        attribute `most`.
+        Points are rounded to a grid, and points at the same position are one dot. The grid is the
+        finest of `GRIDS_PX` with at most `self.most` dots.
 
         Args:
             across: horizontal coordinates of the points, (n,) pixels.

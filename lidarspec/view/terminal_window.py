@@ -63,16 +63,16 @@ class ViewSettings:
         zoom: magnification; 1.0 shows all points.
         middle: the middle of the picture, in metres forward and left of the sensor.
         paused: whether the picture is paused.
-        helped: whether the list of keys is shown.
-        done: whether the window is to be closed.
+        shows_keys: whether the list of keys is shown.
+        is_closing: whether the window is to be closed.
     """
 
     ramp: str = "range"
     zoom: float = 1.0
     middle: tuple[float, float] = (0.0, 0.0)
     paused: bool = False
-    helped: bool = False
-    done: bool = False
+    shows_keys: bool = False
+    is_closing: bool = False
 
     def after_key(
         self, key: str, reach: float, ramps: Sequence[str] = DEFAULT_RAMPS
@@ -85,7 +85,7 @@ class ViewSettings:
             ramps: the columns that the colours can show.
         """
         if key in ("q", "Q"):
-            return replace(self, done=True)
+            return replace(self, is_closing=True)
         if key == " ":
             return replace(self, paused=not self.paused)
         if key in ("c", "C"):
@@ -102,9 +102,9 @@ class ViewSettings:
             middle = (self.middle[0] + forward * step, self.middle[1] + left * step)
             return replace(self, middle=middle)
         if key in ("?", "h"):
-            return replace(self, helped=not self.helped)
+            return replace(self, shows_keys=not self.shows_keys)
         if key == "escape":
-            return replace(self, helped=False)
+            return replace(self, shows_keys=False)
         return self
 
     def _next_ramp(self, ramps: Sequence[str]) -> str:
@@ -156,7 +156,7 @@ class Window:
         drawn_at = 0.0
         drawn_number = -1
         drawn_size = (0, 0)
-        while not self.settings.done and time.monotonic() < self._end:
+        while not self.settings.is_closing and time.monotonic() < self._end:
             keys = self._wait(screen)
             for key in keys:
                 self._handle_key(key)
@@ -196,7 +196,7 @@ class Window:
             write_side(window, width, self._list_figures(), current_look)
         else:
             write_last_line(window, self._list_figures())
-        if self.settings.helped:
+        if self.settings.shows_keys:
             _paste_in_middle(window, draw_keys(columns, lines))
         return window
 

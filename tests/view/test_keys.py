@@ -44,9 +44,9 @@ def test_keys_change_the_view() -> None:
         == begin
     )
     assert begin.after_key(" ", 6).paused
-    assert begin.after_key("q", 6).done
-    assert begin.after_key("?", 6).helped
-    assert not begin.after_key("?", 6).after_key("escape", 6).helped
+    assert begin.after_key("q", 6).is_closing
+    assert begin.after_key("?", 6).shows_keys
+    assert not begin.after_key("?", 6).after_key("escape", 6).shows_keys
     assert begin.after_key("x", 6) is begin
 
 

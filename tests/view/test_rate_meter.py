@@ -34,9 +34,9 @@ class Bench:
 
     def feed(self, data: bytes, at: int | None) -> Packets:
         packets = self._packets.add(self.decoder.frames(data, at))
-        self.meter.packets(packets)
+        self.meter.add_packets(packets)
         for scan in self._scans.add(packets) if len(packets) else []:
-            self.meter.scan(scan)
+            self.meter.add_scan(scan)
         return packets
 
 
@@ -94,7 +94,7 @@ def test_lost_packets_are_a_share_where_the_sensor_numbers_them() -> None:
         PacketStream(sensor, "data", decoder.stats),
     )
     frames = [frame for number, frame in enumerate(simulate(sensor, 200)) if number % 10 != 5]
-    meter.packets(
+    meter.add_packets(
         stream.add([decoder.datagrams(frames, [START + n * 1000 for n in range(len(frames))])])
     )
     assert meter.summary(decoder.stats).loss_rate == pytest.approx(0.1)
