@@ -77,11 +77,11 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        candidates: the evidence for each candidate that may have sent the frames, by id; "" without
-            evidence.
-        others: the difference of each related model that has no installed plugin and may have sent
-            the frames, by id. If `candidates` is empty, one of these models has sent the
-            frames.
+        candidates: the installed models that may have sent the frames: id -> evidence for this
+            model, or "".
+        others: the models without an installed plugin that may have sent the frames: id ->
+            difference from the installed models. If `candidates` is empty, one of these models has
+            sent the frames.
     """
 
     candidates: dict[str, str]
@@ -149,9 +149,12 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return related models that have sent the frames instead, as {id: difference}.
+    """Return the related models that, unlike the sensor, may have sent some frames.
 
-    A model is returned if more than half of the packets have a property that only this model has.
+    More than half of the packets must have a property that only the related model has.
+
+    Returns:
+        Id of the related model -> its difference from the sensor.
     """
     distinct_relatives = {
         name: relative
@@ -316,7 +319,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
 
 
 def _reports(sensor: Sensor, fact: Reported, item: Found) -> bool:
-    """Return whether a frame contains a fact."""
+    """Return whether a frame reports a fact, such as the model name."""
     if not fact.path_in(item.frame):
         return False
     return bool(find_reporting(sensor, fact, item.frame, pack_found([item]))[0])
@@ -325,10 +328,13 @@ def _reports(sensor: Sensor, fact: Reported, item: Found) -> bool:
 def find_reporting(
     sensor: SensorDescription, fact: Reported, name: str, frames: Frames
 ) -> NDArray[np.bool_]:
-    """Return a mask of the frames of one type that contain a fact, (n,).
+    """Return which frames report a fact, such as the model name, as a mask (n,).
 
     Args:
-        name: the name of the frame type.
+        sensor: the sensor that sent the frames.
+        fact: the fact, which declares the condition that a frame must meet.
+        name: the type of the frames.
+        frames: n frames of this type.
     """
     if fact.where is None or not len(frames):
         return np.ones(len(frames), np.bool_)
@@ -423,8 +429,9 @@ class Verdict:
         sample: the bytes.
         scores: all sensors that fit, best first.
         candidates: the sensors that remain possible after comparing related models.
-        others: the difference of each related model that has no installed plugin and may have sent
-            the bytes, by id. If `candidates` is empty, one of these models has sent the bytes.
+        others: the models without an installed plugin that may have sent the bytes: id ->
+            difference from the installed models. If `candidates` is empty, one of these models has
+            sent the bytes.
         fault: a description of the fault if frames match a sensor except for their checksums; else
             "".
     """
@@ -468,7 +475,7 @@ def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
 
 
 def _list_sensors_with_frames() -> list[Sensor]:
-    """Return the installed sensors with frames that need no configuration."""
+    """Return the installed sensors whose frames are known without configuration."""
     return [sensor for sensor in sensors().values() if sensor.incoming]
 
 
@@ -569,11 +576,10 @@ def _score(
 
 
 def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """Return the score of a sensor as if the reply before its data had been received.
+    """Return the score of a sensor for bytes that begin in the middle of its data.
 
-    Some data frames are valid only after another frame, such as a reply. If the sensor has several
-    types of such data frames, the best score is returned. Returns None if the sensor has no such
-    type, or if none fits.
+    Some data frames are valid only after another frame, such as a reply. They are rated as if this
+    frame had been received. Returns None if the sensor has no such data frames, or if none fits.
     """
     names = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scores = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in names]

@@ -158,10 +158,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
 
 
 def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a warning if no datagram came from the requested sender.
-
-    The result is a tuple, which is empty without a warning.
-    """
+    """Return a tuple with a warning if only other senders sent datagrams; else empty."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)

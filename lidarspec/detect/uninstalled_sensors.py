@@ -145,7 +145,7 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Name in the error for unknown bytes the distributions to install, if known."""
+    """Add the distributions to install to an error about unknown bytes, if they are known."""
     missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))

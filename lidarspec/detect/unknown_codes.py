@@ -1,4 +1,4 @@
-"""Find codes in the first frames of a sensor that its spec does not name."""
+"""Find codes without a name: values of enumerated fields that the spec does not list."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ MAX_PARSED_FRAMES = 4
 
 
 def find_unknown_codes(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return a text for each unnamed code in the fields that are not in arrays.
+    """Return a message for each code in the frames that the spec does not name.
 
-    A code of 0 is ignored, because sensors often leave fields that they do not use at 0.
+    Fields in arrays are ignored, and so is the code 0, because sensors often leave unused fields at
+    0.
     """
     texts: dict[str, str] = {}
     for name, frame in sensor.frames.items():
