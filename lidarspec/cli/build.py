@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import click
 
-from lidarspec.cli.frames import listing, plain
+from lidarspec.cli.frames import listing, to_json_values
 from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import emit, emit_json, output_options, table
@@ -112,9 +112,9 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    No other command is sent, so a sensor that was started keeps running when the verb ends. Without
-    a unit, as in rate=10, a value has the unit that `show` prints; rate=600rpm is converted to it.
-    If a sensor sends nothing until it is started, name it with -s.
+    No stop command is sent, so a sensor that was started keeps running. A value without a unit, as
+    in rate=10, is in the unit that `show` prints. A value with another unit, as in rate=600rpm, is
+    converted. If a sensor sends nothing until it is started, name it with -s.
     """
     if (command is None) == (digits is None):
         raise UsageError("send requires the name of a command, or bytes such as --hex 'a5 50'")
@@ -164,7 +164,7 @@ class _AnswerLog:
     def close(self) -> None:
         """Do nothing."""
 
-    def after(self, number: int, seconds: float) -> list[Chunk]:
+    def await_reply(self, number: int, seconds: float) -> list[Chunk]:
         """Wait for the end of a reply, and return its chunks.
 
         Waits until no data arrives for `REPLY_SILENCE_S`, but at most `seconds`.
@@ -203,7 +203,7 @@ def _write_bytes(
     before = len(answer.chunks)
     device.write(data)
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
-    chunks = answer.after(before, REPLY_TIMEOUT_S if timeout is None else timeout)
+    chunks = answer.await_reply(before, REPLY_TIMEOUT_S if timeout is None else timeout)
     if chunks:
         pieces = list(iter_pieces(sensor, chunks, datagrams=sensor.datagrams))
     else:
@@ -258,4 +258,9 @@ def _reply_to_dict(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     if reply.frame is None:
         return {**head, "hex": None, "fields": None, "values": []}
     values = [value.to_dict() for value in explain(reply.data, sensor, reply.frame).fields.values()]
-    return {**head, "hex": reply.data.hex(" "), "fields": plain(reply.values), "values": values}
+    return {
+        **head,
+        "hex": reply.data.hex(" "),
+        "fields": to_json_values(reply.values),
+        "values": values,
+    }

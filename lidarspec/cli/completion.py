@@ -53,7 +53,7 @@ class BashCompletion(BashComplete):
     def get_completion_args(self) -> tuple[list[str], str]:
         """Return the words before the cursor, and the word at the cursor.
 
-        Bash splits words at the characters in `WORD_BREAKS`; the parts are joined again.
+        Bash also splits words at the characters in `WORD_BREAKS`. This method joins these words.
         """
         args, incomplete = super().get_completion_args()
         words: list[str] = []
@@ -67,7 +67,10 @@ class BashCompletion(BashComplete):
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return a completion without the beginning of the word, which bash keeps."""
+        """Return the part of a completion that bash inserts.
+
+        Bash keeps the word up to the last character in `WORD_BREAKS`, and replaces the rest.
+        """
         return f"{item.type},{item.value.removeprefix(self._bash_prefix)}"
 
 
@@ -135,9 +138,9 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _find_sensor(ctx: click.Context) -> Sensor | None:
-    """Return the sensor that the words before the cursor select; None if they do not.
+    """Return the sensor of an incomplete command; None if the command names none.
 
-    They select a sensor by -s, by the name of a device in lidarspec.toml, or by a simulated source.
+    The sensor is named by -s, by a device of lidarspec.toml, or by a SOURCE like "sim:ID".
     """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])

@@ -26,8 +26,14 @@ from lidarspec.cli.inputs import (
     refuse_overwriting,
     reread,
 )
-from lidarspec.cli.options import BYTES, count_option, points_option, selecting, sensor_option
-from lidarspec.cli.output import Progress, emit_json, size
+from lidarspec.cli.options import (
+    BYTES,
+    count_option,
+    points_option,
+    selection_options,
+    sensor_option,
+)
+from lidarspec.cli.output import Progress, emit_json, format_size
 from lidarspec.cli.terminal import note
 from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
@@ -102,7 +108,9 @@ class _Counts:
 @click.argument("target", metavar="OUT")
 @sensor_option
 @count_option("scans; with -f frames, with --imu samples")
-@selecting("times", "scans", "every", "ranges", "returns", "columns", "time", "beams", "frame_id")
+@selection_options(
+    "times", "scans", "every", "ranges", "returns", "columns", "time", "beams", "frame_id"
+)
 @points_option
 @click.option(
     "--organized",
@@ -336,8 +344,11 @@ def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> No
 def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
     """Return the frame types to write.
 
-    This is the requested frame type, or all types that a sensor without points sends. A path of
-    parts may follow the frame type.
+    Args:
+        device: the device.
+        target: the output file.
+        frame: the requested type, such as "report", or a kind of parts of a frame, such as
+            "report.tags.temperature"; None for all types that a sensor without points sends.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
@@ -407,13 +418,13 @@ def _select_frames(
 ) -> Generator[dict[str, Packets]]:
     """Yield batches with the selected frames and their parts, without empty batches.
 
-    At its end, or when it is closed, warnings about the clock are printed.
+    When the generator ends or is closed, it prints warnings about the clock.
 
     Args:
         types: the frame types, and the types of parts.
 
     Raises:
-        UsageError: if a required time is unknown, or if there are frames, but none is in the slice.
+        UsageError: if a required time is unknown, or if all frames are outside the selected times.
     """
     frames = list(dict.fromkeys(name.partition(".")[0] for name in types))
     slices = {frame: TimeSlice(selection.times) for frame in frames}
@@ -444,7 +455,12 @@ def _select_frames(
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
-    """Return the packets and their parts by type, for the types in `types`."""
+    """Return the packets of each type in `types`, by type.
+
+    Args:
+        packets: packets of one frame type.
+        types: frame types, and kinds of parts such as "report.tags.temperature".
+    """
     found = dict[str, Packets]()
     for name in types:
         frame, _, path = name.partition(".")
@@ -467,7 +483,7 @@ def _write_packets(
         )
     with (
         contextlib.closing(open_transport(source)) as opened,
-        Progress(size) as progress,
+        Progress(format_size) as progress,
         replace_file(Path(target)) as part,
     ):
         sensor: Sensor | None = None
@@ -488,7 +504,7 @@ def _write_packets(
             raise suggest(
                 WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}"
             )
-    note(f"{target}: {file.records} packets, {size(file.bytes)}")
+    note(f"{target}: {file.records} packets, {format_size(file.bytes)}")
     for warning in opened.warnings:
         note(warning)
     if as_json:
@@ -507,7 +523,7 @@ def _write_points(
     """Write the points of scans; return the entries of the summary."""
     counts = _Counts(device, target)
     with (
-        Progress(size) as progress,
+        Progress(format_size) as progress,
         _open_packets(str(device.source), wanted=with_packets) as packets,
     ):
         first = next(scans, None)

@@ -81,7 +81,7 @@ def ports(as_json: bool, output: str | None) -> None:
         for port in serial
     ]
     rows += [
-        [f"udp://:{port}", ", ".join(_find_senders(port)), _describe_udp_port(users), ""]
+        [f"udp://:{port}", ", ".join(_list_sensors_at_port(port)), _describe_udp_port(users), ""]
         for port, users in udp.items()
     ]
     emit(table(["port", "description", "state", "stable name"], rows, output), output)
@@ -94,7 +94,7 @@ def ports(as_json: bool, output: str | None) -> None:
     )
 
 
-def _find_senders(port: int) -> list[str]:
+def _list_sensors_at_port(port: int) -> list[str]:
     """Return the installed sensors that send data to a UDP port."""
     return [
         sensor.id
@@ -120,7 +120,7 @@ def _describe_udp_port(users: tuple[PortUser, ...] | None) -> str:
 def _udp_to_dict(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any]:
     return {
         "port": port,
-        "sensors": _find_senders(port),
+        "sensors": _list_sensors_at_port(port),
         "free": users is None,
         "users": [vars(user) for user in users or ()],
     }

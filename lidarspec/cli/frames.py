@@ -12,7 +12,7 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import nearest_fault_error, no_frame_error, open_input
 from lidarspec.cli.listing import emit_lines
-from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
+from lidarspec.cli.options import OFFSET, count_option, selection_options, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
 from lidarspec.cli.terminal import note
 from lidarspec.detect.sample_bytes import SampleBytes
@@ -33,7 +33,7 @@ words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, require
 @words_argument
 @sensor_option
 @count_option("frames")
-@selecting("times")
+@selection_options("times")
 @output_options
 def parse(
     words: Sequence[str],
@@ -50,7 +50,7 @@ def parse(
     with open_input(words, selection.times) as (sample, chunks):
         sensor, fits = _find_sensor(sample, sensor_id)
         wanted = FrameSelection(sensor, count=count)
-        selected = wanted.frames(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
+        selected = wanted.iter_valid(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
         first = next(selected, None)
         if first is None:
             raise no_frame_error(sensor, sample)
@@ -72,11 +72,11 @@ def _frame_to_dict(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
     """Return a frame as a JSON object."""
     facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
     parsed = sensor.parse(piece.data, piece.frame)
-    return {**facts, "fields": plain(parsed), "names": dict(_iter_names(parsed, ""))}
+    return {**facts, "fields": to_json_values(parsed), "names": dict(_iter_names(parsed, ""))}
 
 
 def _iter_names(parsed: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield (path, name) of each enum value in a parsed frame; "" if it has no name."""
+    """Yield (path, name) of each enum value in a parsed frame; name "" if it is unknown."""
     if isinstance(parsed, dict):
         for name, value in parsed.items():
             yield from _iter_names(value, f"{path}.{name}" if path else name)
@@ -120,7 +120,7 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
     metavar="FROM:TO",
     help="Explain only the frames in this range of bytes.",
 )
-@selecting("times")
+@selection_options("times")
 @click.option(
     "--bits",
     is_flag=True,
@@ -167,7 +167,7 @@ def explain(
             _compare(sensor, sample, pieces, diff, frame, as_json=as_json, output=output)
             return
         wanted = FrameSelection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
-        parts = wanted.parts(pieces)
+        parts = wanted.iter_explained(pieces)
         if as_json:
             listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
@@ -259,7 +259,7 @@ class FrameSelection:
         self._ended = False
         self.valid = self.damaged = self.unframed = self.others = 0
 
-    def frames(self, pieces: Iterable[InputPiece]) -> Iterator[InputPiece]:
+    def iter_valid(self, pieces: Iterable[InputPiece]) -> Iterator[InputPiece]:
         """Yield the valid frames."""
         for piece in pieces:
             if piece.is_valid:
@@ -270,7 +270,9 @@ class FrameSelection:
             else:
                 self.unframed += len(piece.data)
 
-    def parts(self, pieces: Iterable[InputPiece]) -> Iterator[tuple[InputPiece, Explanation]]:
+    def iter_explained(
+        self, pieces: Iterable[InputPiece]
+    ) -> Iterator[tuple[InputPiece, Explanation]]:
         """Yield the selected pieces with their explanations, as they are found.
 
         Raises:
@@ -421,7 +423,16 @@ def _compare(
 def _find_sensor(
     sample: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
-    """Return the named or a fitting sensor, and the ids of all fitting sensors."""
+    """Return the named sensor, or the first of the sensors that fit some bytes.
+
+    Args:
+        sample: the bytes.
+        sensor_id: the named sensor; None to find one.
+        damaged: whether to return the most similar sensor if the bytes contain no valid frame.
+
+    Returns:
+        The sensor, and the ids of all sensors that fit; no ids for a named sensor.
+    """
     if sensor_id is not None:
         return named_sensor(sensor_id), []
     # A named sensor does not need this module, which is slow to import.
@@ -458,15 +469,19 @@ def _raw_text(raw: Any) -> str:
     return f"{raw[: 2 * LINE_BYTES].hex(' ')} ... ({len(raw)} bytes)"
 
 
-def plain(parsed: Any) -> Any:
+def to_json_values(parsed: Any) -> Any:
     """Return a parsed frame as JSON values.
 
     Bytes become hexadecimal text. NaN and infinity become null.
     """
     if isinstance(parsed, dict):
-        return {name: plain(value) for name, value in parsed.items() if not name.startswith("_")}
+        return {
+            name: to_json_values(value)
+            for name, value in parsed.items()
+            if not name.startswith("_")
+        }
     if isinstance(parsed, list):
-        return [plain(value) for value in parsed]
+        return [to_json_values(value) for value in parsed]
     if isinstance(parsed, bytes | bytearray):
         return parsed.hex(" ")
     if isinstance(parsed, int):

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import click
 
 from lidarspec.cli.failures import NO_DATA
-from lidarspec.cli.output import emit_parts, output_options, size
+from lidarspec.cli.output import emit_parts, format_size, output_options
 from lidarspec.cli.terminal import note
 from lidarspec.explaining.file_contents import format_contents, read_contents
 
@@ -33,7 +33,7 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
             if as_json:
                 yield json.dumps(contents.to_dict(), indent=2, allow_nan=False)
             else:
-                yield f"{contents.path}: {contents.kind}, {size(contents.size)}"
+                yield f"{contents.path}: {contents.kind}, {format_size(contents.size)}"
                 yield from format_contents(contents)
             for warning in contents.warnings:
                 note(warning)

@@ -238,7 +238,10 @@ def refuse_overwriting(
 
 
 def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
-    """Yield the files that may be read for an argument."""
+    """Yield the files that an argument of a verb may name; 0 for standard input.
+
+    Some of them may not exist, because each part of the argument that could be a path is returned.
+    """
     if isinstance(argument, Sensor):
         yield from (
             str(value) for value in argument.options.values() if isinstance(value, str | Path)
@@ -316,7 +319,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
 
 def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
-    """Return an error if the input has a sensor's frames with only wrong checksums.
+    """Return an error if the input has frames that match a sensor except for all checksums.
 
     Returns None for any other input.
     """

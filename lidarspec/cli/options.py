@@ -24,14 +24,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def sensor_option(function: Function) -> Function:
     """Add ``-s/--sensor`` and the options that configure the sensor."""
-    return _add_sensor_option(configuring(function))  # type: ignore[return-value]
+    return _add_sensor_option(configuration_options(function))  # type: ignore[return-value]
 
 
-def configuring(function: Function) -> Function:
-    """Add ``-O`` and ``--calibration``.
+def configuration_options(function: Function) -> Function:
+    """Add ``-O`` and ``--calibration``, which configure the sensor.
 
-    The verb gets the argument `sensor_id`, which is the id, or the sensor that the options
-    configure.
+    The verb gets the configured sensor as `sensor_id`, or the id if no option is given.
     """
 
     @functools.wraps(function)
@@ -107,7 +106,7 @@ def configure_sensor(
 def _parse_value(sensor: Sensor, name: str, text: str) -> Any:
     """Return the value of an option given as text.
 
-    If the option accepts a number or boolean, it is parsed as in `lidarspec.toml`. Any other value
+    If the option accepts a number or boolean, the text is parsed as a TOML value. Any other value
     remains a text.
     """
     try:
@@ -334,7 +333,7 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def selecting(*names: str) -> Callable[[Function], Function]:
+def selection_options(*names: str) -> Callable[[Function], Function]:
     """Add options that select scans. The verb gets a `Selection`.
 
     Args:

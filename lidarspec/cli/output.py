@@ -171,7 +171,7 @@ def _make_bar(*, is_measured: bool) -> Bar:
     return bar
 
 
-def size(number: float) -> str:
+def format_size(number: float) -> str:
     """Format a number of bytes: "1.5 MB"."""
     if number < 1000:
         power = 0
@@ -200,12 +200,12 @@ def emit(content: str | bytes, output: str | None) -> None:
 def emit_parts(
     parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None
 ) -> None:
-    """Write texts or bytes as soon as each is made; otherwise like `emit`.
+    """Write texts or bytes like `emit`, but each as soon as the iterator yields it.
 
     Args:
         parts: texts of one or more lines, or bytes.
         output: the file; None for standard output.
-        colour: True keeps colours in a pipe.
+        colour: the argument of `say`.
     """
     if output is None or output == "-":
         for part in parts:
@@ -233,7 +233,7 @@ def emit_json(value: Any, output: str | None) -> None:
 def emit_json_list(
     head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
 ) -> None:
-    """Write a JSON object with a list, each item as soon as it is made, like `emit`.
+    """Write a JSON object with a list, whose items are written as the iterator yields them.
 
     Args:
         head: the entries before the list.

@@ -19,7 +19,7 @@ from lidarspec.cli.inputs import (
     refuse_overwriting,
     require_points,
 )
-from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
+from lidarspec.cli.options import DURATION, colour_option, selection_options, sensor_option
 from lidarspec.cli.output import emit
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
@@ -66,7 +66,7 @@ from lidarspec.view.svg import svg
     type=DURATION,
     help="Time to read a live source.  [default: 10s; for a scan, until it is complete]",
 )
-@selecting("times", "scans", "every", "ranges", "returns", "time")
+@selection_options("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
 @click.option(
     "--max-range",

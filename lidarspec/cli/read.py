@@ -27,7 +27,7 @@ from lidarspec.cli.options import (
     SHARE,
     count_option,
     points_option,
-    selecting,
+    selection_options,
     sensor_option,
 )
 from lidarspec.cli.terminal import note, say
@@ -83,7 +83,7 @@ TOLERANCE_S = 1e-6
 @click.option("-f", "--frame", metavar="NAME", help="Print the packets of this frame type.")
 @count_option("rows")
 @click.option("-t", "--duration", type=DURATION, help="Stop after this time, such as 10s.")
-@selecting("times", "scans", "every", "ranges", "returns", "columns", "time")
+@selection_options("times", "scans", "every", "ranges", "returns", "columns", "time")
 @points_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def read(
@@ -207,7 +207,7 @@ def _iter_packets(
 
 
 def _to_scalar(value: Any) -> Any:
-    """Return a number as a float; arrays, texts and None, for a missing text, unchanged."""
+    """Convert a number to float; return an array, a text or None unchanged."""
     if np.ndim(value) or value is None or isinstance(value, str):
         return value
     return float(value)
@@ -289,7 +289,7 @@ class StatsPrinter:
     as_json: bool
     printed: int = 0
 
-    def interval(self, at: float | None, reading: MeterReading) -> None:
+    def print_interval(self, at: float | None, reading: MeterReading) -> None:
         """Print the values of an interval that ended `at` seconds after the start."""
         if self.as_json:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
@@ -307,7 +307,7 @@ class StatsPrinter:
         )
         sys.stdout.flush()
 
-    def summary(self, reading: MeterReading, clock: ClockReport) -> None:
+    def print_summary(self, reading: MeterReading, clock: ClockReport) -> None:
         """Print the totals and the rates of the whole input."""
         if self.as_json:
             self._emit(
@@ -355,7 +355,7 @@ class StatsPrinter:
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
 @sensor_option
 @count_option("lines")
-@selecting("times", "scans", "every", "ranges", "returns", "time")
+@selection_options("times", "scans", "every", "ranges", "returns", "time")
 @click.option(
     "-t",
     "--duration",
@@ -432,12 +432,12 @@ def _print_stats(
         else:
             _print_by_packet_time(feed, lines, interval, lasting)
     except KeyboardInterrupt:
-        lines.summary(_measure_input(feed, start), feed.clock.report())
+        lines.print_summary(_measure_input(feed, start), feed.clock.report())
         raise
     reading = _measure_input(feed, start)
     if reading.packets == 0:
         raise no_scan_error(feed.device, source, reading.seconds)
-    lines.summary(reading, feed.clock.report())
+    lines.print_summary(reading, feed.clock.report())
     return reading
 
 
@@ -460,7 +460,7 @@ def _print_by_clock(
     lasting: float,
     patience: FirstFrameTimeout,
 ) -> None:
-    """Print a line for each interval of the host's clock."""
+    """Print a line for each interval, measured by the clock of this computer."""
     edge = last = start
     end = start + lasting
     while end - edge > TOLERANCE_S and not feed.ended:
@@ -468,14 +468,16 @@ def _print_by_clock(
         feed.read(edge)
         patience.check()
         now = time.monotonic()
-        lines.interval(round(now - start, 3), feed.meter.reading(feed.device.stats, now - last))
+        lines.print_interval(
+            round(now - start, 3), feed.meter.reading(feed.device.stats, now - last)
+        )
         last = now
 
 
 def _print_by_packet_time(
     feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> None:
-    """Print a line for each interval of the packets' time.
+    """Print a line for each interval, measured by the times of the packets.
 
     An interval contains at least one batch of packets.
     """
@@ -491,4 +493,4 @@ def _print_by_packet_time(
         passed = (int(times[-1]) - start) * 1e-9
         if passed >= (edges + 1) * interval:
             edges = int(passed / interval)
-            lines.interval(round(passed, 3), feed.meter.reading(feed.device.stats))
+            lines.print_interval(round(passed, 3), feed.meter.reading(feed.device.stats))

@@ -10,8 +10,8 @@ import click
 
 from lidarspec.cli.failures import INTERRUPTED
 from lidarspec.cli.inputs import no_scan_error, refuse_overwriting
-from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
-from lidarspec.cli.output import Progress, emit_json, size
+from lidarspec.cli.options import DURATION, SPEED, count_option, selection_options, sensor_option
+from lidarspec.cli.output import Progress, emit_json, format_size
 from lidarspec.cli.terminal import note, say
 from lidarspec.detect.identification import find_declared_sensor, verb_to_show
 from lidarspec.device.named_devices import find_device
@@ -130,7 +130,7 @@ def record(
 
 
 def _slice_error(source: str, target: str, times: str) -> UsageError:
-    """Return the error for --slice, which suggests the command that copies a part."""
+    """Return the error for `record --slice`, which suggests a command that works."""
     if is_live(source):
         return suggest(
             UsageError("--slice requires a recording; for a live source, use -t"),
@@ -154,7 +154,8 @@ def _print_recording(task: SourceRecording) -> None:
 def _describe_recording(task: SourceRecording, recorder: BackgroundWriter) -> str:
     """Return a text with the number of packets, records and bytes, and the duration."""
     packets = f"{task.packets} packets, " if task.packets else ""
-    return f"{packets}{recorder.records} records, {size(recorder.bytes)} in {task.elapsed:.1f} s"
+    written = f"{recorder.records} records, {format_size(recorder.bytes)}"
+    return f"{packets}{written} in {task.elapsed:.1f} s"
 
 
 def _sum_up_recording(
@@ -165,7 +166,10 @@ def _sum_up_recording(
     *,
     as_json: bool,
 ) -> None:
-    """Print a summary of a recording and the next command; delete it if it is empty."""
+    """Print a summary of a recording and the next command.
+
+    An empty recording is deleted, and an error is raised.
+    """
     device = task.device
     if not recorder.records:
         if not recorder.discard():
@@ -236,7 +240,7 @@ def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
 @click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
 @click.option("--force", is_flag=True, help="Overwrite the destination file.")
 @sensor_option
-@selecting("times")
+@selection_options("times")
 @click.option(
     "--json",
     "as_json",
@@ -331,7 +335,7 @@ def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | 
 def _make_file(
     source: Transport, file: str, target: str, sensor: Sensor | None, *, force: bool
 ) -> BackgroundWriter:
-    """Return a new file for the bytes of another file."""
+    """Create the file to which a recording is copied."""
     try:
         return make_recorder(source, file, target, sensor, overwrite=force)
     except UsageError as error:
@@ -367,7 +371,7 @@ def _view_words(sensor: Sensor | None, target: str) -> str:
 
 
 def _describe_progress(played: Replay) -> str:
-    return f"{played.chunks} chunks, {size(played.bytes)} in {played.seconds:.1f} s"
+    return f"{played.chunks} chunks, {format_size(played.bytes)} in {played.seconds:.1f} s"
 
 
 def _print_summary(

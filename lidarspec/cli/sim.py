@@ -13,8 +13,14 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
-from lidarspec.cli.output import Progress, emit_json, render, size
+from lidarspec.cli.options import (
+    DURATION,
+    SHARE,
+    configuration_options,
+    count_option,
+    sensor_option,
+)
+from lidarspec.cli.output import Progress, emit_json, format_size, render
 from lidarspec.cli.terminal import handle_sigterm, note, say
 from lidarspec.detect.identification import format_sensor_options, verb_to_show
 from lidarspec.device.demo import Demonstration, demonstrate
@@ -57,7 +63,7 @@ PLACES = (
 
 @click.command(short_help="Simulate a sensor on a serial port, UDP, TCP or in a file.")
 @click.argument("sensor_id", metavar="SENSOR")
-@configuring
+@configuration_options
 @click.option("--to", metavar="PLACE", help=PLACES)
 @click.option("--link", metavar="PATH", help="Create a symbolic link to the pty at this path.")
 @click.option(
@@ -181,7 +187,7 @@ def sim(
             )
         written = write_file(device, target, duration or FILE_DURATION_S, overwrite=force)
         _announce(sensor, target, target, {}, as_json=as_json)
-        note(f"{_format_sent(device)}, {size(written)}")
+        note(f"{_format_sent(device)}, {format_size(written)}")
         return
     try:
         opened = make_simulated_outlet(sensor, target, link)
@@ -198,7 +204,7 @@ def sim(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; no program has read {size(opened.unsent_bytes)} of the data"
+            lost = f"; no program has read {format_size(opened.unsent_bytes)} of the data"
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")
@@ -341,7 +347,7 @@ def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[
     else:
         same = "DIFFERENT points"
     lines.append(
-        f"recorded ({size(result.recorded_bytes)}) and read again: {same},"
+        f"recorded ({format_size(result.recorded_bytes)}) and read again: {same},"
         f" SHA-256 {result.recorded_digest[:16]}..."
     )
     return [*lines, f"next: lidarspec view sim:{name}"]

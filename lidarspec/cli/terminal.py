@@ -41,12 +41,11 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
     """Print data on standard output.
 
     Args:
-        content: text, in which characters that control a terminal are escaped; or bytes, which are
-            written unchanged.
+        content: bytes, which are written unchanged, or a text. Characters of the text that control
+            a terminal are escaped.
         nl: whether to end the output with a line break.
-        colour: for a text that lidarspec has coloured, True to print the colours also in a pipe,
-            and False to remove them. None for a text without colours, in which all escape sequences
-            are escaped.
+        colour: whether to keep the colours that lidarspec has added to the text; None if it has
+            added none.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.

@@ -19,7 +19,7 @@ from lidarspec.cli.inputs import (
     refuse_overwriting,
     require_points,
 )
-from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
+from lidarspec.cli.options import DURATION, colour_option, selection_options, sensor_option
 from lidarspec.cli.output import render
 from lidarspec.cli.terminal import handle_sigterm, note, say
 from lidarspec.device.device import Device, open as open_device
@@ -58,7 +58,7 @@ from lidarspec.view.terminal_window import Window
     is_flag=True,
     help="Print one picture and exit; this is the default if output is not a terminal.",
 )
-@selecting("times", "scans", "every", "ranges", "returns", "time")
+@selection_options("times", "scans", "every", "ranges", "returns", "time")
 @colour_option
 @click.option(
     "--web",

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.cli.frames import plain
+from lidarspec.cli.frames import to_json_values
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, ran, run_json
 from tests.engine.streams import MEGABYTE, peak
 from tests.evidence import capture
@@ -382,5 +382,5 @@ def test_parts_are_built_shown_and_explained(tmp_path: Path) -> None:
 def test_json_has_the_fields_of_a_frame_and_not_how_they_were_spelled() -> None:
     sensor = SHAPES["shape-tokens"]
     spelled = sensor.parse(sensor.example("data").replace(b"scandata ", b"scandata 0"))
-    assert list(plain(spelled)) == [name for name in spelled if name != "_wire"]
-    assert len(spelled) == len(plain(spelled)) + 1
+    assert list(to_json_values(spelled)) == [name for name in spelled if name != "_wire"]
+    assert len(spelled) == len(to_json_values(spelled)) + 1
