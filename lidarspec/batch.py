@@ -90,14 +90,15 @@ class FilePiece:
 
     Attributes:
         source: the path or URL of the file.
-        sensor, options: the sensor's id, or "" to detect the sensor, and the sensor's options.
+        sensor: the sensor's id; "" to detect the sensor.
+        options: the sensor's options, by name.
         target: the output file; "" without output. If the source has several pieces, the number of
             the piece is added to the file's name.
         every_point: whether to include points without a valid return.
         size: size of a piece in bytes.
         select: the selected scans. If they are selected by time or number, the file is not cut.
-        number, first: the number of the piece in the file, and the number of the piece's first
-            scan.
+        number: the number of the piece in the file, from 0.
+        first: the number of the piece's first scan in the file, from 0.
         count: the number of scans in the piece; None for all scans up to the end of the file.
         bookmark: the start of the piece; None for the start of the file.
         is_last: whether it is the last piece.
@@ -182,17 +183,18 @@ class FilePiece:
 
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
-    """Return a configured sensor. Repeated calls return one object with compiled code."""
+    """Return a configured sensor; the same object each time, so that it is compiled only once."""
     named = named_sensor(name)
     configured: Sensor = named.configure(**dict(options)) if options else named
     return configured
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Count the scans of a piece.
+    """Count the scans of a piece, and find the next piece.
 
-    Returns a list with the piece, which has the number of its scans, and with the next piece, if
-    there is one.
+    Returns:
+        A copy of the piece with the number of scans, followed by the next piece of the file if
+        there is one.
     """
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
@@ -385,7 +387,7 @@ class Manifest:
         return None
 
     def _is_same(self, source: str, record: Record) -> bool:
-        """Return whether a file is the same as when a record was written."""
+        """Return whether a file has not changed since a record was written."""
         now = read_stamp(source)
         return bool(
             now["size"] == record["size"]

@@ -50,7 +50,7 @@ class Signature(NamedTuple):
 
 
 class KnownSensor(NamedTuple):
-    """A row of the table.
+    """A sensor in the table of known sensors.
 
     Attributes:
         signatures: constant bytes and sizes of its data frames.
@@ -103,10 +103,10 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 
 
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
-    """Return the rows that describe installed entry points exactly.
+    """Return the rows of sensors that are installed exactly as described.
 
-    A row describes an entry point if the distribution is installed in the row's version, and its
-    entry points have the row's names.
+    Their distribution is installed in the version of the row, and their entry points have the names
+    in the row.
     """
     offered: dict[tuple[str, str], dict[str, set[str]]] = {}
     for entry in entries:
@@ -136,7 +136,7 @@ def list_described_sensors() -> list[KnownSensor] | None:
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
-    """Return the row of a sensor; None if there is none.
+    """Return the row of a sensor in the table of known sensors; None if it has none.
 
     Args:
         name: an id or alias, in upper or lower case, with or without hyphens.
@@ -197,8 +197,8 @@ def unknown_sensor_error(
         name: an id or alias.
         installed: the ids of the installed sensors.
         aliases: alias -> id of an installed sensor.
-        failures: the distributions whose plugin failed to load so that their sensors are unknown,
-            and the reason for each.
+        failures: the plugins that failed to load, so that their sensors are unknown: distribution
+            -> reason.
     """
     row = find_known_sensor(name)
     if row is not None:

@@ -15,9 +15,12 @@ DRAWING = "lidarspec.view.notebook"
 
 
 def make_display_method(kind: str) -> Callable[[Any], str | None]:
-    """Return a method that displays a value by the function `kind` of `DRAWING`.
+    """Return a method that displays a value in notebooks.
 
     The method returns HTML, or None if the value is to be displayed as text.
+
+    Args:
+        kind: the name of the function in `lidarspec.view.notebook` that draws the value.
     """
 
     def representation(value: Any) -> str | None:

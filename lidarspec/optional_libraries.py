@@ -1,4 +1,4 @@
-"""Optional libraries: the oldest usable version of each, and the extra with it.
+"""Import optional libraries, and check that their versions are new enough.
 
 An extra is a set of libraries that `pip install lidarspec[EXTRA]` installs. All optional libraries
 are imported by `import_library`. It first compares the installed version with `EXTRAS`, because an

@@ -86,7 +86,7 @@ def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
     """Return the checksum algorithm of a frame type; None keeps the declared one.
 
-    The field that stores the checksum and the covered bytes do not change.
+    A hook cannot change which bytes the checksum covers, or which field stores it.
     """
 
 
@@ -114,7 +114,7 @@ def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
 def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
     """Return the open transport of a link for commands, or None.
 
-    It is called for kinds of links that the package does not support.
+    It is called for kinds of links that lidarspec itself does not support.
 
     Args:
         source: the source of the data.
@@ -127,7 +127,7 @@ def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
 def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
     """Return the command-line verbs that a module adds.
 
-    The entry-point group `lidarspec.verbs` names the module.
+    The module must be named in the entry-point group `lidarspec.verbs`.
     """
 
 
@@ -143,7 +143,8 @@ def lidarspec_page(
 ) -> Any:
     """Open a source, and return the `lidarspec.view.page_server.PageServer` of its page.
 
-    `lidarspec view --web` calls it. The entry-point group `lidarspec.page` names the module.
+    `lidarspec view --web` calls this hook in the module that the entry-point group `lidarspec.page`
+    names.
 
     Args:
         source: the source as the user typed it.
@@ -194,7 +195,9 @@ class Plugin:
     """An installed plugin.
 
     Attributes:
-        distribution, version, entry_point: where it is declared.
+        distribution: the name of the distribution that contains the plugin.
+        version: the version of this distribution.
+        entry_point: the entry point that declares the plugin.
         sensors: the ids that it adds.
         error: the reason why the plugin or one of its ids is not available; "" if everything is
             available.
@@ -271,13 +274,19 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """All installed plugins. A plugin that failed or lost a name has an error."""
+        """All installed plugins.
+
+        A plugin has an `error` if it failed to load, or if another plugin owns one of its ids.
+        """
         self._load_all()
         offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._drop_lost_names(plugin) for plugin in (*self._modules, *offered)]
 
     def _drop_lost_names(self, plugin: Plugin) -> Plugin:
-        """Return a plugin with only the ids that it owns, and an error if it lost a name."""
+        """Return a plugin without the ids that another plugin owns.
+
+        If there are such ids, the returned plugin has an error that names the first of them.
+        """
         home = plugin.home
         own = sorted(name for name in self._sensors.get(home, {}) if self._find_owner(name) == home)
         lost = [
@@ -377,7 +386,10 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _find_owner(self, name: str) -> Home | None:
-        """Return the plugin that owns a name; None if no plugin claims or owns it."""
+        """Return the plugin that provides the sensor with a name; None if there is none.
+
+        There is none if no plugin claims the name, or if several claim it and none owns it.
+        """
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normalise_name(home[0]): home for home in reversed(homes)}
@@ -473,7 +485,10 @@ class Registry:
 
     @property
     def failures(self) -> list[Plugin]:
-        """The plugins loaded so far that failed, or lost a name to another plugin."""
+        """The plugins that failed to load, or whose ids another plugin owns.
+
+        Plugins that were not loaded yet are not included.
+        """
         offered = [
             self._load_module([entry for entry in entries if entry in self._tried])
             for entries in self._offered.values()
@@ -520,7 +535,7 @@ class Registry:
     def sensor(self, name: str) -> Sensor:
         """Return a sensor by id or alias, with its hooks applied.
 
-        The name may also be in upper case, and have other separators or none.
+        Upper and lower case, and the separators in the name, make no difference.
 
         Raises:
             UnknownSensor: if no sensor has this name. The message suggests similar names, or the
@@ -680,7 +695,7 @@ def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
 
 
 def named_owners() -> dict[str, str]:
-    """Return id -> the distribution that owns it, from the user's own settings.
+    """Return the owners that the user's settings name: id -> distribution.
 
     Invalid settings cause a Python warning.
     """
@@ -834,7 +849,7 @@ def try_plugins() -> list[Plugin]:
     """
     if len(_registries) > 1:  # a substitute is active
         return registry().plugins
-    groups = [_modules(), entry_points(SENSORS)]
+    groups = [_list_hook_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
     trials = _try_loading_all(list(entries))
     lost = [
@@ -857,7 +872,7 @@ def try_plugins() -> list[Plugin]:
     ] + lost
 
 
-def _modules() -> list[EntryPoint]:
+def _list_hook_modules() -> list[EntryPoint]:
     """Return the first entry point of each module with hooks."""
     entries: dict[Home, EntryPoint] = {}
     for entry in entry_points(GROUP) + entry_points(VERBS) + entry_points(PAGE):
@@ -929,7 +944,7 @@ def load_alone() -> None:
     *names, mark, limit = sys.argv[1:]
     homes = set(zip(names[::2], names[1::2], strict=True))
     faulthandler.dump_traceback_later(float(limit), exit=True)
-    groups = (_modules(), entry_points(SENSORS))
+    groups = (_list_hook_modules(), entry_points(SENSORS))
     modules, offered = (
         [entry for entry in group if (entry.distribution, entry.module) in homes]
         for group in groups

@@ -209,7 +209,10 @@ class Sensor(SensorDescription):
     def _decode(
         self, data: Any, frame: str | None, backend: str
     ) -> tuple[Packets, WaitingSamples | None]:
-        """Return the packets of a frame type, and IMU samples if no type is named."""
+        """Return the packets of a frame type, and the IMU samples.
+
+        If `frame` is given, or if the sensor has no IMU, None is returned instead of the samples.
+        """
         from lidarspec.framing.decoder import decode_all, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 

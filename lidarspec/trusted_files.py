@@ -123,10 +123,14 @@ def trust(folder: str | Path) -> Path:
 
 
 def resolve_beside(folder: Path, value: object) -> Path:
-    """Return the path of a file that another file in the folder names.
+    """Return the path of a file in a folder.
+
+    Args:
+        folder: the folder.
+        value: the path of the file relative to the folder, from an untrusted source.
 
     Raises:
-        UsageError: for any other path, or if it is not a regular file.
+        UsageError: if `value` is not the path of a regular file in the folder or below.
     """
     if isinstance(value, str) and "\0" not in value:
         path = folder / value

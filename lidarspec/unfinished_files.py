@@ -51,7 +51,7 @@ def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
 
 
 def is_running(process: int) -> bool:
-    """Return whether a process exists; True if the system does not tell."""
+    """Return whether a process exists; True if this is unknown."""
     if os.name != "posix":
         return True
     try:
