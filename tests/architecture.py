@@ -329,7 +329,7 @@ def core_modules(
 
 
 def attributes(module: Module) -> Iterator[tuple[int, str]]:
-    """Line and name of every attribute that is read from lidarspec itself."""
+    """Yield the line and name of every attribute that is read from lidarspec itself."""
     nodes = list(ast.walk(module.tree))
     imported = [alias for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     aliases = [alias for alias in imported if alias.name == "lidarspec"]
@@ -357,7 +357,7 @@ def name_pattern(name: str) -> re.Pattern[str]:
 
 
 def named_sensors(modules: Mapping[str, Module], names: Collection[str]) -> list[str]:
-    """Mentions of a sensor, by its id, vendor or model."""
+    """Return the places where a module names a sensor, by its id, vendor or model."""
     complaints, letters = [], re.compile(r"[\W_]+")
     sought = {name: letters.sub("", name).lower() for name in names}
     for module in modules.values():

@@ -27,7 +27,7 @@ class ConstructFrame(Frame):
 
 
 def _with_part(node: tree.Node) -> tree.Node:
-    """Return the tree of a frame with the part that is never compiled at its end."""
+    """Return the tree of a frame with `_NEVER_COMPILED` added at its end."""
     if isinstance(node, tree.Sealed):
         return dataclasses.replace(node, body=_with_part(node.body))
     assert isinstance(node, tree.Struct)

@@ -207,8 +207,9 @@ def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
 
 
 def test_handwritten_decoders_give_the_same_points(tmp_path: Path) -> None:
-    """The decoders that the engine is measured beside do the same work: in a process of its own,
-    where they can be imported.
+    """Handwritten decoders and the engine give the same points.
+
+    The comparison runs in a separate process, which can import the decoders.
     """
     done = subprocess.run(
         [sys.executable, "-c", BY_HAND, str(RUN.parent), str(tmp_path)],

@@ -30,7 +30,7 @@ NEW_YEAR_2017 = datetime(2017, 1, 1, tzinfo=UTC).timestamp()
 
 @pytest.fixture
 def computer(tmp_path, monkeypatch):
-    """A computer whose only time zone folder is empty."""
+    """Simulate a computer whose only time zone folder is empty; yield the folder."""
     monkeypatch.setattr(leap_seconds.zoneinfo, "TZPATH", (str(tmp_path),))
     monkeypatch.setattr(leap_seconds.importlib.util, "find_spec", lambda name: None)
     read_leap_seconds.cache_clear()

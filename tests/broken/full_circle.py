@@ -1,4 +1,4 @@
-"""Does not fold an angle of 360.0 degrees, though its table has only 360 entries."""
+"""A table of 360 entries that is indexed by an angle of 360.0 degrees."""
 
 from __future__ import annotations
 

@@ -71,13 +71,13 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Counter-clockwise from the first to the last angle."""
+    """Return points, counter-clockwise from the first to the last angle."""
     degrees = spread(f.first, f.last, f.count, full=360.0)
     return Polar(f.samples.distance, np.deg2rad(degrees), intensity=f.samples.quality)
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Packets of 24 samples, 10 a turn."""
+    """Return the values of packet i, ten packets of 24 samples a turn."""
     first = (10 + i * LONGEST * STEP) % 360
     last = (first + (LONGEST - 1) * STEP) % 360
     return dict(

@@ -36,7 +36,7 @@ print(count, first, most())
 
 
 def written(path: Path, megabytes: int) -> int:
-    """Writes frames of the sensor over and over; the number of packets."""
+    """Write a capture that repeats the same frames; return the number of packets."""
     frames = simulate(ls.sensor(SENSOR), 630)
     with path.open("wb") as file:
         file.write(capture_head(ETHERNET))

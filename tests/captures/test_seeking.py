@@ -42,7 +42,10 @@ def _near(monkeypatch: pytest.MonkeyPatch) -> None:
 def written(
     path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True
 ) -> Path:
-    """Twenty seconds of datagrams of 1000 bytes, or of pieces of a byte stream."""
+    """Write records of 1000 bytes to a capture, one every `STEP`; return its path.
+
+    The records are datagrams, or pieces of a byte stream, depending on `link`.
+    """
     writing = WRITINGS[path.suffix]
     with path.open("ab") as file:
         file.write(writing.head(link) if head else b"")
@@ -182,7 +185,7 @@ RATE = 754
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds of a simulated sensor, as it would send them."""
+    """Return a capture of four seconds of a simulated sensor."""
     path = tmp_path_factory.mktemp("captured") / "drive.pcap"
     with path.open("wb") as file:
         file.write(WRITINGS[".pcap"].head(ETHERNET))

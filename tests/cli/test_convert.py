@@ -522,7 +522,10 @@ def lidarspec_sensors():
 
 
 def test_imu_samples_have_the_times_of_the_selected_clock(tmp_path: Path) -> None:
-    """The clock of the shape counts from power-up: UTC is the arrival without its delay."""
+    """The clock of the shape counts from power-up, and every second frame is late.
+
+    The UTC of a sample is the time at which it would have arrived without delay.
+    """
     sensor = SHAPES["shape-inertia"]
     recording = tmp_path / "drive.lsr"
     began_ns = 1_785_283_200 * 10**9

@@ -67,7 +67,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def example_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Contents of the files that golden commands read, by name."""
+    """Return the contents of the files that golden commands read, by name."""
     sensor = ls.sensor(STL)
     frames = ls.simulate(sensor, 400)
     recording = tmp_path_factory.mktemp("golden") / "drive.lsr"

@@ -147,7 +147,7 @@ def shell(block: Block, place: Path, environment: Mapping[str, str] | None = Non
 
 
 def python(block: Block, place: Path, session: dict[str, Any]) -> str:
-    """Return the output of a Python block, run in the names of the blocks before it.
+    """Run a Python block in `session`, and return its output.
 
     An exception names the line of the page.
     """

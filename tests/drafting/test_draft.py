@@ -427,7 +427,7 @@ def test_names_are_refused_before_a_capture_is_read() -> None:
 
 
 def test_points_may_depend_on_no_field() -> None:
-    """A draft without an angle has such points."""
+    """The points of a draft without an angle are constant."""
     shape = SHAPES["shape-count"]
     batch = shape.decode(shape.example("data") * 3).batch()
     arrays, axes, ready = align((np.zeros(1), 0.0), batch)

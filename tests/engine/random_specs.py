@@ -254,7 +254,10 @@ class Drawn:
         return f"Switch({key}, {{{cases}}}{default})"
 
     def bits(self, name: str) -> str:
-        """Return a bit block of whole bytes; later parts may use the integers of a named one."""
+        """Return a bit block of whole bytes.
+
+        If the block has a name, later parts may use its integers.
+        """
         left, parts = 8 * self.source.randint(1, 4), list[str]()
         order = self.source.choice(("", "", "ByteSwapped", "BitsSwapped"))
         while left:

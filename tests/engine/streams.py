@@ -145,9 +145,10 @@ def clean(subject: SensorUnderTest, *, seed: int = 0, length: int = LENGTH) -> b
 
 
 def longest_example(subject: SensorUnderTest, name: str, headers: int = MANY_HEADERS) -> bytes:
-    """Return the longest of many examples, and of the longest header among `headers` drawn ones.
+    """Return the longest of several examples.
 
-    With few headers, headers of frames with parts are not drawn: those have thousands of fields.
+    One of the examples has the longest of `headers` random headers. If `headers` is small, this
+    example is left out for frames with parts, whose headers have thousands of fields.
     """
     found = [
         subject.example(name, seed=seed) for seed in range(8 if headers < MANY_HEADERS else 20)

@@ -122,12 +122,12 @@ def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = 
 
 
 def _answer(sensor: Sensor, name: str, data: bytes) -> str:
-    """Return the frame type that a dissector reports for some bytes.
+    """Return the frame type that a dissector is expected to report for a frame.
 
-    If the bytes are a command, this is the reply with the same bytes, if there is one. A dissector
-    does not evaluate `plausible`. So if several frame types match, this is the first of them, in
-    the order of the dissector, of those that the last announcement permits. Otherwise it is the
-    frame's own type.
+    For a command, this is the reply with the same bytes, if there is one. For other frames, it is
+    the first frame type that matches, in the order of the dissector, and that the last announcement
+    permits. It may differ from the type of the frame, because a dissector does not evaluate
+    `plausible`.
     """
     if name not in sensor.incoming:
         return next((other for other in sensor.incoming if _reads(sensor, other, data)), name)

@@ -112,7 +112,7 @@ def test_named_values_choose_as_in_construct(name: str) -> None:
 def test_headers_that_mean_the_same_have_one_layout() -> None:
     """Headers with lengths that are too long share one layout, and so do unknown keys.
 
-    Noise has a new length and key in each header, which would otherwise need a new layout.
+    Otherwise each header in noise would need a new layout, because it has a new length and key.
     """
     body = Switch(
         this.key,

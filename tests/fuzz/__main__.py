@@ -128,7 +128,8 @@ def list_targets(folder: Path, only: list[str] | None) -> dict[str, float]:
 def spread(costs: dict[str, float], number: int) -> dict[str, int]:
     """Return the number of inputs of each target.
 
-    It depends on the share of its group and, within the group, on the cost of an input.
+    A group of targets gets its share of all inputs. Within a group, a target gets more inputs if
+    its inputs cost less.
     """
     from tests.fuzz.targets import SHARES
 

@@ -71,11 +71,11 @@ class Job:
             self.findings[found.place] = found
             keep(self.folder, found)
         if time.monotonic() - self._began - self.seconds > TOLD:
-            self.tell()
+            self.write_progress()
             bound_memory()
 
-    def tell(self) -> None:
-        """Write how far it is."""
+    def write_progress(self) -> None:
+        """Write the counts, the duration and the findings so far to a file."""
         self.seconds = time.monotonic() - self._began
         told = {
             "inputs": self.inputs,
@@ -105,7 +105,7 @@ class Job:
         with limits(), self.current.open("wb", buffering=0) as self._current:
             self._began = time.monotonic()
             yield beginning
-            self.tell()
+            self.write_progress()
         self.current.unlink()
 
 

@@ -142,8 +142,8 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
     """Return the targets by name.
 
     Args:
-        folder: an empty one of their own, which is also the working directory while they run.
-        sensors: those whose frames, streams and calibration files are read.
+        folder: an empty folder for the files of the targets. It is also their working directory.
+        sensors: the sensors whose frames, streams and calibration files are read.
     """
     found = [_frame(sensor, name) for sensor, name in distinct_frames(sensors)]
     found += [_stream(sensor) for sensor in distinct_sensors(sensors)]
@@ -410,7 +410,7 @@ def _file(folder: Path) -> Target:
 
 
 def _log(folder: Path, kind: str) -> Target:
-    """Read logs of ROS and Foxglove with packets of a sensor, under their own suffix."""
+    """Return the target that reads logs of ROS or Foxglove with packets of a sensor."""
     path = folder / f"some.{kind}"
 
     def run(data: bytes) -> None:
@@ -500,7 +500,10 @@ def _recording(folder: Path) -> Target:
                     str(record)
 
     def mended(data: bytes) -> bytes:
-        """Return the records with correct checksums, as far as their lengths lead."""
+        """Return the input with a correct checksum in each record.
+
+        The length in a record gives the offset of the next one.
+        """
         found, place = bytearray(data), len(MAGIC)
         while place + 21 <= len(found):
             end = (

@@ -23,7 +23,10 @@ PAIRS = SHAPES["shape-pairs"]
 
 
 def make_packet(index: int, mode: int = DUAL_MODE) -> bytes:
-    """Return a packet; the first return is 1 m plus the index of the pair in cm, the second 2 m."""
+    """Return packet `index`, with first or second returns.
+
+    A first return is 1 m away, and a second return 2 m, both plus the index of the pair in cm.
+    """
     second = index % 2 if mode == DUAL_MODE else 0
     pair = index // 2 if mode == DUAL_MODE else index
     return PAIRS.build(

@@ -1,6 +1,6 @@
 """Tests of sensors with several variants of data frames.
 
-They differ in length, counter or unit, as their header says, or use default angles.
+Variants differ in length, counter or unit, which the header states. Some use default angles.
 """
 
 from __future__ import annotations

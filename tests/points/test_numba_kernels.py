@@ -129,7 +129,10 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
 
 
 def answers_in(module: str) -> list[tuple[Sensor, str]]:
-    """Load each frame with its points of a module's sensors once, whichever sensors share both."""
+    """Load each data frame of a module with each of its `points` functions, once.
+
+    Several sensors may share both.
+    """
     answers: dict[tuple[int, object], tuple[Sensor, str]] = {}
     for sensor in sensors_in(module):
         for answer, frame in sensor.frames.items():

@@ -140,9 +140,9 @@ def test_a_length_may_follow_from_a_constant() -> None:
 
 
 def test_plausible_frames_are_found_around_the_lengths_of_the_sweep() -> None:
-    """Two lengths must fit each other, which no declaration states.
+    """Two lengths depend on each other, but the frame does not declare how.
 
-    Random lengths would never fit.
+    Random lengths would never be plausible.
     """
     shape = SHAPES["shape-sized"]
     children = [

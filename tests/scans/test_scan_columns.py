@@ -113,7 +113,10 @@ def test_the_vendors_axes_hold_for_scans_too() -> None:
 
 
 def test_scans_of_batches_that_are_evaluated_in_different_ways_have_all_columns() -> None:
-    """`z` of a level sensor follows from x, unless it was computed with the others."""
+    """One part of the scan has z as a column, and in the other part z is derived.
+
+    A plan of a planar sensor does not compute z, but the reference evaluator does.
+    """
     packets = packets_of("ldrobot-stl27l", 20, "numpy")
     planned = packets.points()
     plain = evaluate_plainly(packets).cloud

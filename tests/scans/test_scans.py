@@ -254,7 +254,7 @@ def segments() -> list[bytes]:
 def test_a_frame_of_parts_counts_once(lost: int, whole: bool, complete: bool, size: int) -> None:
     """A turn has 20 frames of 30 parts each.
 
-    It is whole if at least as many frames were received as are missing.
+    A turn is whole if at most half of its frames are missing.
     """
     frames = [frame for place, frame in enumerate(segments()) if not 24 <= place < 24 + lost]
     assert SHAPES["shape-segments"].decode(frames).stats.lost == lost

@@ -271,7 +271,10 @@ def test_stamps_in_utc_follow_from_the_clock_and_changes_are_reported(tmp_path: 
 
 
 def test_stamps_of_a_free_clock_are_mapped_to_utc_by_arrival(recordings: dict[str, Path]) -> None:
-    """The simulated packets arrive up to 10 ms late; those of a scan's start always do."""
+    """The simulated packets arrive up to 10 ms late.
+
+    The packets in which a scan starts are always 10 ms late.
+    """
     path = recordings["lsr"]
     with ls.open(path, ID) as device:
         first_arrival_ns = min(int(packets.host_ns.min()) for packets in device.packets())

@@ -26,7 +26,7 @@ SAMPLES = 6
 
 
 def sample() -> BitStruct:
-    """Fourteen bits of distance, two of mode, eight of intensity, from the high end down."""
+    """Return the struct of a sample of 24 bits; its fields begin at the high end."""
     return BitStruct(
         "distance" / Scaled(BitsInteger(14), 0.001, "m"),
         "mode" / BitsInteger(2),

@@ -59,7 +59,10 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Twelve packets a turn, with channels of two lengths."""
+    """Return the values of packet i, twelve packets a turn.
+
+    The channels have two lengths.
+    """
     return dict(
         wide=1,
         azimuth=i * 30.0 % 360,

@@ -62,7 +62,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Four packets a turn of a tenth of a second."""
+    """Return the values of packet i, four packets a turn of a tenth of a second."""
     numbers = COLUMNS * i + np.arange(COLUMNS)
     times, places = numbers * (0.1 / TURN) % 4000, numbers % TURN
     return {

@@ -64,7 +64,7 @@ def _sensor(name: str, coordinate: Any, count: Any, longest: int) -> Sensor:
 
 
 def points(f: Fields) -> Cartesian:
-    """A point with a tag of 200 or more is noise."""
+    """Return points; a point with a tag of 200 or more is noise."""
     return Cartesian(
         f.points.x,
         f.points.y,

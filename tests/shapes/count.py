@@ -53,7 +53,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Nine packets a turn."""
+    """Return the values of packet i, nine packets a turn."""
     return dict(count=LONGEST, first=i * 40.0 % 360, last=(i * 40 + 39.0) % 360)
 
 

@@ -51,7 +51,10 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Two segments in each frame, fifteen of these a turn, of two lengths."""
+    """Return the values of frame i, fifteen frames a turn.
+
+    A frame has two segments of different lengths.
+    """
     segments = [
         dict(count=BEAMS - number % 2, start=number * 24.0 % 360) for number in (2 * i, 2 * i + 1)
     ]

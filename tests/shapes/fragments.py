@@ -46,7 +46,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Twelve messages a turn."""
+    """Return the values of message i, twelve a turn."""
     return dict(counter=i % 256, count=LONGEST - i % 3, angle=i * 30.0 % 360)
 
 

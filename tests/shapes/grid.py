@@ -24,7 +24,7 @@ DATA = Checksummed(
 
 
 def points(f: Fields) -> Cartesian:
-    """A picture of depths: columns to the right, rows down."""
+    """Return the points of a depth image: columns to the right, rows down."""
     right, down = np.arange(COLUMNS) - 1.5, np.arange(ROWS)[:, None] - 1.0
     return Cartesian(
         x=f.depth,

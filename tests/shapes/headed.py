@@ -58,7 +58,7 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Twelve packets of two blocks a turn."""
+    """Return the values of packet i, twelve packets of two blocks a turn."""
     return {
         "unit": 4,
         "rows": 2,

@@ -26,7 +26,10 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Twelve packets a turn; the counter is for the frames that have one."""
+    """Return the values of packet i, twelve packets a turn.
+
+    Frames without a counter ignore the counter.
+    """
     return {"azimuth": i * 30.0 % 360, "counter": i % 65_536}
 
 

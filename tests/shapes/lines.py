@@ -48,7 +48,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Nine sectors a turn."""
+    """Return the values of packet i, nine sectors a turn."""
     return dict(tens=BEAMS // 10, ones=0, time=i * 10 % 2**24, sector=i % 9 * 40)
 
 

@@ -79,7 +79,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, object]:
-    """Eighteen packets a turn, of different lengths."""
+    """Return the values of packet i, eighteen packets a turn, of different lengths."""
     return {
         "body.samples_count": LONGEST - i % 4,
         "body.angle": i * 20.0 % 360,

@@ -44,7 +44,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Forty packets a turn."""
+    """Return the values of packet i, forty packets a turn."""
     return dict(scale=2.0, start=i * SAMPLES * STEP % 360, tilt=0.1)
 
 

@@ -75,7 +75,7 @@ def points(f: Fields) -> Polar:
 
 
 def segment(i: int) -> dict[str, Any]:
-    """Thirty segments a turn, of two lengths."""
+    """Return the values of segment i, thirty segments of two lengths a turn."""
     number = CHANNELS - i % 2
     elevations = np.arange(number) * 2.0
     return dict(
@@ -89,7 +89,7 @@ def segment(i: int) -> dict[str, Any]:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Two segments in each telegram, then one."""
+    """Return the values of telegram i; telegrams alternately have two segments or one."""
     first = i // 2 * 3 + i % 2 * 2
     return dict(
         counter=i % 65_536,

@@ -54,7 +54,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Eighteen packets a turn, of different lengths."""
+    """Return the values of packet i, eighteen packets a turn, of different lengths."""
     return dict(size=2 + 3 * (LONGEST - i % 4), angle=i * 20.0 % 360)
 
 

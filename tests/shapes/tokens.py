@@ -70,7 +70,7 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Twelve telegrams a turn."""
+    """Return the values of telegram i, twelve a turn."""
     return dict(
         kind=KIND,
         counter=i % 65_536,

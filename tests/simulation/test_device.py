@@ -220,7 +220,7 @@ def test_a_deadline_is_when_something_comes() -> None:
 
 
 def test_the_end_of_a_delay_is_a_deadline() -> None:
-    """A sensor that waits for a command sends nothing else."""
+    """The sensor waits for a command, so nothing else would wake it."""
     device = on(a1())
     device.delay_output(0.5, 0)
     assert send_command(device, "get_info", 10 * MS) == b""

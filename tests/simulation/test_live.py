@@ -412,7 +412,7 @@ def test_keys_come_over_any_descriptor() -> None:
 
 @posix
 def test_many_simulators_take_turns_and_end() -> None:
-    """One process runs almost more simulators than it can; all send, and all end."""
+    """One process runs twelve simulators; all of them send, and all of them end."""
     ports = [Served(SimulatedDevice(stl()), make_simulated_outlet(stl(), "pty")) for _ in range(12)]
     until(lambda: all(port.device.sent["data"] for port in ports))
 

@@ -332,7 +332,10 @@ def decoding_rate(sensor: Sensor, data: bytes) -> float:
 
 
 def line_rates() -> dict[Hashable, float]:
-    """Return the bytes a second of the fastest line, for each set of frames that sensors share."""
+    """Return the bytes per second of the fastest line, for each set of frames.
+
+    Sensors with the same frames share one entry.
+    """
     found: dict[Hashable, float] = {}
     for sensor in every_sensor().values():
         key = _frames_key(sensor)

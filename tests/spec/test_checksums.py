@@ -102,7 +102,7 @@ name_of = methodcaller("describe")
 
 
 def slow_unless(values: Iterable[Any], quick: Collection[Any]) -> list[Any]:
-    """Return parameters of which those that are not in `quick` are left to the slow tier."""
+    """Return test parameters; all that are not in `quick` are marked as slow."""
     return [
         pytest.param(value, marks=() if value in quick else pytest.mark.slow) for value in values
     ]

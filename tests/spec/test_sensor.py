@@ -73,7 +73,10 @@ def test_an_option_is_of_the_type_that_its_parameter_declares(
 
 
 def configured_by(annotation: str) -> ls.Sensor:
-    """Return a sensor with an option `table`; its module imports no name of the annotation."""
+    """Return a sensor with an option `table` of this type.
+
+    The module of the option does not import the names in the annotation.
+    """
     names: dict[str, Any] = {}
     exec(f"def typed(sensor: 'Sensor', *, table: {annotation!r}):\n    return sensor\n", names)
     return dataclasses.replace(SHAPES["shape-count"], configure=names["typed"])

@@ -295,7 +295,7 @@ def test_underivable_facts_are_requested_by_name(how: object) -> None:
 
 
 class Lossy(Sensor):
-    """It forgets the sign of the tilt."""
+    """A sensor that loses the sign of the tilt when it builds a frame."""
 
     def build(self, frame, value=None, /, *, units=False, **values):  # type: ignore[no-untyped-def]
         if frame == "data" and value is not None and value.get("tilt", 0) < -100:

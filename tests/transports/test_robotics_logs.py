@@ -57,8 +57,13 @@ def packets(number: int, name: str = "velodyne-vlp16", start: int = 0) -> list[b
 
 
 def write_log(path: Path, kind: str, topics: dict[str, tuple[str, Sequence[bytes]]]) -> Path:
-    """A log in which each topic has a type and packets, a list of ten or one a message, as rosbags
-    writes it.
+    """Write a log with rosbags; return its path.
+
+    Args:
+        path: the folder of the log.
+        kind: one of `KINDS`.
+        topics: topic -> the type of its messages, and the packets. If a message contains a list of
+            packets, the list has ten.
     """
     is_1 = kind == "bag"
     store = typesys.get_typestore(

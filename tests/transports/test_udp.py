@@ -296,7 +296,7 @@ def test_a_port_that_cannot_be_opened_gives_a_reason(
 
 
 def test_a_datagram_that_is_too_long_for_udp_is_dropped_and_counted() -> None:
-    """A patient sender waits for room, but never for what cannot be sent at all."""
+    """A patient sender waits for space, but drops what UDP can never send."""
     line = UdpLine.make_reply_line("127.0.0.1", 0)
     try:
         with udp() as reader:

@@ -19,7 +19,7 @@ SCRIPT = "<script>alert('x')</script>"
 
 
 def dots(svg: str, view: int = 0) -> list[tuple[float, float]]:
-    """Places of the dots of a view in pixels, from its left upper corner."""
+    """Return the positions of the dots of a view, pixels from its upper left corner."""
     group = ET.fromstring(svg).findall("{*}svg")[view].find("{*}g[@transform]")
     assert group is not None
     scale = float(group.get("transform", "").removeprefix("scale(").removesuffix(")"))

@@ -57,7 +57,10 @@ def draw_lines(
 
 
 def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
-    """(row, column) of every dot, by the bits of the characters as Unicode numbers them."""
+    """Return the (row, column) of every dot of braille characters.
+
+    The bits of a character are its dots, in the order of Unicode.
+    """
     found = set()
     for row, line in enumerate(lines):
         for column, character in enumerate(line):

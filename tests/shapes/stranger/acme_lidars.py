@@ -110,7 +110,7 @@ def configure(sensor: Sensor, *, calibration: str | Path) -> Sensor:
 
 
 def sweep(i: int) -> dict[str, float]:
-    """Thirty-six packets a turn."""
+    """Return the values of packet i, thirty-six packets a turn."""
     return dict(count=4, start=i * 10.0 % 360)
 
 
