@@ -25,7 +25,7 @@ CODES = np.arange(1 << 16)
 
 @functools.cache
 def _m1_tables() -> dict[str, Floats]:
-    """Return lookup tables by the big-endian raw value loaded as little-endian."""
+    """Return lookup tables for big-endian fields that are read as little-endian."""
     code = CODES.astype("<u2").view(">u2").astype(np.float64)
     angle = np.deg2rad(code * 0.01 - 327.68)
     distance = np.where(code > 0, code * 0.005, np.nan)
@@ -214,7 +214,7 @@ class Scratch:
 
 
 def lookup(table: Floats, codes: NDArray[Any], scratch: Scratch, out: Floats) -> None:
-    """Return the table's values for these codes."""
+    """Write the table's values for these codes to `out`."""
     index = scratch.index[: len(out)]
     np.copyto(index, codes)
     table.take(index, out=out, mode="wrap")

@@ -95,10 +95,10 @@ class Inputs:
         return make_opening_frame(self.sensor(key)) + b"".join(self.frames(key))
 
     def noisy(self, key: str) -> Noisy:
-        """Return the frames with noise between them and damage in every fiftieth.
+        """Return the frames as a stream, with noise before some and damage in some.
 
-        One byte of each damaged frame is changed. The runs of noise are as many, and have the mean
-        length of a frame.
+        About one frame in fifty has noise before it, of up to twice the length of a frame. In about
+        one frame in fifty, one byte is changed.
         """
         random = np.random.default_rng(SEED)
         pieces: list[bytes | bytearray] = []

@@ -36,8 +36,8 @@ class Line:
 
     Args:
         rate: frames per second.
-        opened: opens both ends of the connection: the SOURCE, and the arguments and descriptors of
-            the sender.
+        opened: a context manager that opens both ends of the connection. It yields the SOURCE to
+            read from, and the arguments and descriptors of the process that sends.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class Line:
 
 
 def arrivals(device: ls.Device, sender: subprocess.Popen[bytes]) -> Iterator[int]:
-    """Return the time at which the points of each packet were ready.
+    """Yield the time at which the points of each packet were ready, ns.
 
-    It returns when the sender is done.
+    Ends when the sender has ended and no packets arrive.
     """
     for packets in device.packets(wait=0.15):
         if len(packets):

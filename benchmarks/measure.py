@@ -65,7 +65,7 @@ LEAST_STEP = 1e-6
 def measure_contenders(
     contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter
 ) -> Rates:
-    """Return the seconds per unit of the amount, by contender, a value for each run.
+    """Return the seconds per unit of the amount, for each contender and run.
 
     Args:
         least: minimum seconds of a run. A faster contender is repeated within a run. To find the
@@ -96,7 +96,10 @@ def cpu_seconds() -> float:
 
 
 def times(rates: Rates, fast: str, slow: str) -> float:
-    """Return the speed of the first relative to the second: the median over the runs."""
+    """Return how many times as fast as `slow` the contender `fast` is.
+
+    The result is the median over the runs.
+    """
     return median(behind / ahead for ahead, behind in zip(rates[fast], rates[slow], strict=True))
 
 
