@@ -58,9 +58,7 @@ class EntryPoint(NamedTuple):
             Exception: any exception of the import.
         """
         if not self.module:
-            raise SpecError(
-                "its file entry_points.txt is not UTF-8, or an entry in it names no module"
-            )
+            raise SpecError("entry_points.txt is not UTF-8, or one of its entries names no module")
         attributes = self.value.partition("[")[0].partition(":")[2]
         names = [name for name in attributes.strip().split(".") if name]
         return functools.reduce(getattr, names, importlib.import_module(self.module))

@@ -260,7 +260,7 @@ class LibraryError(UsageError):
         if installed_version:
             found = f"version {installed_version} is installed"
         else:
-            found = "it is not installed"
+            found = "this library is not installed"
         super().__init__(f"this requires {needed}; {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
@@ -402,9 +402,9 @@ class UnknownSensor(UnknownName):
         self.distribution = distribution
         self.failure = failure
         if failure:
-            hint = f": it comes with {distribution}, which failed to load: {failure}"
+            hint = f": the distribution {distribution} provides it, but failed to load: {failure}"
         elif distribution:
-            hint = f": it comes with {distribution}, which is not installed"
+            hint = f": the distribution {distribution} provides it, but is not installed"
         super().__init__(name, known, place=place, hint=hint, aliases=aliases)
 
 

@@ -751,7 +751,8 @@ def _import_in_time(entry: EntryPoint) -> Any:
         thread.join(max(LOAD_TIMEOUT_S - LOAD_WARNING_S, 0))
     if not outcome:
         _hanging[entry.module] = (
-            f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s{_describe_location(thread)}"
+            f"the plugin hangs: loading took more than {LOAD_TIMEOUT_S:g} s"
+            f"{_describe_location(thread)}"
         )
         warnings.warn(
             f"{entry.distribution}: {_hanging[entry.module]}; the plugin is ignored",
@@ -800,11 +801,11 @@ def _letters(name: str) -> str:
 
 def _replace_checksum(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
-        raise SpecError(f"must return a Checksum or None, got {type(algorithm).__name__}")
+        raise SpecError(f"the hook must return a Checksum or None, got {type(algorithm).__name__}")
     struct = prepare(frame.struct)
     seal = next(iter_seals(struct), None)
     if seal is None:
-        raise SpecError("returns a checksum for a frame type that declares no checksum")
+        raise SpecError("the hook returns a checksum for a frame type that declares none")
     seal.algorithm = algorithm
     return replace(frame, struct=struct)
 
@@ -904,7 +905,7 @@ def _try_loading(*homes: Home) -> tuple[str, str]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     names = [name for home in homes for name in home]
     command = [sys.executable, "-P", "-c", code, *names, mark, str(LOAD_TIMEOUT_S)]
-    hangs = f"it hangs: loading took more than {LOAD_TIMEOUT_S:g} s"
+    hangs = f"the plugin hangs: loading took more than {LOAD_TIMEOUT_S:g} s"
     pipe = subprocess.PIPE
     try:
         done = subprocess.run(
@@ -923,13 +924,13 @@ def _try_loading(*homes: Home) -> tuple[str, str]:
     if not ended:
         if "Timeout (" in complaints:  # of `faulthandler.dump_traceback_later`
             return hangs, ""
-        return f"loading it ends the process with the exit status {done.returncode}", ""
+        return f"loading the plugin ends the process with the exit status {done.returncode}", ""
     text = " ".join((printed + complaints).split())
     effects = list[str]()
     if text:
-        effects.append(f"it prints {shown(text)}")
+        effects.append(f"the plugin prints {shown(text)}")
     if threads:
-        effects.append(f"it starts a thread that keeps running: {threads}")
+        effects.append(f"the plugin starts a thread that keeps running: {threads}")
     return "", "; ".join(effects)
 
 

@@ -154,16 +154,16 @@ def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
     parse = json.loads if kind == "JSON" else tomllib.loads
     with system_errors(path), path.open("rb") as file:
         data = file.read(MAX_BYTES[kind] + 1)
-    reason: object = f"it is longer than {MAX_BYTES[kind] >> 10} kB"
+    reason: object = f"the file is longer than {MAX_BYTES[kind] >> 10} kB"
     try:
         if len(data) <= MAX_BYTES[kind]:
             if kind == "TOML" and _ENDLESS_KEY.search(data):
                 raise ValueError("a key has more than 32 parts")
             return parse(data.decode())
     except RecursionError:
-        reason = "its brackets are nested too deeply"
+        reason = "the brackets are nested too deeply"
     except UnicodeDecodeError:
-        reason = "it is not UTF-8"
+        reason = "the file is not UTF-8"
     except ValueError as error:
         reason = error
     raise UsageError(f"{path}: not {kind}: {reason}")

@@ -168,9 +168,9 @@ class CaptureReader(ClosingContext):
             magic = bytes(self._source.peek(4))
             if not is_capture(magic):
                 if magic:
-                    seen = f"it begins with {magic.hex(' ')}"
+                    seen = f"the file begins with {magic.hex(' ')}"
                 else:
-                    seen = "it is empty"
+                    seen = "the file is empty"
                 raise SourceError(
                     f"{getattr(file, 'name', 'input')}: neither a pcap nor a pcapng capture: {seen}"
                 )

@@ -432,7 +432,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())
         return (
-            f"does not contain the sensor's settings; to read its data frames, set {assignments}",
+            f"does not contain the sensor's settings: to read the data frames, set {assignments}",
             format_sensor_options(sensor.configure(**own)),
         )
     others = [score.sensor for score in scores if score.sensor.id != sensor.id]
@@ -440,7 +440,7 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
         return None
     return (
         (
-            "has no data frame of this sensor; it has frames of"
+            "has no data frame of this sensor, but has frames of"
             f" {', '.join(other.id for other in others)}"
         ),
         format_sensor_options(others[0]),

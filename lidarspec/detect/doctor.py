@@ -283,8 +283,8 @@ def _check_interfaces(
         yield Diagnosis(False, text, f"sudo tcpdump -ni {name} udp")
         if ports.filters_senders(name):
             text = (
-                f"{name} drops packets of senders in other networks (rp_filter); a sensor with its"
-                " factory address can be such a sender"
+                f"{name} drops packets from other networks (rp_filter), for example those of a"
+                " sensor with its factory address"
             )
             yield Diagnosis(
                 False,

@@ -249,7 +249,7 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
         uncertainty = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
     if abs(step - expected) > PACE_TOLERANCE * expected + uncertainty:
         return ""
-    return f"its clock advances by {step / 1e6:.3g} ms per packet"
+    return f"the clock advances by {step / 1e6:.3g} ms per packet"
 
 
 @functools.lru_cache(maxsize=256)
@@ -615,7 +615,7 @@ def identify_sample(sample: SampleBytes) -> Verdict:
         if score.sensor.id in result.candidates
     ]
     if len(possible) > 1 and sample.baud is not None:
-        why = f"it sends at {sample.baud} baud"
+        why = f"the sensor sends at {sample.baud} baud"
         links = [(score, data_link(score.sensor, Serial)) for score in possible]
         possible = [
             replace(score, why=why) for score, link in links if link and sample.baud in link.bauds

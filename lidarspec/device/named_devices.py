@@ -108,7 +108,7 @@ class NamedDevice:
             reason = f"sensor {self.sensor!r} is a Python file, which would be executed"
         elif is_remote(self.source):
             reason = (
-                f"source {self.source!r} is a URL, which could name any host, or a file outside"
+                f"source {self.source!r} is a URL: it could name any host, or a file outside"
                 f" {folder}"
             )
         elif os.path.isfile(file):

@@ -180,7 +180,7 @@ def parse_arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> di
         UsageError: for an unknown command or argument, or an invalid value.
     """
     if name not in sensor.commands:
-        hint = "" if sensor.commands else "; it has no commands"
+        hint = "" if sensor.commands else "; the sensor has no commands"
         raise UnknownCommand(name, sensor.commands, place=sensor.id, hint=hint)
     command = sensor.commands[name]
     given: dict[str, Any] = {}

@@ -66,7 +66,7 @@ class ExplainedPoint(NamedTuple):
 
     def __str__(self) -> str:
         if math.isnan(self.azimuth_deg + self.elevation_deg):
-            return "the direction is unknown, because it comes from other frames"
+            return "the direction is unknown, because other frames contain it"
         level = round(self.elevation_deg, 2) == 0
         direction = f"at {format_fixed(self.azimuth_deg, 2)} deg" + (
             "" if level else f", {format_fixed(self.elevation_deg, 2)} deg up"

@@ -37,7 +37,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             raise NotCompilableError(node.info.path, node.reason)
         case tree.Sealed():
             if in_array:
-                raise NotCompilableError(path, "it is a checksum inside an array")
+                raise NotCompilableError(path, "the checksum is inside an array")
             _ = node.algorithm
         case tree.Blob() if in_array and node.ending is not None:
             raise NotCompilableError(
@@ -45,11 +45,11 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
                 "the content of each element determines its end: use an array of structs",
             )
         case tree.PartSequence() if in_array:
-            raise NotCompilableError(path, "it is a sequence of parts inside an array")
+            raise NotCompilableError(path, "the sequence of parts is inside an array")
         case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
-                    raise NotCompilableError(part.info.path, "it is an array of arrays of bits")
+                    raise NotCompilableError(part.info.path, "the bits are in an array of arrays")
         case tree.When() | tree.Select():
             _check_alternatives(node)
     for formula in tree.formulas(node):
@@ -138,10 +138,10 @@ def _check_columns(root: tree.Node) -> None:
     """Raise `NotCompilableError` if no column can represent the values of a field."""
     for info in make_schema(root).fields.values():
         if info.dtype is None:
-            wide = f"it has {info.bits} bits, and a column has at most 64"
+            wide = f"the field has {info.bits} bits, and a column has at most 64"
             raise NotCompilableError(
                 info.path,
-                wide if info.bits > 64 else "its values are not numbers of one type",
+                wide if info.bits > 64 else "the values of the field are not numbers of one type",
             )
 
 

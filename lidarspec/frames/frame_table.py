@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 #: The reason why an array inside the elements of an array has no single length per frame.
-VARYING_LENGTH = "its length varies within one frame, so it cannot be a column"
+VARYING_LENGTH = "the length of the array varies within one frame, so it cannot be a column"
 
 
 class Table(Protocol):

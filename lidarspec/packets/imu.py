@@ -107,7 +107,7 @@ def read_samples(
     with plugin_errors(f"imu of {frame}", sensor.id, function), np.errstate(all="ignore"):
         result = function(Fields(batch))
         if not isinstance(result, Imu):
-            raise TypeError(f"must return Imu, got {type(result).__name__}")
+            raise TypeError(f"the function must return Imu, got {type(result).__name__}")
         values = dict(
             zip(
                 [*UNITS, "time"],

@@ -59,18 +59,18 @@ class UtcSource:
 
     @property
     def reason(self) -> str:
-        """The reason why the clock does not give UTC, to be printed after "the clock"."""
+        """The reason why the clock does not give UTC."""
         if self.kind == "hour":
-            return "counts from the full hour"
+            return "the sensor's clock counts from the full hour"
         if self.epoch in DATED_EPOCHS:
-            return "was not set"
+            return "the sensor's clock was not set"
         if self.epoch:
-            return "counts time since power-up"
-        return "is not declared to count UTC, TAI or GPS time"
+            return "the sensor's clock counts time since power-up"
+        return "the sensor's clock is not declared to count UTC, TAI or GPS time"
 
     def __str__(self) -> str:
         if self.kind == "arrival":
-            text = f"the arrival times, because the sensor's clock {self.reason}"
+            text = f"the arrival times, because {self.reason}"
         elif self.kind == "hour":
             text = "the sensor's clock within the hour; the hour comes from the arrival time"
         elif self.epoch == "utc":
@@ -259,8 +259,7 @@ class UtcTimes:
     def _explain_unknown(self, source: UtcSource) -> UsageError:
         """Return the error for times that cannot be converted."""
         error = UsageError(
-            f"UTC is unknown, because {self._name} has no arrival times, and the clock of"
-            f" {self._sensor} {source.reason}; record with arrival times: lidarspec record -o"
-            " drive.lsr"
+            f"UTC is unknown, because {self._name} has no arrival times, and"
+            f" {source.reason}: record with arrival times (lidarspec record -o drive.lsr)"
         )
         return suggest(error, "repeat with --time sensor")

@@ -121,7 +121,9 @@ def evaluate_plainly(
     ):
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
-            raise TypeError(f"must return Polar or Cartesian, got {type(result).__name__}")
+            raise TypeError(
+                f"the function must return Polar or Cartesian, got {type(result).__name__}"
+            )
         return _make_points(packets, result, batch, find_stamp(packets, epoch), final=final)
 
 

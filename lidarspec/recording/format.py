@@ -121,9 +121,9 @@ class Header:
             UnknownSensor: if the sensor is not installed.
         """
         if not self.sensor:
-            raise UsageError("it names no sensor")
+            raise UsageError("the recording names no sensor")
         if not _ID.fullmatch(self.sensor):
-            raise UsageError(f"its header contains the invalid sensor id {self.sensor[:40]!r}")
+            raise UsageError(f"the recording has the invalid sensor id {self.sensor[:40]!r}")
         installed = named_sensor(self.sensor)
         if not self.options:
             return installed
@@ -357,9 +357,9 @@ class Recording(ClosingContext):
             magic = self._file.read(len(MAGIC))
             if magic != MAGIC:
                 if magic:
-                    seen = f"it begins with {magic.hex(' ')}"
+                    seen = f"the file begins with {magic.hex(' ')}"
                 else:
-                    seen = "it is empty"
+                    seen = "the file is empty"
                 raise SourceError(f"{self.path}: not an .lsr recording: {seen}")
             pairs = self._iter_valid_records()
             first = next(pairs, None)

@@ -260,12 +260,12 @@ class ClockWriter:
             base = np.datetime64(self.read(table).item() // DAY_NS, "D")
             self._date = _DateFields(*paths, base, (year, month, day))
         elif date:
-            raise self._make_error("some fields of its date were not found")
+            raise self._make_error("some fields of the date were not found")
         self._set_fields(linear)
 
     def _set_fields(self, fields: list[_TimeField]) -> None:
         if not fields:
-            raise self._make_error("no field outside of arrays determines it")
+            raise self._make_error("no field outside of arrays determines the time")
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
@@ -288,7 +288,7 @@ class ClockWriter:
             wanted = wanted % self.period_ns
         self.write(table, wanted)
         if abs(self.read(table) - wanted).item() > max(self.resolution_ns, 1000):
-            raise self._make_error("its function cannot be inverted")
+            raise self._make_error("the function that reads the clock cannot be inverted")
 
     def _make_error(self, reason: str) -> UsageError:
         return UsageError(f"the clock of {self._sensor.id} cannot be written: {reason}")

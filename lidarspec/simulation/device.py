@@ -735,7 +735,7 @@ class SimulatedDevice:
         stream_simulation = frame_simulation(sensor, frame, blocked=bool(self.faults.rotor))
         if not stream_simulation.interval:
             raise SpecError(
-                "its rate is unknown: declare `rate`",
+                "the rate of this frame type is unknown: declare `rate`",
                 path=frame,
                 sensor=self.sensor.id,
             )

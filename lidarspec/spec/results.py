@@ -93,7 +93,7 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     for name in extra:
         if not _NAME.fullmatch(name) or name in STANDARD_NAMES:
             if name in STANDARD_NAMES:
-                reason = "is a reserved name"
+                reason = "is the name of a standard column"
             else:
                 reason = "is not a valid name: use lower-case letters, digits and _"
             raise SpecError(f"{name!r} {reason}", path="extra")

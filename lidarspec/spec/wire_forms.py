@@ -990,7 +990,8 @@ class Lines:
         object.__setattr__(self, "head", tuple(self.head))
         if self.width < 1 or min(self.head, default=1) < 1 or not 0 <= self.bare <= len(self.head):
             raise SpecError(
-                "lines must have at least one character, and lines without a check must come first",
+                "width and all numbers of head must be at least 1, and bare at most the count of"
+                " these numbers",
                 path="wire",
             )
         if self.numbers is not None and self.numbers.echoes is not None and not self.head:

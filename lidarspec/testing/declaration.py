@@ -242,7 +242,7 @@ def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"the frame is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
-        reason = getattr(engine, "reason", "its layout cannot be computed")
+        reason = getattr(engine, "reason", "the layout of the frame cannot be computed")
         if NAME_IS_COMPARED in reason:
             yield "LS117", reason, name
         elif not _is_reply(subject.sensor, name):  # a reply comes only once, on request
@@ -483,7 +483,7 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        what = f"its constant bytes also occur at {share:.1%} of the offsets in its content"
+        what = f"the constant bytes also occur at {share:.1%} of the offsets in the content"
         yield "LS204", what, name
 
 
@@ -638,9 +638,9 @@ def _check_column(
                 ),
             )
             if first.unit:
-                problem = f"its unit is {first.unit!r}, expected {' or '.join(units)}"
+                problem = f"the unit is {first.unit!r}, expected {' or '.join(units)}"
             else:
-                problem = f"it has no unit, expected {' or '.join(units)}"
+                problem = f"no unit is declared, expected {' or '.join(units)}"
             yield (
                 "LS201",
                 f"the {column} of points is calculated from this field, but {problem}",

@@ -24,17 +24,17 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 def _no_points(subject: SensorUnderTest) -> str:
     if subject.sensor.has_points:
         return ""
-    return "it has no points"
+    return "the sensor has no points"
 
 
 def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
-        return "it cannot be simulated, because it declares no `sweep`"
+        return "the sensor cannot be simulated, because it declares no `sweep`"
     alone = [name for name in names if not get_codec(subject.sensor.frames[name]).is_compiled]
     if alone:
         return (
-            "it cannot be simulated, because these frame types are not compiled:"
+            "the sensor cannot be simulated, because these frame types are not compiled:"
             f" {', '.join(alone)}"
         )
     return ""
@@ -43,13 +43,13 @@ def _no_sweep(subject: SensorUnderTest) -> str:
 def _no_commands(subject: SensorUnderTest) -> str:
     if subject.sensor.commands:
         return ""
-    return "it has no commands"
+    return "the sensor has no commands"
 
 
 def _no_device(subject: SensorUnderTest) -> str:
     has_replies = any(command.replies for command in subject.sensor.commands.values())
     if not has_replies:
-        return "it has no commands with a documented reply"
+        return "the sensor has no commands with a documented reply"
     if subject.sensor.has_points:
         return _no_sweep(subject)
     return ""

@@ -283,7 +283,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     require(
         not unsaid,
         "LS212",
-        "its name is that of a checksum, but no Checksummed verifies it",
+        "the field has the name of a checksum, but no Checksummed verifies it",
         f"{name}.{''.join(unsaid[:1])}",
     )
 

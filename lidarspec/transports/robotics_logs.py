@@ -143,7 +143,7 @@ class BagTransport(Transport):
                     f"the topic {link.topic} has the type {link.msgtype}"
                     for link in (with_packets or self._log.connections)[:MAX_LISTED_TOPICS]
                 )
-                or "it is empty"
+                or "the log is empty"
             )
             self.warnings.append(
                 f"{path} is {log.description} without packets{f' of {sender}' if sender else ''}:"

@@ -111,7 +111,7 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
         return UsageError(f"nothing was written, because all sent frames ({frames}) were lost")
     if device.deadline is not None:
-        due = f"its next frame is due after {device.deadline / SECOND:g} s"
+        due = f"the next frame is due after {device.deadline / SECOND:g} s"
         return UsageError(
             f"nothing was written: the simulated {sensor.id} sends no data in the first {seconds:g}"
             f" s; {due}"

@@ -149,7 +149,7 @@ def test_points_of_a_contradicted_sensor_have_a_warning(tmp_path: Path) -> None:
         "convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e"
     ).stderr
     assert (
-        "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms per packet)" in told
+        "the frames are those of velodyne-vlp16 (the clock advances by 1.33 ms per packet)" in told
     )
 
 
@@ -175,7 +175,7 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
         in ran("convert", log, out, code=2).stderr
     )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
-    assert "to read its data frames, set answer=node" in told
+    assert "to read the data frames, set answer=node" in told
     following = next(line for line in told.splitlines() if "next: " in line).split(
         "next: lidarspec "
     )[1]

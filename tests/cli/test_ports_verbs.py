@@ -98,7 +98,7 @@ class TestSend:
         (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 9)))
         ran("send", tmp_path / "raw.bin", "start", "-s", "cspc-m1c1-mini", code=2)
         with virtual_port("ldrobot-stl27l") as made:
-            assert "it has no commands" in ran("send", made.path, "start", code=2).stderr
+            assert "the sensor has no commands" in ran("send", made.path, "start", code=2).stderr
 
     def test_a_port_in_use(self) -> None:
         with virtual_port("ldrobot-stl27l") as made, ls.open(made.path, "ldrobot-stl27l"):

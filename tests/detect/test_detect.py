@@ -157,7 +157,7 @@ def test_clocks_tell_twins_apart(name: str) -> None:
     data = simulate(sensor, 60, start=7)
     found = identify_sample(SampleBytes("", tuple(data), datagrams=sensor.datagrams))
     assert found.sensor is sensor
-    assert "its clock advances by" in found.candidates[0].why
+    assert "the clock advances by" in found.candidates[0].why
 
 
 def old_firmware(
@@ -196,7 +196,7 @@ def test_the_clock_identifies_a_model_on_a_bad_network(
     found = identify_sample(SampleBytes("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
     assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
         "velodyne-vlp16",
-        "its clock advances by 1.33 ms per packet",
+        "the clock advances by 1.33 ms per packet",
     )
 
 
@@ -268,7 +268,7 @@ def test_the_baud_rate_decides_between_equal_candidates() -> None:
     assert {score.sensor.id for score in found.candidates} == {
         f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")
     }
-    assert found.candidates[0].why == "it sends at 1000000 baud"
+    assert found.candidates[0].why == "the sensor sends at 1000000 baud"
     named = sensor.build(
         "info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16)
     )

@@ -287,7 +287,7 @@ def test_invalid_lengths_are_plugin_errors_or_wire_errors(
             ),
             "b",
         ),
-        (BitStruct("wide" / BitsInteger(72)), "it has 72 bits, and a column has at most 64"),
+        (BitStruct("wide" / BitsInteger(72)), "the field has 72 bits, and a column has at most 64"),
     ],
 )
 def test_the_reason_why_a_frame_is_not_compiled_is_true(part: Any, reason: str) -> None:

@@ -100,8 +100,8 @@ def test_warning_and_error_give_the_same_reason(epoch: str) -> None:
     times = make(epoch)
     times.to_utc(5 * SECOND, NOW)
     (change,) = times.changes
-    assert f"the clock of shape-synced {change.source.reason}; record" in str(error.value)
-    assert times.warnings[0].endswith(f"because the sensor's clock {change.source.reason}")
+    assert f"no arrival times, and {change.source.reason}: record" in str(error.value)
+    assert times.warnings[0].endswith(f"because {change.source.reason}")
 
 
 def test_each_change_of_the_source_is_reported_once_with_its_time() -> None:

@@ -45,7 +45,7 @@ FAILING = {
     "broken-points": "no such luck",
     "broken-field": "did you mean 'distances'?",
     "broken-shape": "the arrays of the points have different lengths",
-    "broken-result": "must return Polar or Cartesian",
+    "broken-result": "the function must return Polar or Cartesian",
 }
 
 FRAME = "bb ad 01 0a 0b 0c 0d 00"

@@ -227,7 +227,7 @@ def test_sensor_of_a_broken_distribution_is_named_with_its_error(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     expected = (
-        "unknown sensor 'acme-x7': it comes with dist, which failed to load: "
+        "unknown sensor 'acme-x7': the distribution dist provides it, but failed to load: "
         "ModuleNotFoundError: No module named 'a_module_that_nobody_has'"
     )
     for name in ("acme-x7", "ACME_X7"):
@@ -475,7 +475,7 @@ def test_entry_points_that_are_not_text_are_named_and_keep_nothing_else_away(
         for plugin in Registry(entry_points("lidarspec")).plugins
         if "bad" in plugin.distribution
     ]
-    assert "its file entry_points.txt is not UTF-8" in named.error
+    assert "entry_points.txt is not UTF-8" in named.error
 
 
 def test_a_plugin_that_takes_long_is_named_while_it_does(
@@ -525,7 +525,9 @@ def test_a_plugin_that_hangs_is_left_out_and_the_others_work(
     assert found.sensor("cspc-m1c1-mini").id == "cspc-m1c1-mini"
     reasons = [plugin.error for plugin in found.plugins if plugin.distribution == "hanging-lidars"]
     assert len(reasons) == 2
-    assert all(reason.startswith("it hangs: loading took more than 0.02 s") for reason in reasons)
+    assert all(
+        reason.startswith("the plugin hangs: loading took more than 0.02 s") for reason in reasons
+    )
     end.set()
     assert gone.wait(60)
 
@@ -540,28 +542,34 @@ def test_a_verb_runs_beside_a_plugin_that_hangs(tmp_path: Path) -> None:
         command, env=environment, capture_output=True, text=True, check=False, timeout=300
     )
     assert (
-        f"hanging: it hangs: loading took more than 10 s at {tmp_path / 'hanging_lidars.py'},"
-        " line 2" in done.stderr
+        "hanging: the plugin hangs: loading took more than 10 s at"
+        f" {tmp_path / 'hanging_lidars.py'}, line 2" in done.stderr
     )
     assert done.returncode == 4
 
 
 #: plugins that do odd things when they are loaded: code, error and remark.
 ODD = {
-    "ends": ("import os\nos._exit(7)", "loading it ends the process with the exit status 7", ""),
+    "ends": (
+        "import os\nos._exit(7)",
+        "loading the plugin ends the process with the exit status 7",
+        "",
+    ),
     "exits": ("import sys\nsys.exit('leaving')", "SystemExit: leaving", ""),
     "prints": (
         "import sys\nprint('hello')\nprint('\\x1b[2J', file=sys.stderr)",
         "",
-        r"it prints 'hello \x1b[2J'",
+        r"the plugin prints 'hello \x1b[2J'",
     ),
     "threads": (
         "import threading\nthreading.Thread(target=threading.Event().wait, name='mine').start()",
         "",
-        "it starts a thread that keeps running: mine",
+        "the plugin starts a thread that keeps running: mine",
     ),
 }
-HANGING = {"hangs": ("import time\ntime.sleep(600)", "it hangs: loading took more than 0.5 s", "")}
+HANGING = {
+    "hangs": ("import time\ntime.sleep(600)", "the plugin hangs: loading took more than 0.5 s", "")
+}
 
 
 @pytest.mark.slow

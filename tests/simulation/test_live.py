@@ -316,7 +316,7 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             SimulatedDevice(slow),
             0.1,
             UsageError,
-            "sends no data in the first 0.1 s; its next frame is due after 0.5 s",
+            "sends no data in the first 0.1 s; the next frame is due after 0.5 s",
         ),
         (
             SimulatedDevice(stl(), faults=Faults(loss=1.0)),

@@ -632,10 +632,10 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[" * 100_000, "not JSON: its brackets are nested too deeply"),
+        ("[" * 100_000, "not JSON: the brackets are nested too deeply"),
         ("[" + "9" * 5000 + "]", "not JSON: "),
         (b"\xff", "not JSON: "),
-        (" " * (1 << 22) + "[]", "not JSON: it is longer than 4096 kB"),
+        (" " * (1 << 22) + "[]", "not JSON: the file is longer than 4096 kB"),
         ('[{"hex": 1}]', "hex: expected a string, got 1"),
         ('[{"frame": ["data"]}]', r"frame: expected a string, got \['data'\]"),
         ('[{"command": {}}]', "command: expected a string, got {}"),

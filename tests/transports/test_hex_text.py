@@ -200,7 +200,7 @@ REFUSED = {
     "12:00:01 54 2c": "12:00:01 may be a time of day or three bytes",
     "uint8_t frame[] = {84, 44};": "expected bytes such as 0x54 in an array, got '84'",
     "uint16_t frame[] = {0x542c};": "expected bytes such as 0x54 in an array, got '0x542c'",
-    ":10010000214601360121470136007EFE09D2190140": "it is Intel HEX",
+    ":10010000214601360121470136007EFE09D2190140": "the text is Intel HEX",
     "0000000 2c54 0e10 0868": "words in host byte order",
     "000000 54 2c 10 0e 54 2c 41 20": "the first zeros may be an offset or data",
     "00000000: 0e102c54 20412c54  T,..T,A ": (

@@ -747,9 +747,11 @@ class _Builder:
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)
             if asked:
-                reason = f"{info.path}: it uses {asked[0].path}, which is in another array or frame"
+                reason = (
+                    f"{info.path}: the condition uses {asked[0].path} of another array or frame"
+                )
             else:
-                reason = f"{info.path}: it may exceed 64 bits"
+                reason = f"{info.path}: the value of the condition may exceed 64 bits"
         except ValueError as code:
             reason = str(code)
         return tree.Opaque(
@@ -907,9 +909,9 @@ def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
     if info.adapter is None:
         return ref
     if info.kind == "bytes":
-        reason = f"it uses {info.path}, which is not a number of fixed size"
+        reason = f"the expression uses {info.path}, which is not a number of fixed size"
     else:
-        reason = f"it uses {info.path}, whose value a Python function computes"
+        reason = f"the expression uses {info.path}, which a Python function computes"
     unknown = tree.Untraced(f"{info.path}: {reason}", "?")
     try:
         value = info.adapter.decode(tree.Symbol(ref))

@@ -291,7 +291,7 @@ def _check_measures(
     )
     if is_number and measures_by_path.setdefault(path, measure) != measure:
         raise SpecError(
-            "its branches have different scales or units: give the field another name in each"
+            "the branches have different scales or units: give the field another name in each"
             " branch",
             path=path,
         )

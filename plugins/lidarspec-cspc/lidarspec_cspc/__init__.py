@@ -108,7 +108,7 @@ def make_ack(header: bytes) -> Checksummed:
             / Enum(Int8ul, **{name: mode ^ 0xA0 for name, mode in MODES.items()})
             * "mode of the command, XOR A0",
             "length" / Const(7, Int8ul) * "number of data bytes: firmware and reserved",
-            "firmware" / Int8ul * "in the reply to start: 3 is V3.0",
+            "firmware" / Int8ul * "set in the reply to the command start; 3 means V3.0",
             "reserved" / Bytes(6),
             "checksum" / Int8ul,
         ),
@@ -462,7 +462,7 @@ TMINI_RELATIVE = Relative(
     has_bits_beside_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
-    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "its replies to requests"),
+    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the replies to requests differ"),
     **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI_RELATIVE),
 }
 

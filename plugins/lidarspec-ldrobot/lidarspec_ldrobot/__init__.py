@@ -309,7 +309,7 @@ LD14 = make_lidar(
     status="vectors",
     source=(
         "ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's"
-        " example; its range is assumed"
+        " example; the range is assumed"
     ),
 )
 LD14P = make_lidar(

@@ -665,6 +665,6 @@ RELATIVES: dict[str, str | Relative] = {
         "the time between points is 5 us", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
     ),
     "livox-hap": Relative("the time between points is 2.2 us", is_fast),
-    "livox-mid360s": "its reply to a discovery contains the device type 35",
+    "livox-mid360s": "the reply to a discovery contains the device type 35",
 }
 MID360, HAP = SENSORS = [make_lidar(name) for name in MODELS]

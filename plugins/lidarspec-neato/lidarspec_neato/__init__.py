@@ -166,9 +166,9 @@ def describe_differences(own: str) -> dict[str, str]:
         if direction == XV11_DIRECTIONS[own]:
             texts[other] = "the packets are identical; the label names the model"
         elif direction == 1:
-            texts[other] = "the packets are identical, but it rotates counter-clockwise"
+            texts[other] = "the packets are identical, but this model rotates counter-clockwise"
         else:
-            texts[other] = "the packets are identical, but it rotates clockwise"
+            texts[other] = "the packets are identical, but this model rotates clockwise"
     return texts
 
 

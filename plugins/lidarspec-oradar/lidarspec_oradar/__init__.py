@@ -120,7 +120,7 @@ def sweep(i: int) -> dict[str, float]:
     }
 
 
-IDENTICAL = "it sends the same frames as an MS200, but its commands begin with 0x54"
+IDENTICAL = "the frames are those of an MS200, but the commands begin with 0x54"
 MS200 = Sensor(
     "oradar-ms200",
     vendor="ORADAR",
@@ -145,7 +145,7 @@ MS200 = Sensor(
     turn=(5, 15),
     relatives={
         "ldrobot-stl27l": IDENTICAL,
-        "ldrobot-ld06": "the frames are identical, but it accepts no commands",
+        "ldrobot-ld06": "the frames are identical, but this model accepts no commands",
         "ldrobot-ld20": IDENTICAL,
         "ldrobot-stl06p": IDENTICAL,
         "ldrobot-ld14": IDENTICAL,

@@ -160,7 +160,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_min",
         0.0,
-        "Lowest z of the points on the topic scan, metres, if the sensor has several rings.",
+        "Lowest z of the points on the topic scan, metres. Only sensors with several rings use it.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
         live=True,

@@ -263,7 +263,7 @@ def make_scanner(name: str) -> Sensor:
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
         relatives={
-            other: "its modules have another number of layers" for other in MODELS if other != name
+            other: "the modules have another number of layers" for other in MODELS if other != name
         },
         status=status,
         source=(

@@ -238,7 +238,7 @@ S1 = make_rplidar(
     range_limits=(0.1, 40.0),
     turn=(8.0, 15.0),
     status="manual",
-    source="ArduPilot's page of the S1 (40 m, speed); its shortest distance is assumed",
+    source="ArduPilot's page of the S1 (40 m, speed); the shortest distance is assumed",
 )
 S2 = make_rplidar(
     "S2",
@@ -256,7 +256,7 @@ S2L = make_rplidar(
     unit=units.S2,
     range_limits=(0.05, 18.0),
     status="manual",
-    source="its range is assumed",
+    source="the range is assumed",
 )
 S3 = make_rplidar(
     "S3",
@@ -265,7 +265,7 @@ S3 = make_rplidar(
     unit=units.S3,
     range_limits=(0.05, 40.0),
     status="manual",
-    source="its range is assumed",
+    source="the range is assumed",
 )
 T1 = make_rplidar(
     "T1",
@@ -274,7 +274,7 @@ T1 = make_rplidar(
     unit=units.T1,
     range_limits=(0.05, 40.0),  # assumed: an S3's
     status="manual",
-    source="port from sllidar_ros2; its range is assumed",
+    source="port from sllidar_ros2; the range is assumed",
 )
 C1 = make_rplidar(
     "C1",

@@ -245,7 +245,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live, or the speed is out of range.
         """
-        self._refuse_live("its speed cannot be changed")
+        self._refuse_live("the speed cannot be changed")
         if not MIN_SPEED <= times <= MAX_SPEED:
             raise UsageError(f"expected a speed from {MIN_SPEED:g} to {MAX_SPEED:g}, got {times:g}")
         self.speed = times

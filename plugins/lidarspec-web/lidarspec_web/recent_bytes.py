@@ -62,7 +62,7 @@ class DamagedBytes:
             sensor.parse(self.data)
         except WireError as error:
             return error.reason
-        return "its values are not plausible"
+        return "the values are not plausible"
 
 
 @dataclass(frozen=True)
