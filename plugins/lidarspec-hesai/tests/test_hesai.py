@@ -23,7 +23,7 @@ from lidarspec_hesai import at128
 from lidarspec_hesai.xt import TABLE_32
 from tests.agreement import assert_same_points
 from tests.evidence import PROTOCOLS, assert_points, decode, vector_bytes, vectors
-from tests.lines import SLACK, free_port
+from tests.lines import SLACK, TIMEOUT_S, free_port
 
 FILE = "vectors_udp3d.json"
 SENSORS = {name: ls.sensor(f"hesai-{name}") for name in ("pandar40p", "xt32", "xt16", "qt64")}
@@ -552,20 +552,20 @@ def test_angles_are_requested_on_opening(tmp_path: Path) -> None:
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
     with virtual_port(unit, to=data) as port:
         with ls.open(port.path, unit) as device:
-            cloud = device.latest(SLACK).points
+            cloud = device.latest(TIMEOUT_S).points
             assert device.send("speed", rate=600).values.code == 0x17
         port.wait_for_commands(["get_calibration", "speed"])
         assert (cloud.nominal, device.warnings) == (False, [])
         assert np.rad2deg(cloud.elevation[:2]) == pytest.approx([15.5, 14.5])
         # The file has the angles, so they are not requested.
         with ls.open(port.path, unit.configure(calibration=file)) as device:
-            assert np.rad2deg(device.latest(SLACK).points.elevation[:2]) == pytest.approx(
+            assert np.rad2deg(device.latest(TIMEOUT_S).points.elevation[:2]) == pytest.approx(
                 [-4.5, -4.0]
             )
         assert port.device.commands_received == ["get_calibration", "speed"]
         # Nothing answers at this address.
         with ls.open(f"{data}?control=127.0.0.1:{free_port()}", unit) as device:
-            assert device.latest(SLACK).points.nominal
+            assert device.latest(TIMEOUT_S).points.nominal
             assert any(
                 "refuses connections" in said and "the sensor is read without the values" in said
                 for said in device.warnings
@@ -583,7 +583,7 @@ def test_a_unit_that_does_not_report_angles_is_read() -> None:
         virtual_port(unit, to=f"udp://127.0.0.1:{unit.links['data'].ports[0]}") as port,
         ls.open(port.path, unit) as device,
     ):
-        assert device.latest(SLACK).points.nominal
+        assert device.latest(TIMEOUT_S).points.nominal
         assert any(
             "result not_supported (5) instead of done (0)" in said for said in device.warnings
         )

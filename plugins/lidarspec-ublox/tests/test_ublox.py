@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from lidarspec.packets.clock_monitor import ClockMonitor
 from lidarspec.packets.clock_status import read_clock_status
 from lidarspec.packets.utc_times import UtcTimes
 from lidarspec.simulation.device import SECOND, SimulatedDevice
+from tests.lines import TIMEOUT_S
 
 GNSS = ls.sensor("ublox-gnss")
 VECTORS = json.loads((Path(lidarspec_ublox.__file__).parent / "vectors.json").read_text())
@@ -126,9 +128,10 @@ def test_the_example_of_the_manual_has_the_checksum_of_a_shorter_sentence() -> N
 
 def test_a_simulated_receiver_acknowledges_and_answers_polls() -> None:
     with ls.open("sim:ublox-gnss", GNSS) as device:
-        assert device.send("message", message_class=1, message_id=33, rate=1).frame == "acknowledge"
-        assert device.send("rate", period=0.2).frame == "acknowledge"
-        assert device.send("nav_timeutc").frame == "nav_timeutc"
+        send = partial(device.send, timeout=TIMEOUT_S)
+        assert send("message", message_class=1, message_id=33, rate=1).frame == "acknowledge"
+        assert send("rate", period=0.2).frame == "acknowledge"
+        assert send("nav_timeutc").frame == "nav_timeutc"
 
 
 def test_the_simulated_hour_moves_north_in_steps_of_the_clock() -> None:
