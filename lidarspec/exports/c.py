@@ -34,9 +34,9 @@ from lidarspec.exports import (
 from lidarspec.exports.c_fields import (
     CEntry,
     CLayout,
-    accesses,
     arguments,
     comment,
+    find_accesses,
     identifier,
     parameters,
     quote_bytes,
@@ -327,7 +327,7 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
 def _format_checksum(
     layout: CLayout, entry: CEntry, seal: Sealed, name: str, algorithm: str
 ) -> str:
-    held = [access for path in seal.fields for access in accesses(layout, path)]
+    held = [access for path in seal.fields for access in find_accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
             raise ExportError(
@@ -354,7 +354,7 @@ def _iter_covered_spans(
     These are the declared range, or the whole struct without the fields that store the checksum.
     """
     if seal.over is not None:
-        first, last = (layout.whole(path) for path in seal.over)
+        first, last = (layout.find_whole(path) for path in seal.over)
         yield first.start, last.start + last.size
         return
     start = entry.start
@@ -423,7 +423,7 @@ def _iter_value_checks(layout: CLayout) -> Iterator[str]:
 
 
 def _format_allowed(expression: str, allowed: tuple[int, ...]) -> str:
-    """Return a C condition that an expression has one of the allowed values."""
+    """Return a C condition that is true if an expression has one of the allowed values."""
     ranges = (
         f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})"
         for first, last in find_runs(allowed)

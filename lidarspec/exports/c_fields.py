@@ -226,7 +226,7 @@ class CLayout:
         self.name = name
         self.entries: list[CEntry] = []
         top = CEntry("", message.root, SizeFormula(), SizeFormula())
-        self.size = self.extent(top)
+        self.size = self.compute_size(top)
         self._visit(top)
 
     def find_entries(self, path: str) -> list[CEntry]:
@@ -240,8 +240,8 @@ class CLayout:
             if any(info.path == path for info in tree.infos(entry.node))
         ]
 
-    def whole(self, path: str) -> CEntry:
-        """Return the entry of the whole array, or of all alternatives together, at a path."""
+    def find_whole(self, path: str) -> CEntry:
+        """Return the entry that contains all elements or alternatives of a node."""
         return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: tree.Formula) -> str:
@@ -273,7 +273,7 @@ class CLayout:
             return node.count
         return f"(int64_t){self.name(node.axis, 'count')}({format_size_arguments(node, depth)})"
 
-    def extent(self, entry: CEntry) -> SizeFormula:
+    def compute_size(self, entry: CEntry) -> SizeFormula:
         """Return the size of an entry."""
         match entry.node:
             case tree.Number() | tree.Block():
@@ -299,11 +299,13 @@ class CLayout:
                     self.count(entry.node, entry.depth)
                 )
             case tree.When() | tree.Select():
-                sizes = self.sizes(entry)
+                sizes = self.list_sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
                 arguments = format_size_arguments(entry.node, entry.depth)
-                return SizeFormula(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
+                return SizeFormula(
+                    0, (f"(int64_t){self.make_size_function_name(entry)}({arguments})",)
+                )
             case tree.PartSequence():
                 raise ExportError(
                     f"{entry.path}: C does not support parts with an offset that depends on the"
@@ -311,9 +313,9 @@ class CLayout:
                 )
             case tree.Empty() | tree.Derived():
                 return SizeFormula()
-        return sum((self.extent(below) for below in self._iter_members(entry)), SizeFormula())
+        return sum((self.compute_size(below) for below in self._iter_members(entry)), SizeFormula())
 
-    def extent_name(self, entry: CEntry) -> str:
+    def make_size_function_name(self, entry: CEntry) -> str:
         """Return the name of the size function of a part with alternatives.
 
         Parts with alternatives can be nested and have the same path, so a number in their names
@@ -327,10 +329,11 @@ class CLayout:
         alike = [id(node) for node in choices if node.name == entry.node.name]
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
-    def sizes(self, entry: CEntry) -> list[tuple[str, SizeFormula]]:
+    def list_sizes(self, entry: CEntry) -> list[tuple[str, SizeFormula]]:
         """Return the sizes of the alternatives of a part, each with its condition."""
         return [
-            (condition.text, self.extent(below)) for condition, below in self._list_cases(entry)
+            (condition.text, self.compute_size(below))
+            for condition, below in self._list_cases(entry)
         ]
 
     def _visit(self, entry: CEntry) -> None:
@@ -341,7 +344,7 @@ class CLayout:
                 path = node.axis
             else:
                 path = entry.path
-            self.entries.append(replace(entry, path=path, size=self.extent(entry)))
+            self.entries.append(replace(entry, path=path, size=self.compute_size(entry)))
         if isinstance(node, tree.Repeat):
             step = self._find_element_size(entry, node).times(f"(int64_t){index(entry.depth)}")
             loops = (*entry.loops, str(self.count(node, entry.depth)))
@@ -361,7 +364,7 @@ class CLayout:
             start = entry.start
             for below in self._iter_members(entry):
                 self._visit(replace(below, start=start))
-                start = start + self.extent(below)
+                start = start + self.compute_size(below)
 
     def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
         """Yield an entry for each member of a struct; all have the start of the struct."""
@@ -375,7 +378,7 @@ class CLayout:
                 )
 
     def _find_element_size(self, entry: CEntry, node: tree.Repeat) -> SizeFormula:
-        size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
+        size = self.compute_size(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
                 f"{node.axis}: C does not support elements with an offset that depends on the sizes"
@@ -448,7 +451,7 @@ def _bits(part: tree.Part, start: SizeFormula) -> str:
     return value
 
 
-def accesses(layout: CLayout, path: str) -> list[CEntry]:
+def find_accesses(layout: CLayout, path: str) -> list[CEntry]:
     """Return one entry for each alternative that contains a field."""
     return [
         access
@@ -461,12 +464,12 @@ def accesses(layout: CLayout, path: str) -> list[CEntry]:
 def fields(layout: CLayout) -> Iterator[str]:
     """Yield the C functions of all fields, in wire order.
 
-    The position of a field that several alternatives contain is its position in the last one.
+    If several alternatives contain a field, its functions come with those of the last alternative.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
     ]
-    extents = list(_iter_extents(layout))
+    extents = list(_iter_size_functions(layout))
     yield from (text.partition("\n")[0].partition(" {")[0] + ";" for text in extents)
     for write, path in reversed(dict.fromkeys(reversed(functions))):
         yield from write(layout, path)
@@ -494,20 +497,22 @@ def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
         yield _write_count, entry.path
 
 
-def _iter_extents(layout: CLayout) -> Iterator[str]:
+def _iter_size_functions(layout: CLayout) -> Iterator[str]:
     """Yield a C function that returns the size, for each part with alternatives.
 
     Parts are omitted if all their alternatives have the same size.
     """
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
-            sizes = layout.sizes(entry)
+            sizes = layout.list_sizes(entry)
             if len({str(size) for _, size in sizes}) > 1:
                 ways = [
                     *((condition, f"(size_t)({size})") for condition, size in sizes[:-1]),
                     ("", f"(size_t)({sizes[-1][1]})"),
                 ]
-                yield _format_function("size_t", layout.extent_name(entry), entry.depth, ways)
+                yield _format_function(
+                    "size_t", layout.make_size_function_name(entry), entry.depth, ways
+                )
 
 
 def _find_inner_axes(part: tree.Part) -> tuple[str, ...]:
@@ -543,7 +548,7 @@ def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
 
 def _write_field(layout: CLayout, path: str) -> Iterator[str]:
     """Yield the functions of a field: its value, presence and conversions to units."""
-    ways = accesses(layout, path)
+    ways = find_accesses(layout, path)
     name = layout.name(path, "")
     first = ways[0]
     depth = first.depth + len(first.indices)

@@ -303,12 +303,12 @@ def svg(sensor: Sensor) -> str:
         detail = f"{size} byte{'s' * (size != '1')}" + (
             f", integers {order}-endian" if order else ""
         )
-        sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
-        sheet.items(
+        sheet.draw_title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
+        sheet.draw_items(
             _ItemBuilder(message.seals, mixed=not order).visit(message.root, SizeFormula(), 0), 0
         )
         sheet.close()
-    return sheet.document(f"{sensor.id}: packet diagrams")
+    return sheet.make_document(f"{sensor.id}: packet diagrams")
 
 
 #: The piece of a box in one row: its left edge and upper edge in pixels, and its width in bits.
@@ -331,7 +331,7 @@ class _Sheet:
     used: int = 0
     deepest: int = 0
 
-    def title(self, text: str, detail: str) -> None:
+    def draw_title(self, text: str, detail: str) -> None:
         """Draw the name of a frame type, and the byte and bit numbers above its first row."""
         self.parts.append(_format_text(MARGIN_PX, self.top + 14, text, 15, weight="bold"))
         self.parts.append(_format_text(MARGIN_PX, self.top + 31, detail, 11.5, fill=DETAIL_COLOUR))
@@ -360,7 +360,7 @@ class _Sheet:
             )
         self.top += 18
 
-    def items(self, items: Sequence[Item], depth: int) -> None:
+    def draw_items(self, items: Sequence[Item], depth: int) -> None:
         """Draw boxes and groups one after another."""
         for item in items:
             if isinstance(item, BoxGroup):
@@ -375,7 +375,7 @@ class _Sheet:
         self._end_row()
         self.top += 26
 
-    def document(self, title: str) -> str:
+    def make_document(self, title: str) -> str:
         """Return the whole SVG document."""
         width = (
             LEFT_MARGIN_PX + ROW_BITS * BIT_WIDTH_PX + MARGIN_PX + BRACKET_WIDTH_PX * self.deepest
@@ -406,7 +406,7 @@ class _Sheet:
         self._end_row()
         self.deepest = max(self.deepest, depth + 1 + _find_nesting_depth(group))
         top = self.top
-        self.items(group.items, depth)
+        self.draw_items(group.items, depth)
         self._end_row()
         x = (
             LEFT_MARGIN_PX
@@ -422,7 +422,7 @@ class _Sheet:
         self.parts += _draw_bracket_label(x + 12, (top + self.top) / 2, group.label)
 
     def _draw_box(self, cell: DiagramBox) -> None:
-        """Draw a field, which may continue in the next rows; write its name where most fits."""
+        """Draw a field, which may continue in the next row, with its name in the widest part."""
         pieces: list[Piece] = []
         left = cell.bits
         lead = self.used % 8

@@ -74,7 +74,7 @@ def _scan_data(rule: Split | None) -> dict[str, Any] | None:
 
 
 def _sequence_data(counter: PacketCounter | None) -> dict[str, Any] | None:
-    """Return the counter of packets; values that functions calculate are null."""
+    """Return the packet counter as JSON data; a value that a function calculates is null."""
     if counter is None:
         return None
     data = select_attributes(counter, "field", "first", "last", "returns")

@@ -169,7 +169,7 @@ FLOAT_SIZES = (4, 8)
 def block_type(
     block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
 ) -> tuple[list[Attribute], dict[str, Attribute]]:
-    """Return the attributes and the instances of a block's type.
+    """Return the attributes and the instances of the Kaitai type of a bit block.
 
     Args:
         doc: a function that returns the documentation of a field.

@@ -128,7 +128,12 @@ def _describe_scan_rule(scan: Split) -> str:
 
 def _iter_commands(sensor: Sensor) -> Iterator[str]:
     rows = [
-        (f"`{name}`", _find_request(sensor, name), _describe_reply(command), effect(sensor, name))
+        (
+            f"`{name}`",
+            _find_request(sensor, name),
+            _describe_reply(command),
+            describe_effect(sensor, name),
+        )
         for name, command in sensor.commands.items()
     ]
     return _iter_table(["command", "bytes or arguments", "reply", ""], rows)
@@ -154,7 +159,7 @@ def _describe_reply(command: Command) -> str:
     return "none documented"
 
 
-def effect(sensor: Sensor, name: str) -> str:
+def describe_effect(sensor: Sensor, name: str) -> str:
     """Describe the effect of a command, and when it is sent."""
     command = sensor.commands[name]
     effects = {
@@ -171,7 +176,7 @@ def effect(sensor: Sensor, name: str) -> str:
 
 
 def _write_quick_start(sensor: Sensor) -> str:
-    """Return the commands to copy, with aligned comments, and a program in Python."""
+    """Return the section with commands to copy and a Python program."""
     commands = list_commands(sensor)
     width = max(len(command) for command, _ in commands)
     lines = [f"$ {command.ljust(width)}    # {purpose}" for command, purpose in commands]

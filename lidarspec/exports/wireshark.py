@@ -71,7 +71,7 @@ _OPERATIONS = {
 }
 
 
-def formula(value: tree.Formula) -> LuaCode:
+def format_formula(value: tree.Formula) -> LuaCode:
     """Return a formula as Lua code: a number, or a function of the field values."""
     if isinstance(value, int):
         return LuaCode(str(value))
@@ -146,7 +146,7 @@ class _TableWriter:
         prefix: the text before the path of a field in Wireshark's filters.
         kept: the paths of the fields that formulas or checksums use.
         marked: the paths of the first and the last part that each checksum covers.
-        types: for each Wireshark field, by its name in filters, the family of its type ("uint").
+        types: the type family (for example "uint") of each Wireshark field, by its name in filters.
     """
 
     def __init__(self, message: ExportedFrame, prefix: str) -> None:
@@ -228,7 +228,7 @@ class _TableWriter:
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
         table |= {
             "le": (node.order == "little" and node.size > 1) or None,
-            **self._number_entries(node.info, kind),
+            **self._make_number_entries(node.info, kind),
         }
         return table | {"skip": self._skip(node.info, node.size)}
 
@@ -245,7 +245,7 @@ class _TableWriter:
             "kind": "bytes",
             "name": name,
             "field": new,
-            "size": formula(node.size),
+            "size": format_formula(node.size),
             "keep": self._keep(path),
         }
         table["const"] = LuaCode(quote_lua(node.const)) if node.const is not None else None
@@ -298,7 +298,7 @@ class _TableWriter:
                 [bits.byte, bits.low, bits.mask.bit_count(), bits.target]
                 for bits in part.bits.segments
             ],
-            **self._number_entries(part.info, kind, mask),
+            **self._make_number_entries(part.info, kind, mask),
         }
 
     def _make_struct_table(self, node: tree.Struct) -> Table:
@@ -342,7 +342,7 @@ class _TableWriter:
         return {
             "kind": "repeat",
             "name": node.name,
-            "count": formula(node.count),
+            "count": format_formula(node.count),
             "summed": summed,
             "skip": whole,
             "element": element,
@@ -367,11 +367,13 @@ class _TableWriter:
                 {
                     "magic": magic,
                     "element": self.node(kind.element),
-                    "following": None if after is None else formula(after),
+                    "following": None if after is None else format_formula(after),
                 }
             )
         rules = {"count": node.count, "size": node.size, "within": node.within}
-        formulas = {name: None if rule is None else formula(rule) for name, rule in rules.items()}
+        formulas = {
+            name: None if rule is None else format_formula(rule) for name, rule in rules.items()
+        }
         return {
             "kind": "parts",
             "name": node.name,
@@ -380,7 +382,9 @@ class _TableWriter:
             "kinds": kinds,
         }
 
-    def _number_entries(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
+    def _make_number_entries(
+        self, info: tree.FieldInfo, kind: str, mask: int | None = None
+    ) -> Table:
         """Return the table entries of a number: unit, scale, labels, limits, ProtoFields."""
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
             "UINT"

@@ -6,7 +6,7 @@ from typing import Any
 
 from lidarspec import Sensor
 from lidarspec.explaining.formatting import format_argument_type
-from lidarspec.exports.reference import effect
+from lidarspec.exports.reference import describe_effect
 from lidarspec.frames.commands import find_argument_slot, has_only_names, list_choices
 from lidarspec.spec.arguments import Range
 
@@ -18,7 +18,7 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
         "name": name,
         "group": _find_group(sensor, name),
         "only_stopped": command.only_stopped,
-        "text": effect(sensor, name),
+        "text": describe_effect(sensor, name),
         "arguments": [_describe_argument(sensor, name, argument) for argument in command.args],
     }
 
