@@ -105,9 +105,9 @@ def find_common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """Return a polynomial's divisors of the given degree with the constant term 1.
+    """Return a polynomial's divisors of the given degree that may be CRC polynomials.
 
-    CRC polynomials have this term.
+    CRC polynomials have the constant term 1.
 
     Returns:
         The divisors; an empty list if too many polynomials would have to be tried.
@@ -128,11 +128,11 @@ def divisors(polynomial: int, degree: int) -> list[int]:
             return sorted(quotients)
         return [polynomial]
     if degree <= 16:
-        return _try_all(polynomial, degree)
+        return _find_small_divisors(polynomial, degree)
     return []
 
 
-def _try_all(polynomial: int, degree: int) -> list[int]:
+def _find_small_divisors(polynomial: int, degree: int) -> list[int]:
     """Return the divisors of a polynomial that have the given degree, which must be small."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
@@ -147,9 +147,9 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
     """Solve linear equations over GF(2).
 
     Args:
-        equations: pairs (mask, bit). The XOR of the bits of the unknown that are set in the mask is
-            `bit`.
-        width: number of bits of the unknown.
+        equations: pairs (mask, bit). For an unknown number x, the XOR of all bits of ``x & mask``
+            must be `bit`.
+        width: number of bits of x.
 
     Returns:
         One solution, and a basis of the null space. The XOR of the solution with basis vectors is
@@ -286,9 +286,7 @@ def iter_crc_matches(
 
 
 def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
-    """Return the estimated time of a search for candidates, in a unit of work.
-
-    The unit is the time to compute the CRC of one byte.
+    """Estimate the work of a search for candidates, as a number of bytes of CRC computation.
 
     Args:
         few: the frames from which the search calculates the candidates.

@@ -497,7 +497,11 @@ def _format_max_length(draft: Draft) -> str:
 
 
 def _make_imports(text: dict[str, str]) -> dict[str, str]:
-    """Return the template values with the imports that the text needs."""
+    """Return {name: text} of the template values with imports.
+
+    Args:
+        text: all other template values, which use the imported names.
+    """
     code = "\n".join(text.values())
     construct = sorted(
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}

@@ -481,11 +481,11 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Split frames that are groups of shorter frames; return other frames unchanged.
+    """Return the structure of shorter frames if `whole` consists of groups of them.
 
-    A group of frames can repeat, for example because an index in the frames counts from 0 to 5, or
-    because the data is simulated. The parts of a group are frames if their sync bytes are not all
-    equal, or if they have a counter.
+    A group of frames can repeat, for example because an index in the frames counts from 0 to 5. The
+    parts of a group are accepted as frames if their sync bytes differ from each other, or if they
+    have a counter. Otherwise, `whole` is returned.
     """
     period = whole.period or 0
     for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
@@ -507,7 +507,7 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield (weight, structure) of frames of a length, if they are found.
+    """Yield (weight, structure) of frames of the length `period`, if they are found.
 
     The frames begin with the longest run of constant bytes. The weight is the share of constant
     bytes, multiplied by the share of bytes in frames.
@@ -536,11 +536,10 @@ def _iter_frames_of_length(
 
 
 def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period: int) -> bool:
-    """Return whether random bytes are likely to have the same structure.
+    """Return whether random bytes are likely to have as many constant bytes as the data.
 
-    The random bytes have the same distribution of values. Chernoff's bound gives the probability
-    that one period has the same number of constant bytes. It is multiplied by the number of periods
-    that are tried.
+    The random bytes have the same distribution of values as the data. The probability is estimated
+    by Chernoff's bound, and multiplied by the number of periods that are tried.
 
     Args:
         data: the data.
