@@ -165,8 +165,8 @@ def add_token(page: str, token: str) -> str:
 def write_opening_page(folder: Path, link: str) -> Path:
     """Write a page that redirects to the link, and return its path.
 
-    Only the user can read this page. A browser is started with it, because other users see the
-    command lines of all programs, and would find the token of the link in them.
+    A browser is started with this page and not with the link, because other users can see the
+    command lines of all programs, and the link contains the token. Only the user can read the page.
     """
     path = folder / "open.html"
     address = escape(link)

@@ -326,7 +326,7 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Store what is new: a scan, statistics, the end of a file; then call `news`."""
+        """Store a new scan, new statistics and the end of a file; call `news` if there are any."""
         has_news = self._update_scan()
         if self._update_figures():
             has_news = True

@@ -149,7 +149,7 @@ class ErrorReporter:
         self._reported: set[str] = set()
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Report an error; the signature is that of a handler of `set_exception_handler`."""
+        """Report an error; the event loop calls this as its exception handler."""
         text = str(context.get("message"))
         if text in self._reported:
             return

@@ -3,8 +3,8 @@
 A page requests each scan after it has drawn the previous scan, and receives the newest scan. A slow
 or hidden page therefore causes little work, and no page shows old data. Requests are JSON objects;
 the entry `do` is the name of the handler. Slow requests run in threads (`page_requests`). Between
-scans, the page is sent replies and, twice a second, the state of the source. While the page shows
-bytes, it is also sent the newest frame.
+scans, the server sends replies to requests, and twice a second the state of the source. While the
+page shows bytes, the server also sends the newest frame.
 
 While a page is paused, a live source continues. A copy of the bytes at the time of the pause is
 kept for this page (`_frozen`).

@@ -213,7 +213,11 @@ class PageSite:
 
 
 def _find_link_host(host: str) -> str:
-    """Return the host in the link to a server that listens on an address."""
+    """Return the host for the link to a server.
+
+    Args:
+        host: the address on which the server listens.
+    """
     if host in ANY_ADDRESS:
         return socket.gethostname()
     if ":" in host:
