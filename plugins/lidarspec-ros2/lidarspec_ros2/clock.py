@@ -16,7 +16,7 @@ Times = NDArray[np.int64]
 
 
 def describe_jump(clock: DeviceClock) -> str:
-    """Return a warning about a recent change of the sensor's clock; "" without one."""
+    """Return a warning if the sensor's clock has recently been changed; otherwise ""."""
     if clock.jump is None:
         return ""
     return f"the sensor's clock was changed by {clock.jump.change_ns / 1e9:+.3f} s"
@@ -44,7 +44,7 @@ class MessageStamps:
 
         Args:
             device_ns: the time of each packet by the sensor's clock, ns.
-            host_ns: the arrival time of each packet, ns; 0 if unknown, to ignore the packet.
+            host_ns: the arrival time of each packet, ns; packets with the time 0 are ignored.
         """
         is_known = host_ns > 0
         self.clock.observe(device_ns[is_known], host_ns[is_known])

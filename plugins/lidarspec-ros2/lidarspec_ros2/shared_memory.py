@@ -89,7 +89,7 @@ class SharedMemory:
 def choose_shared_memory(
     rmw: str, find_sensor: Callable[[], Sensor | None], *, is_serial: bool
 ) -> SharedMemory:
-    """Return the shared memory for the clouds of a sensor.
+    """Return the settings of shared memory for the clouds of a sensor.
 
     Args:
         rmw: identifier of the middleware, for example rmw_fastrtps_cpp.
@@ -97,7 +97,7 @@ def choose_shared_memory(
             called only if the node may provide a profile.
         is_serial: whether the sensor is on a serial line, which is too slow for large clouds.
     """
-    free = free_bytes()
+    free = find_free_bytes()
     if free is None or not rmw.startswith("rmw_fastrtps") or has_user_profile():
         return SharedMemory()
     try:
@@ -153,7 +153,7 @@ def format_megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB".replace(".0 ", " ")
 
 
-def free_bytes() -> int | None:
+def find_free_bytes() -> int | None:
     """Return the bytes of free shared memory; None if the system does not report it."""
     try:
         status = os.statvfs(SHARED_MEMORY_DIR)

@@ -42,7 +42,7 @@ def _environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     for name in USER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(shared_memory, "free_bytes", lambda: 10**9)
+    monkeypatch.setattr(shared_memory, "find_free_bytes", lambda: 10**9)
 
 
 def choose(sensor: str | None, rmw: str = FAST_DDS, *, is_serial: bool = False) -> SharedMemory:
@@ -84,7 +84,7 @@ def test_another_middleware_needs_no_profile() -> None:
 
 
 def test_a_system_without_its_folder_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_memory, "free_bytes", lambda: None)
+    monkeypatch.setattr(shared_memory, "find_free_bytes", lambda: None)
     assert choose("robosense-m1") == SharedMemory()
 
 
@@ -92,13 +92,13 @@ def test_a_system_without_its_folder_is_left_alone(monkeypatch: pytest.MonkeyPat
 def test_the_segment_takes_half_of_the_free_memory_at_most(
     monkeypatch: pytest.MonkeyPatch, free: int, segment: int
 ) -> None:
-    monkeypatch.setattr(shared_memory, "free_bytes", lambda: free * 10**6)
+    monkeypatch.setattr(shared_memory, "find_free_bytes", lambda: free * 10**6)
     memory = choose("robosense-m1")
     assert (memory.segment_bytes, memory.warning) == (segment * 10**6, "")
 
 
 def test_little_shared_memory_is_a_warning_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_memory, "free_bytes", lambda: 21 * 10**6)
+    monkeypatch.setattr(shared_memory, "find_free_bytes", lambda: 21 * 10**6)
     memory = choose("robosense-m1")
     assert (memory.segment_bytes, memory.notice) == (0, "")
     for part in (
