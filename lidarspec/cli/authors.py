@@ -32,7 +32,7 @@ from lidarspec.exports import (
 )
 from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
-from lidarspec.testing.check import Report, find_target, reports
+from lidarspec.testing.check import Report, find_target, iter_reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
@@ -200,7 +200,7 @@ def check(
 
         line(lambda: f"{name}: loading", (0, 1))
         found_reports = list(
-            reports(find_target(name), name, examples=max_examples, vectors=file, watch=show)
+            iter_reports(find_target(name), name, examples=max_examples, vectors=file, watch=show)
         )
     if as_json:
         emit_json([report.to_dict() for report in found_reports], output)

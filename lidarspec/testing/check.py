@@ -90,7 +90,9 @@ def find_target(text: str | Path) -> CheckTarget:
         return _find_distribution_target(_find_entry_points(error.distribution))
     homes = [plugin for plugin in registry().plugins if sensor.id in plugin.sensors]
     files = [
-        file for plugin in homes for file in module_files(plugin.entry_point.partition(" = ")[2])
+        file
+        for plugin in homes
+        for file in find_module_files(plugin.entry_point.partition(" = ")[2])
     ]
     family = [
         sensor_id
@@ -144,7 +146,7 @@ def _find_folder_target(folder: Path) -> CheckTarget:
     elsewhere = [
         module
         for entry in entries
-        for module in module_files(entry.value)
+        for module in find_module_files(entry.value)
         if folder.resolve() not in module.resolve().parents
     ]
     if elsewhere:
@@ -182,12 +184,14 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
         try:
             sensors = _load_sensors(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
-            finding = describe_loading_error(error, module_files(entry.value))
+            finding = describe_loading_error(error, find_module_files(entry.value))
             target.findings.append(
                 replace(finding, path=finding.path or f"{entry.name} = {entry.value}")
             )
             continue
-        target.files += [file for file in module_files(entry.value) if file not in target.files]
+        target.files += [
+            file for file in find_module_files(entry.value) if file not in target.files
+        ]
         target.sensors += [
             sensor for sensor in sensors if sensor.id not in {other.id for other in target.sensors}
         ]
@@ -234,7 +238,7 @@ def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
         for plugin in registry().plugins
         if sensor.id in plugin.sensors
         and not any(
-            file.samefile(own) for own in module_files(plugin.entry_point.partition(" = ")[2])
+            file.samefile(own) for own in find_module_files(plugin.entry_point.partition(" = ")[2])
         )
     ]
 
@@ -313,7 +317,7 @@ def _find_loading_rule(error: BaseException, cause: BaseException) -> str:
     return "LS001"
 
 
-def module_files(value: str) -> list[Path]:
+def find_module_files(value: str) -> list[Path]:
     """Return the source files of the module or package of an entry point.
 
     Returns an empty list if there is none.
@@ -524,7 +528,7 @@ def _find_expression_names(tree: ast.Module) -> set[str]:
 
 
 def _list_tests(node: ast.AST) -> list[ast.expr]:
-    """Return the expressions whose truth value Python uses at a node."""
+    """Return the conditions of a syntax node, for example of `if`, `while` or `and`."""
     match node:
         case (
             ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test)
@@ -607,7 +611,7 @@ class Report:
         return {**vars(self), "findings": [finding.to_dict() for finding in self.findings]}
 
 
-def reports(
+def iter_reports(
     target: CheckTarget,
     name: str,
     *,

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import pytest
 
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing.check import CheckTarget, Report, find_target, reports
+from lidarspec.testing.check import CheckTarget, Report, find_target, iter_reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
 
 #: The rule about an id that another installed plugin uses.
@@ -28,7 +28,7 @@ def assert_conformance(
     vectors: str | Path | None = None,
     tested: Sequence[Sensor] = (),
 ) -> list[Report]:
-    """Fail if `lidarspec check` has findings, with all of them; return the reports.
+    """Fail with all findings of `lidarspec check`, if there are any; return the reports.
 
     Findings of rule LS005 are ignored. They report that another installed plugin uses the same id,
     which is a fault of the environment, not of the sensor.
@@ -48,7 +48,7 @@ def assert_conformance(
     else:
         check_target = find_target(sensor)
     made = list(
-        reports(
+        iter_reports(
             check_target,
             str(sensor),
             examples=examples,

@@ -385,7 +385,7 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     These are `Scaled` fields with an empty unit.
 
     Args:
-        with_scale: include fields with a scale, such as the components of a direction.
+        with_scale: whether to include fields with a scale, such as components of a direction.
     """
     return {
         info.path

@@ -154,7 +154,9 @@ def _changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
 
 
 def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -> None:
-    for (path, before), (other, after) in zip(leaves(parsed), leaves(again), strict=False):
+    for (path, before), (other, after) in zip(
+        iter_leaves(parsed), iter_leaves(again), strict=False
+    ):
         is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
         if path == other and is_number and not same(before, after):
             raise ViolationError(
@@ -271,7 +273,7 @@ def _raise_changed_bytes(
     difference = next(
         (
             (path, a, b)
-            for (path, a), (_, b) in zip(leaves(before), leaves(after), strict=False)
+            for (path, a), (_, b) in zip(iter_leaves(before), iter_leaves(after), strict=False)
             if a != b
         ),
         None,
@@ -289,14 +291,14 @@ def _raise_changed_bytes(
     )
 
 
-def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def iter_leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (path with indices, value) for each value of a parsed frame."""
     if isinstance(parsed, dict):
         for key, value in parsed.items():
-            yield from leaves(value, f"{path}.{key}" if path else key)
+            yield from iter_leaves(value, f"{path}.{key}" if path else key)
     elif isinstance(parsed, list):
         for index, value in enumerate(parsed):
-            yield from leaves(value, f"{path}[{index}]")
+            yield from iter_leaves(value, f"{path}[{index}]")
     else:
         yield path, parsed
 

@@ -102,7 +102,7 @@ def make_sweep(
 
     Args:
         packets: maximum number of packets.
-        total: maximum number of their bytes.
+        total: maximum total size of the packets, in bytes.
     """
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
@@ -137,9 +137,9 @@ def decode_frames(
 
 
 def trace_points(subject: SensorUnderTest, name: str) -> Any:
-    """Return the result of `points` for one example with traced columns.
+    """Call `points` with columns that record their use, and return its result.
 
-    Returns None if the frame is not compiled.
+    Returns None if the frame type is not compiled.
 
     Raises:
         UntraceableError: if `points` cannot be traced, with the reason.
@@ -167,7 +167,7 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
     """Return the nodes of the fields that traced values are calculated from.
 
     Args:
-        looked_up: include fields that are only used as indices of a table.
+        looked_up: whether to include fields that are only used as indices of a table.
     """
     nodes = traverse(
         *values, into=lambda node: looked_up or not isinstance(node.function, TableLookup)
@@ -527,8 +527,8 @@ def _find_zero(info: FieldInfo) -> int | None:
 def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
     """Return the angle fields of a frame type that may turn its points, by path.
 
-    These are the fields that `points` uses, and optional fields, which the traced example may not
-    have. If `points` cannot be traced, these are all angle fields.
+    These are the angle fields that `points` uses and all optional angle fields. If `points` cannot
+    be traced, all angle fields are returned.
     """
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
@@ -601,10 +601,16 @@ def _decode_with_values(
 
 
 def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
-    """Return the direction in which points turn if a field increases.
+    """Return the direction in which points turn if the value of a field increases.
 
-    1 is counter-clockwise, -1 clockwise, 0 if the points do not turn, for example because the field
-    is a rate or an elevation.
+    Args:
+        info: the field.
+        nought: the points if the angle is 0.
+        turned: the points if the raw value is higher by `ANGLE_CHANGE_STEPS`.
+
+    Returns:
+        1 for counter-clockwise, -1 for clockwise. 0 if the points do not turn, for example because
+        the field is a rate or an elevation.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
@@ -649,8 +655,8 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
     return distances
 
 
-def half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half the resolution of the coarsest length field, in metres.
+def find_half_step(subject: SensorUnderTest, name: str) -> float:
+    """Return half the resolution of the coarsest field in a unit of length, in metres.
 
     The result is `MIN_HALF_STEP_M` if the resolution is not larger than this value.
     """
@@ -705,7 +711,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         each = np.sqrt(3)
     else:
         each = 1  # each coordinate is rounded separately
-    near_enough = worst < half_step(subject, name) * each + FLOAT32_ERROR_M
+    near_enough = worst < find_half_step(subject, name) * each + FLOAT32_ERROR_M
     require(
         near_enough,
         "LS507",

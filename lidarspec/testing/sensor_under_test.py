@@ -109,7 +109,7 @@ def iter_integers(
 
 
 def parse_physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """Parse a frame, with scaled numbers in their units.
+    """Parse a frame, and convert scaled numbers to their units.
 
     Returns None if a number is too large for an exact float.
     """
@@ -291,10 +291,7 @@ class SensorUnderTest:
         return self._known[frame, seed]
 
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
-        """Return the functions that the plugin's author gives to draw raw values.
-
-        The key of each is the path of the field in this frame type.
-        """
+        """Return the functions of the plugin's author that draw raw values, by field path."""
         if frame not in self._drawers:
             own = {
                 path.removeprefix(f"{frame}."): how

@@ -12,9 +12,8 @@ the other fields of the layout are drawn, within the ranges that the struct and 
 (`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. In a long array,
 all elements have the same drawn value except a few.
 
-Frames without layouts, which only construct can parse, and frames with parts are drawn value by
-value, in the order of their struct. If such values are seldom valid together, one of a few examples
-is drawn instead.
+If a frame type has parts, or only construct can parse it, its values are drawn in the order of the
+struct. If such values are seldom valid together, one of a few examples is drawn instead.
 """
 
 from __future__ import annotations
@@ -534,7 +533,7 @@ def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
 
 @st.composite
 def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
-    """Draw a frame with parts, or a frame without layouts, value by value."""
+    """Draw a frame value by value, if its type has parts or is not compiled."""
     source = _DrawnNumbers(draw, ranges_of_values(sensor, frame))
     drawn = {path: functools.partial(_draw_own, strategy) for path, strategy in fields.items()}
     try:

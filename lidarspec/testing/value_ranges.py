@@ -106,10 +106,10 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and all other values that are valid together with them.
+        """Return the fixed values, and all values that are valid together with them.
 
-        Fields that are missing in the result have their value from the base. For a field in an
-        array, the valid elements are kept, and the other elements have their value from the base.
+        Invalid values are omitted, so that the fields keep their values of `base`. Invalid elements
+        of an array are replaced by the elements of `base`.
         """
         kept = dict(fixed)
         for leaf in self.free:
@@ -186,7 +186,10 @@ class LayoutRanges:
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Set each field of `base` to the valid value nearest to 0; return if any changed."""
+        """Set each field of `base` to the valid value nearest to 0.
+
+        Returns whether a value has changed.
+        """
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
@@ -323,11 +326,11 @@ def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...
     sizes: dict[tuple[tuple[str, int], ...], int] = {}
     for seed in range(KNOWN_HEADERS):
         layout, row = draw_row(sensor, frame, random.Random(seed))
-        sizes[_header_of(sensor, frame, row.tobytes())] = layout.size
+        sizes[_find_header(sensor, frame, row.tobytes())] = layout.size
     return sorted(sizes, key=lambda header: (sizes[header], header))
 
 
-def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, int], ...]:
+def _find_header(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, int], ...]:
     """Return the values of those fields of a struct that determine its layout."""
     values: dict[str, int] = {}
     while True:
@@ -374,7 +377,7 @@ def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
 
 @functools.lru_cache(maxsize=1024)
 def is_often_valid(sensor: Sensor, frame: str) -> bool:
-    """Return whether any of a few random frames without layouts is valid."""
+    """Return whether random values often make a valid frame of a type."""
     return any(_is_walk_valid(sensor, frame, seed) for seed in range(SINGLE_WALKS))
 
 
@@ -390,9 +393,9 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
     """Return the lowest and highest raw value of integer fields of a frame.
 
-    The frame need not have layouts. The values are found by changing one valid frame. Two kinds of
-    fields are omitted: fields that determine which fields follow, such as counts, and fields that
-    have only one valid value in that frame.
+    The frame type need not be compiled. The values are found by changing one valid frame. Two kinds
+    of fields are omitted: fields that determine which fields follow, such as counts, and fields
+    that have only one valid value in that frame.
     """
     if sensor.frames[frame].plausible is None:
         return {}

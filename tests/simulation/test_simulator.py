@@ -47,7 +47,7 @@ def take_coordinates(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
     return xyz[cloud.valid[: len(xyz)]].astype(np.float64)
 
 
-def half_step(sensor: Sensor, frame: str) -> float:
+def find_half_step(sensor: Sensor, frame: str) -> float:
     """Return the largest error of a point that rounding its range can cause, m.
 
     It is half a step of the coarsest range field. If `points` returns coordinates, which are
@@ -114,7 +114,7 @@ def assert_scene_comes_back(sensor: Sensor, frame: str, room: Room, *, number: i
     assert cloud.valid[seen].mean() > 0.98
     assert (
         distance_outside(room, take_coordinates(cloud, len(frames))).max()
-        < half_step(sensor, frame) + EXACT
+        < find_half_step(sensor, frame) + EXACT
     )
 
 
@@ -149,7 +149,7 @@ def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name:
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert (
         distance_outside(room, take_coordinates(cloud, len(packets))).max()
-        < half_step(sensor, packets.frame) + EXACT
+        < find_half_step(sensor, packets.frame) + EXACT
     )
     assert set(np.round(np.sign(np.diff(packets.time_ns))).tolist()) <= {0.0, 1.0}
 

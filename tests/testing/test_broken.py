@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.testing.check import find_target, reports
+from lidarspec.testing.check import find_target, iter_reports
 from lidarspec.testing.findings import Finding
 
 HERE = Path(__file__).resolve().parents[1] / "broken"
@@ -143,7 +143,7 @@ def check_module(name: str) -> list[Finding]:
     file = HERE / f"{name}.py"
     return [
         finding
-        for report in reports(find_target(file), str(file), examples=4)
+        for report in iter_reports(find_target(file), str(file), examples=4)
         for finding in report.findings
     ]
 

@@ -52,7 +52,7 @@ from lidarspec.spec import (
     take,
 )
 from lidarspec.testing import frames
-from lidarspec.testing.check import CheckTarget, reports
+from lidarspec.testing.check import CheckTarget, iter_reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import ViolationError, list_unacknowledged
@@ -119,7 +119,7 @@ def run(folder: Path, *words: str, **variables: str) -> subprocess.CompletedProc
 def codes(sensor: Sensor) -> set[str]:
     return {
         finding.code
-        for report in reports(CheckTarget([sensor]), sensor.id, examples=6)
+        for report in iter_reports(CheckTarget([sensor]), sensor.id, examples=6)
         for finding in report.findings
     }
 
@@ -210,7 +210,7 @@ def test_work_with_a_long_frame_is_limited_in_bytes(
 def test_progress_names_each_case_before_it_begins() -> None:
     seen: list[tuple[str, int, int]] = []
     (sensor,) = no_example.lidarspec_sensors()
-    list(reports(CheckTarget([sensor]), sensor.id, watch=lambda *told: seen.append(told)))
+    list(iter_reports(CheckTarget([sensor]), sensor.id, watch=lambda *told: seen.append(told)))
     assert seen[0] == ("broken-one: declaration", 0, len(PROPERTIES))
     assert seen[1] == ("broken-one: examples_are_valid_and_repeat data", 0, len(PROPERTIES))
 
@@ -352,7 +352,7 @@ def test_acknowledged_findings_do_not_skip_checks() -> None:
         samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
     )
     bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})
-    (report,) = reports(CheckTarget([bare]), "bare", examples=1)
+    (report,) = iter_reports(CheckTarget([bare]), "bare", examples=1)
     assert "LS201" not in {finding.code for finding in report.findings}
     assert "the_simulated_sensor_answers" not in report.skipped
 
