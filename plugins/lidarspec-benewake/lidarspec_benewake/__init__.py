@@ -3,11 +3,11 @@
 The CE30-D, a lidar over UDP, is in the module `ce30d`.
 
 Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections,
-and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The first TFmini sends
-the same frames with other data in place of the temperature, and has other commands. Distances are
-in centimetres by default. Frames do not contain the unit, so use ``configure(unit="mm")`` after the
-command `set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores the
-checksum of commands, which is a sum, and its manual prints commands with the sum 00. The other
+and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The original TFmini
+sends the same frames with other data in place of the temperature, and has other commands. Distances
+are in centimetres by default. Frames do not contain the unit, so use ``configure(unit="mm")`` after
+the command `set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores
+the checksum of commands, which is a sum, and its manual prints commands with the sum 00. The other
 models check the sum. In the TFmini-S manual, the replies to reset, factory settings and save are
 printed with the sums of their commands. In this module, each reply has the sum of its own bytes.
 """
