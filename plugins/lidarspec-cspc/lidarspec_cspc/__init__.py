@@ -291,7 +291,7 @@ def points(f: Fields, zero: str = "data", has_exposure: bool = False) -> Polar:
 
 
 def older_points(f: Fields, zero: str = "data") -> Polar:
-    """Return the points of a packet of the older kind, all at the packet's time."""
+    """Return the points of a packet of the older M1C1_Mini, all at the packet's time."""
     return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
 
 
@@ -388,7 +388,7 @@ def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
 
 
 def older_sweep(i: int) -> dict[str, float]:
-    """Return the simulated values of packet i of the older kind."""
+    """Return the simulated values of packet i of the older M1C1_Mini."""
     return {
         name: value
         for name, value in Turning()(i).items()
@@ -424,10 +424,10 @@ def make_start_packets(
 
 
 def has_customer_firmware(f: Fields) -> Any:
-    """Return whether the upper bits of M&T are set in a packet without start flag.
+    """Return whether a packet has the upper bits of M&T set, but no start flag.
 
-    A CSPC lidar sets them only in the first packet after a start packet, if at all (manual 2.2.3,
-    M&T).
+    A CSPC lidar sends its customer firmware in these bits, and only in the first packet after a
+    start packet (manual 2.2.3, M&T).
     """
     return (f.mt.start == 0) & (f.mt.m > 0)
 

@@ -167,7 +167,10 @@ def test_an_answer_of_the_older_generation_is_no_point_packet(name: str) -> None
 
 
 def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
-    """The packet has the manual's sample: 30, 120, 210, 300 degrees and 1, 2, 7.161, 8 m."""
+    """The packet has four samples, at 30, 120, 210 and 300 degrees.
+
+    Their distances are 1, 2, 7.161 and 8 m.
+    """
     si = vector_bytes(FILE, "cspc_v11_si2")
     data = bytes.fromhex("aa55 0004 010f 0196 aeca a00f 401f") + si + bytes.fromhex("007d")
     packets = decode(
