@@ -198,8 +198,8 @@ TAIL = (
 def points(f: Fields, channels: Mirror) -> Polar:
     """Return the points of a packet; the last shot is at the packet's time (nebula).
 
-    Clockwise from the left, the azimuth of a point is twice the angle of the mirror from the start
-    of the face, plus the azimuth and the correction of the channel.
+    Measured clockwise from the left, the azimuth of a point is twice the mirror's angle from the
+    start of the face, plus the azimuth and the correction of the channel.
     """
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]

@@ -122,8 +122,8 @@ def configure(
     opening the sensor does not request them.
 
     Args:
-        points: the model's function of `Fields` and the channels' `Calibration`.
-        table: the model's channels.
+        points: a function that returns points, given `Fields` and the unit's `Calibration`.
+        table: the nominal corrections of the model.
         calibration: a CSV file with the columns Channel (or Laser id), Elevation and Azimuth, in
             degrees and in any order; or a binary file, if the model has one; or the unit's reply.
         firing_times: a CSV file with the columns Channel and Fire time, in microseconds.

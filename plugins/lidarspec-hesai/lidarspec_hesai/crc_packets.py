@@ -183,7 +183,10 @@ ACKNOWLEDGED = {
 
 
 def distance(f: Fields) -> Any:
-    """Return distances in metres, (n, blocks, lasers), by the unit in the header."""
+    """Return distances in metres, (n, blocks, lasers).
+
+    The header contains the unit of the sent distances.
+    """
     return f.body.blocks.channels.distance * (f.dis_unit * 0.001)
 
 

@@ -21,15 +21,15 @@ def make_spinning_sensor(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a rotating sensor, whose angles are requested when it is opened.
+    """Return a rotating sensor that requests the angles of the unit when it is opened.
 
     Args:
         id: the id of the sensor.
         data: its data frames.
-        points: a function of `Fields` and the channels' `Calibration`.
-        table: the model's channels.
-        sweep: the values of simulated packet i.
-        azimuth: the field that passes 0 at the end of a scan.
+        points: a function that returns points, given `Fields` and the unit's `Calibration`.
+        table: the nominal corrections of the model.
+        sweep: a function that returns the values of simulated packet i.
+        azimuth: the path of the field that passes 0 at the end of a scan.
         facts: further arguments of `Sensor`.
     """
     defaults: dict[str, Any] = {

@@ -3,7 +3,7 @@
     EE FF  major minor  reserved(2) | lasers blocks first_return dis_unit return_num flags
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the
-length rule is verified with captures of both.
+length rule is verified with captures of a PandarQT64 and a Pandar XT.
 """
 
 from __future__ import annotations
@@ -73,7 +73,10 @@ def plausible(f: Fields) -> Any:
 
 
 def distance(f: Fields) -> Any:
-    """Return distances in metres, (n, blocks, lasers), by the unit in the header."""
+    """Return distances in metres, (n, blocks, lasers).
+
+    The header contains the unit of the sent distances.
+    """
     return f.blocks.channels.distance * (f.dis_unit * 0.001)
 
 

@@ -9,8 +9,9 @@ sample:
         | acceleration, rate, sequence | CRC
 
 No captured packet was available. The azimuths per revolution and the rotation speed are not public.
-The simulation has 600 azimuths, as the vendor's code does, at 5 Hz, the most that the baud rate
-allows. The axes of the IMU are not documented, so its samples are available as fields only.
+The simulation has 600 azimuths per revolution, as in the vendor's code, and makes 5 revolutions a
+second, which is the most that the baud rate allows. The axes of the IMU are not documented, so its
+samples are available as fields only.
 
 Commands are not supported: they use a second line (RS232, 9600 baud), and contain random numbers.
 The angles of a unit, which a command could read, come from a correction file instead.
