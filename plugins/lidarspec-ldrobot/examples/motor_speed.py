@@ -7,9 +7,9 @@ Connect the output to pin 2 of the sensor (PWM, at most 3.3 V), and the grounds.
 the speed, and each unit has another speed at the same duty cycle, so this program compares the
 speed in the packets with the wanted speed and corrects the duty cycle (manual, section 2).
 
-`--pin` uses gpiozero. Its pin factory has to reach 20 kHz; pigpio does with `pigpiod -s 1`, in
-coarse steps. `--pwm` uses the PWM hardware through Linux, in fine steps; export the channel first:
-``echo 0 | sudo tee /sys/class/pwm/pwmchip0/export``.
+`--pin` uses gpiozero. Its pin factory has to reach 20 kHz. pigpio reaches it with `pigpiod -s 1`,
+but only in coarse steps. `--pwm` uses the PWM hardware through Linux, in fine steps. Export the
+channel first: ``echo 0 | sudo tee /sys/class/pwm/pwmchip0/export``.
 
 The sensor stays under external control until its power is switched off.
 """

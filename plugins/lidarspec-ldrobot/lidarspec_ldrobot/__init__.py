@@ -9,8 +9,8 @@ angles are converted to angles around the axis of rotation, as in the SDK (sl_tr
 older LD14P measures 2300 points a second.
 
 The replies of an LD14P to commands are not documented, so commands do not wait for a reply. The
-baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's; no captured frame of the last
-two was available. The STL-50 is left out, because its protocol is not public.
+baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's. No captured frame of an STL-06P
+or an STL-26 was available. The STL-50 is left out, because its protocol is not public.
 
 Known errors of the manual: The CRC table lacks entries 175 to 186; this module generates the table.
 In the decoded example, point 2 is printed as 200 mm, but 0x00dc is 220, and point 12 is printed as

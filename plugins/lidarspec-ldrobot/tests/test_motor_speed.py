@@ -43,7 +43,7 @@ class Motor:
     """A simulated sensor whose speed follows the duty cycle of a pin.
 
     Args:
-        pin: the pin.
+        pin: the pin that sets the duty cycle.
         gain: Hz per unit of duty cycle.
         lag: the time constant, seconds.
     """
