@@ -482,7 +482,7 @@ COMMANDS: dict[str, Command] = {
 
 @cache
 def make_frames(rate: int, first: str) -> Mapping[str, Frame]:
-    """Return all frames of the models with one shot rate.
+    """Return all frames of the models that measure at this rate.
 
     Args:
         rate: shots per second.
