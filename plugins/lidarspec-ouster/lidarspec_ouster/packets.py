@@ -327,7 +327,7 @@ def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
 
 
 def rotate(rotation: Rotation, vector: Any) -> tuple[Any, ...]:
-    """Return a vector of columns after rotating it."""
+    """Return the components of a rotated vector; each component is a column."""
     parts = list(vector)
     return tuple(
         sum(weight * part for weight, part in zip(row, parts, strict=True) if weight)

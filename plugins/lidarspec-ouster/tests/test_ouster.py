@@ -68,7 +68,7 @@ def digest(values: Any) -> str:
 
 
 def pixels(packets: ls.Packets, name: str) -> Any:
-    """Return a field of the pixels in the vendor's type: (packets, rows, columns)."""
+    """Return a field of the pixels in the vendor's type, (packets, rows, columns)."""
     return packets.raw["columns"]["pixels"][name].transpose(0, 2, 1).astype(TYPES[name.rstrip("2")])
 
 
