@@ -240,7 +240,10 @@ def points(f: Fields) -> Polar:
 
 
 def imu(f: Fields) -> Imu:
-    """Return the IMU sample; a raw step is 1/32768 of the sample's range (Table 13)."""
+    """Return the IMU sample.
+
+    A raw step is 1/32768 of the measuring range, which the sample contains (Table 13).
+    """
     acceleration_step = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
     rotation_step = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)
     return Imu(

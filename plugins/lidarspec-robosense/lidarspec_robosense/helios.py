@@ -5,8 +5,8 @@ The angles of a unit are in its device information (DIFOP).
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
 decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, offset of the horizontal
-angles, the times of 32 lasers. From nebula's former decoder of the 16P: the firing times of its
-lasers, which reproduce the azimuths in nebula's published point clouds to the last digit.
+angles, the times of 32 lasers. From nebula's former decoder: the firing times of the 16P, which
+reproduce the azimuths in nebula's published point clouds to the last digit.
 
 The manual has errors. The distance in its example, 320 steps of 0.25 cm, is 0.8 m and not 8 m. In
 its examples of angles, the vertical angle 00 05 d6 is 14.94 degrees and not 14.95, and the

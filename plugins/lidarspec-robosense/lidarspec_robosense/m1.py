@@ -204,8 +204,8 @@ def pace(f: Fields) -> Any:
 def points(f: Fields) -> Polar:
     """Return range and direction as sent; the sent angles have REP-103 axes.
 
-    The column is the number of the firing in its frame. Two returns of a firing have the same
-    column and ring.
+    The column of a point is the number of its firing in the frame. The two returns of a firing have
+    the same column and ring.
 
     Source: M1P user guide, page 13.
     """

@@ -209,7 +209,10 @@ DIFOP_TAIL = "tail" / Const(b"\x0f\xf0")
 
 
 def make_first_layout(*end: Construct) -> Construct:
-    """Return the device information of the first layout; `end` begins at byte 468."""
+    """Return the device information of the first layout.
+
+    `end` are the fields from byte 468 on.
+    """
     time = ("software" / Int16ub, "time" / Bytes(10))
     return Struct(
         *DIFOP_HEAD, "reserved_50" / Bytes(242), *DIFOP_UNIT, *time, *DIFOP_STATUS, *end, DIFOP_TAIL
@@ -382,7 +385,7 @@ def rotation_values(i: int, shots: int, period: float, **others: Any) -> dict[st
 def sweep_difop(i: int, speed: str = "measured_speed", **others: Any) -> Mapping[str, Any]:
     """Return the device information with the factory's settings and default angles.
 
-    `speed` is the field of the measured speed.
+    `speed` is the name of the field with the measured speed.
     """
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     return {

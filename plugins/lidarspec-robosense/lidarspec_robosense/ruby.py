@@ -166,7 +166,13 @@ def even_firing_times(*counts: int) -> NDArray[np.float64]:
 
 
 def make_rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
-    """Return the rotor of a model with these firing times and nominal angles."""
+    """Return the rotor of a model, with evenly spaced nominal angles.
+
+    Args:
+        delay: the firing times of the lasers in seconds.
+        period: the seconds from one firing of all lasers to the next.
+        lens: the distance from the axis to the optical centre, metres.
+    """
     return Rotor(
         delay=delay,
         period=period,

@@ -242,7 +242,10 @@ def points(f: Fields, returns: bool = False) -> Polar:
 
 
 def points_mx(f: Fields) -> Polar:
-    """Return two points of each channel, the second with dual return only."""
+    """Return two points of each channel.
+
+    The second point is valid only with dual return.
+    """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
     second = np.where(f.wave_mode == DUAL, channels.second_radius, 0)

@@ -255,9 +255,9 @@ def test_calibration_by_its_offset(layout: str, start: int) -> None:
 
 
 def test_device_information_layouts_are_distinguished() -> None:
-    """Layouts are distinguished by the values at the offsets of modes and time.
+    """The layouts of DIFOP differ in the offsets of the modes and of the time.
 
-    A frame that fits none of them keeps its bytes.
+    The content of a packet without a known layout is kept as bytes.
     """
     head = bytes.fromhex("a5ff005a11115555000a") + bytes(18)
     modes = bytes([5, 2, 1]) + (1_700_000_000).to_bytes(6, "big") + (999_999).to_bytes(4, "big")

@@ -29,7 +29,7 @@ def msop(
     *,
     lidar_type: int = 2,
 ) -> bytes:
-    """Return a packet by the offsets of rs_driver.
+    """Return an MSOP packet; the offsets are those of rs_driver.
 
     Args:
         azimuths: raw values by block.
