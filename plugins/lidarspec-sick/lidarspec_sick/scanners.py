@@ -3,11 +3,11 @@
 They use CoLa B or CoLa A.
 
 Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883
-(steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10).
-Assumed, because no data sheet was available: the steps, rates and angles of TiM7xx and LMS1xx, the
-rates of an LMS5xx, and the ranges of all. Telegrams contain the settings of the scanner. Models are
-therefore distinguished by settings that other models do not support. If this is not sufficient, the
-reply to `get_identity` contains the model.
+(steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10). The
+steps, rates and angles of TiM7xx and LMS1xx, the rates of an LMS5xx, and the ranges of all models
+are assumed, because no data sheets were available. Telegrams contain the settings of the scanner.
+Models are therefore distinguished by settings that other models do not support. If this is not
+sufficient, the reply to `get_identity` contains the model.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ANGLE_TOLERANCE_DEG = 1e-4
 class Kind:
     """The possible settings of a family of models.
 
-    A simulated scanner has the first rate and the first step.
+    A simulated scanner uses the first rate and the first step.
 
     Attributes:
         rates: the possible scans per second.

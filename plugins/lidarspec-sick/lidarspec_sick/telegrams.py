@@ -50,7 +50,10 @@ MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
 
 def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
-    """Return the frame of CoLa B: four bytes 02, a length, the content, and its XOR."""
+    """Return the frame of a telegram in CoLa B.
+
+    It has four bytes 02, a length, the content, and the XOR of the content.
+    """
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
         "length" / SizeOf(Int32ub, plus=-9) * "number of bytes of the content",
@@ -64,7 +67,7 @@ def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Fr
 
 
 def make_text_frame(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
-    """Return the frame of a telegram in CoLa A: 02, tokens, 03."""
+    """Return the frame of a telegram in CoLa A: the byte 02, tokens, the byte 03."""
     return Frame(
         Struct(*parts),
         wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16),

@@ -20,7 +20,10 @@ MRS1104, MULTISCAN = ls.sensor("sick-mrs1104"), ls.sensor("sick-multiscan136")
 
 
 def telegrams() -> list[bytes]:
-    """Return the datagrams of the multiScan capture, each after its length."""
+    """Return the datagrams of the multiScan capture.
+
+    In the file, the length of a datagram is before the datagram.
+    """
     data, found, start = (
         capture("sick/multiscan_compact_test01_udp_scandata.telegrams.bin").read_bytes(),
         list[bytes](),
