@@ -165,7 +165,10 @@ def point_step(f: Fields, count: int) -> Any:
 
 
 def uncompensated_angles(f: Fields, cabins: int, points: int) -> Any:
-    """Return the clockwise degrees of the points, (n, cabins, points)."""
+    """Return the angles of the points without compensation, (n, cabins, points).
+
+    Angles are clockwise in degrees.
+    """
     count = cabins * points
     step = point_step(f, cabins * points)
     return stack(

@@ -41,7 +41,7 @@ class Mode:
     Attributes:
         name: its name.
         us_per_sample: microseconds from point to point.
-        max_range: in metres.
+        max_range: the longest range in metres.
         kind: the type of its descriptor.
     """
 

@@ -21,7 +21,10 @@ def node(degrees: float, metres: float, *, quality: int = 40, start: bool = Fals
 
 
 def capsule(answer: str, source: random.Random, degrees: float) -> bytes:
-    """Return a capsule with random content and, except for "hq", this first angle."""
+    """Return a capsule with random content.
+
+    `degrees` is its first angle, except for "hq".
+    """
     parsed = A1.parse(A1.example(answer, seed=source.randrange(1 << 30)), frame=answer)
     if answer != "hq":
         parsed.start.angle, parsed.start.sync = round(degrees * 64) % (360 * 64), 0
