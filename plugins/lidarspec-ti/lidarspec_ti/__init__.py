@@ -7,10 +7,10 @@ the points: ``packets.parts("tlvs.side_info")``.
 
 Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), in
 which the size of the header is given as 44 bytes, but is 40 bytes according to its own table;
-mmWave SDK 3.5 (mmw_output.h) for the types of parts, dpif_pointcloud.h for points and SNR. Assumed:
-the cycles of the 200 MHz R4F, and the longest range. Heat maps, and parts of other demos of the
-toolbox, are kept as bytes. To configure and start the radar, send it the lines of a .cfg file over
-its other UART at 115 200 baud; this plugin does not.
+mmWave SDK 3.5 (mmw_output.h) for the types of parts, dpif_pointcloud.h for points and SNR. It is
+assumed that CPU cycles are those of the R4F at 200 MHz. The longest range is assumed. Heat maps,
+and parts of other demos of the toolbox, are kept as bytes. To configure and start the radar, send
+it the lines of a .cfg file over its other UART at 115 200 baud; this plugin does not.
 """
 
 from __future__ import annotations
