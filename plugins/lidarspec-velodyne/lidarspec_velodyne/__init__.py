@@ -284,13 +284,13 @@ VLP16 = Sensor(
 
 
 def make_related_model(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
-    """Return another model of the family: a VLP-16 with other facts.
+    """Return another model of the family, derived from the VLP-16.
 
     Args:
         id: the id of the model.
         model: the name of the model.
         firings: its firing pattern.
-        facts: further arguments of `Sensor`.
+        facts: further arguments of `Sensor` that differ from those of a VLP-16.
     """
     return dataclasses.replace(
         VLP16,

@@ -7,7 +7,7 @@ next azimuth is two blocks ahead.
 
 If a packet was lost, the azimuth of the next block is further ahead than the sensor can have
 rotated. The same is true after a sector that is masked in the sensor's settings. In these cases,
-and if there is no next block, a rule is used that the user selects:
+and if there is no next block, the user's choice applies:
 
 * "previous", the default: the last valid step is used again. ros-drivers and nebula do this for the
   last block of every packet; velodyne_decoder uses the mean step of the packet. For real packets,
@@ -114,7 +114,7 @@ def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> A
 
 
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
-    """Return the sensor with one of the rules for the last block (module docstring)."""
+    """Return the sensor with a rule for the last block, see the module's docstring."""
 
     def set_rule(function: Any) -> Any:
         return function and partial(function, last_block=last_block)

@@ -459,7 +459,10 @@ def test_the_difference_of_an_hdl32e_names_its_own_interval_first() -> None:
 
 
 def test_the_hour_is_that_of_the_position_packets() -> None:
-    """Data at 13:59:59 on 2023-07-05; the hour arrives 0.5 s later or earlier."""
+    """The data are from 13:59:59 on 2023-07-05.
+
+    The packet with the hour arrives 0.5 s after or before them.
+    """
     sentence = b"$GPRMC,135959,A,4807.038,N,01131.000,E,022.4,084.4,050723,003.1,W*00\r\n"
     ten = 1_688_558_400  # 12:00:00
     for told, read, seconds in (
