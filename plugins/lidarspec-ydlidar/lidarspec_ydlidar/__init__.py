@@ -6,9 +6,9 @@ after a request. Models with one channel cannot receive, and measure without a r
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response, angle analysis).
 
 Known errors and gaps: the angles of the protocol's example, 217.0178 and 235.6326 degrees, are
-217.0191 and 235.6313 by its own formula. Packets do not contain the format of their samples.
-Formats with samples of different sizes can be recognised, but the others cannot, so select the
-model by its name. Not supported: GS1, GS2, GS5 and TIA, which have other protocols, and the network
+217.0191 and 235.6313 by its own formula. Packets do not contain the format of their samples. A
+format can only be recognised if no other format has samples of the same size, so select the model
+by its name. Not supported: GS1, GS2, GS5 and TIA, which have other protocols, and the network
 models T15 and T30.
 """
 
@@ -165,8 +165,8 @@ def make_id(name: str) -> str:
 def contains_state(f: Fields, slowest: float) -> Any:
     """Return whether a packet other than a zero packet contains the device's state.
 
-    The state is in the bits of the scan frequency. In these packets, models without a state send
-    the frequency 0 (protocol, CT).
+    The state is in the bits of the scan frequency. Models without a state send the frequency 0 in
+    these packets (protocol, CT).
     """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 

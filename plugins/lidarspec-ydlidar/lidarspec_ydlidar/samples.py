@@ -28,7 +28,7 @@ class Form:
         groups: the sizes in bytes of the words into which the checksum divides a sample.
         correction: a function of the distance in metres that returns the degrees to add to the
             angle.
-        slowest: the scan frequency in Hz of the raw value 0.
+        slowest: the scan frequency in Hz that is sent as the raw value 0.
         has_intensity: whether a sample has an intensity.
     """
 
