@@ -9,7 +9,7 @@ that the packets need are kept with them. Modules in reading order:
 * `pace`: the declared time from one packet to the next.
 * `returns`: finds the returns of the same firings in consecutive packets.
 * `counter_order`: finds lost, duplicate and late packets by their counter.
-* `clock_order`: finds such packets by the clock, for datagrams without a counter.
+* `clock_order`: finds lost, duplicate and late datagrams by their clock, without a counter.
 * `arrival_order`: counts losses among packets that have no counter and always arrive in order.
 * `masked_sector`: finds sectors in which a rotating sensor sends nothing on purpose.
 * `reorder`: sorts packets and drops duplicates.

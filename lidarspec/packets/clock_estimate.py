@@ -9,15 +9,13 @@ time, all delays lie above a line, and many lie close to it. This line is the sh
 packet can have. Its height is the offset between the clocks, and its slope is the drift.
 
 The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
-computes their lower convex hull. The line continues the edge of the hull at the middle of the
-samples. At the middle, it is the highest of all lines below the samples. If the previous slope lies
-between the slopes of the hull shortly before and after the middle, the previous slope is kept,
-because the delays do not determine a better one. If the line changes, the delays of stamps approach
-it smoothly.
+computes their lower convex hull. The line is as high as the samples above it allow. It keeps its
+previous slope if this slope lies between the slopes of the hull shortly before and after the middle
+of the samples, because the delays do not determine a better slope. Otherwise it gets the nearer of
+these two slopes. If the line changes, the delays of stamps approach it smoothly.
 
-A change of the clock is detected in two cases: several consecutive samples are far below the line,
-or all samples of a second are far above the line, by much more than their delays differ from each
-other.
+A jump of the clock is detected in two cases: several consecutive samples are far below the line, or
+all samples of a second are far above the line, compared with the differences between their delays.
 
 Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
 measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
@@ -91,8 +89,8 @@ class ClockJump(NamedTuple):
     """A jump of the sensor's clock, for example because it was set or restarted.
 
     Attributes:
-        change_ns: the sensor's time after the change minus the time that it would have had.
-        host_ns: the arrival time of the first packet after the change.
+        change_ns: the sensor's time after the jump minus the time without the jump.
+        host_ns: the arrival time of the first packet after the jump.
     """
 
     change_ns: int
@@ -111,7 +109,7 @@ class DeviceClock:
 
     Attributes:
         jumps: how often the sensor's clock was set.
-        jump: the last change, until ten seconds after it; otherwise None.
+        jump: the last jump, until ten seconds after it; otherwise None.
     """
 
     def __init__(self, parts: int = PARTS) -> None:
@@ -150,7 +148,8 @@ class DeviceClock:
         """Return how much later packets arrive than the fastest ones, (n,) ns.
 
         Args:
-            device, host: as for `observe`.
+            device: the times of the packets by the sensor's clock, (n,) ns.
+            host: the arrival times of the packets, (n,) ns.
         """
         line = self._line
         expected = line.delay + line.slope * (device - line.device)
@@ -186,7 +185,7 @@ class DeviceClock:
         offset = host_ns - device_ns
         went_back = self._last_stamped is not None and device_ns <= self._last_stamped.device
         if not went_back:
-            offset = min(self._slewed_delay(device_ns), offset)
+            offset = min(self._find_slewed_delay(device_ns), offset)
         self._last_stamped = ClockSample(device_ns, offset)
         self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
@@ -228,7 +227,7 @@ class DeviceClock:
         assert before is not None
         self.observe(device, host)
         last = device.item(-1)
-        delay_change = self._slewed_delay(last) - before.delay
+        delay_change = self._find_slewed_delay(last) - before.delay
         steps = (device - before.device) / (last - before.device)
         delays = before.delay + np.rint(delay_change * steps).astype(np.int64)
         delays = np.minimum(delays, host - device)
@@ -240,7 +239,7 @@ class DeviceClock:
         self._stamp = stamps.item(-1)
         return stamps
 
-    def _slewed_delay(self, device: int) -> int:
+    def _find_slewed_delay(self, device: int) -> int:
         """Return the delay to add to a time of the sensor to get its stamp, ns.
 
         If the line has changed, the delay approaches it smoothly.
@@ -258,7 +257,7 @@ class DeviceClock:
 
         Returns a jump of the clock if the outliers show one.
         """
-        deviation = self._deviation(sample)
+        deviation = self._find_deviation(sample)
         has_paused = (
             bool(self._min_delays)
             and sample.host - self._min_delays[-1].host > self._parts * PART_NS
@@ -287,7 +286,7 @@ class DeviceClock:
         self._outliers.clear()
         self._last_stamped = None
 
-    def _deviation(self, sample: ClockSample) -> int:
+    def _find_deviation(self, sample: ClockSample) -> int:
         """Return how much later a sample arrived than a packet on the line, ns."""
         return sample.delay - self._line.delay_at(sample.device)
 
@@ -300,7 +299,7 @@ class DeviceClock:
         newest = self._min_delays[-1].device
         outliers = list(self._outliers)
         are_early = [
-            self._deviation(sample) < 0 or sample.device < newest
+            self._find_deviation(sample) < 0 or sample.device < newest
             for sample in outliers[-CERTAIN_OUTLIERS:]
         ]
         if len(are_early) == CERTAIN_OUTLIERS and all(are_early):
@@ -310,7 +309,7 @@ class DeviceClock:
         return (
             len(outliers) == LATE_OUTLIERS
             and lasting >= LATE_OUTLIERS_NS
-            and min(map(self._deviation, outliers)) > MIN_LATE_SPREADS * spread
+            and min(map(self._find_deviation, outliers)) > MIN_LATE_SPREADS * spread
         )
 
     def _restart_at_outliers(self) -> ClockJump:

@@ -14,7 +14,9 @@ from lidarspec.spec.timing import DAY_S
 
 
 class FindingType(NamedTuple):
-    """A kind of finding. In its texts, braces name attributes of `ClockFinding`.
+    """A kind of finding.
+
+    A name in braces in a text is replaced by the attribute of `ClockFinding` with this name.
 
     Attributes:
         text: what was found.

@@ -154,7 +154,7 @@ class ClockMonitor:
         self._late_uncertain = 0  # late packets since the clock may have been set
 
     def add(self, packets: Packets) -> list[ClockFinding]:
-        """Update the clock with packets, and return the events among them.
+        """Add packets, and return the events of the clock that they show.
 
         Args:
             packets: the next packets. Packets of a frame type with another clock are only counted.
@@ -353,9 +353,9 @@ class ClockMonitor:
             yield ClockFinding("ok")
 
     def _judge_offset(self, epoch: str) -> ClockFinding | None:
-        """Return the finding about the offset.
+        """Return the finding about the offset of the clock.
 
-        Returns None if the offset is correct, or if it cannot be compared.
+        Returns None if the offset is correct, or if the clock has no date.
         """
         error_s = self._find_error_s()
         if math.isnan(error_s) or abs(error_s) < OFFSET_LIMIT_S:
@@ -393,9 +393,9 @@ def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
 
 
 def _is_at_month_end(host_ns: int) -> bool:
-    """Return whether a leap second may be inserted near a time.
+    """Return whether a time is near the end of a month in UTC.
 
-    Leap seconds are inserted at the end of a month in UTC.
+    Leap seconds are inserted at the end of a month.
     """
     moment = np.datetime64(host_ns, "ns")
     nearest_day = (moment + np.timedelta64(DAY_S // 2, "s")).astype("datetime64[D]")

@@ -58,7 +58,7 @@ class RecentPacket:
         missing: the number of packets missing directly before this packet.
         checksum: the CRC-32 of its bytes; None if it is no longer stored.
         angle: the angle at which it begins, in turns; nan if unknown.
-        masked: the number of packets directly before this packet that a masked sector leaves out.
+        masked: how many packets a masked sector leaves out directly before this packet.
     """
 
     time: int
@@ -129,9 +129,9 @@ class ClockOrder:
         return index, order
 
     def forget(self) -> None:
-        """Treat the next packet as the first one after the clock was set.
+        """Forget all stored packets, because input was lost.
 
-        Call this after input was lost, since the number of lost packets is then unknown.
+        The next packet is treated as if the clock had been set before it.
         """
         self._arrived = None
         self._neighbours.clear()

@@ -99,7 +99,7 @@ class ClockReference:
 class ClockEpoch:
     """The offset from unwrapped times to times since 1970.
 
-    Frames of another type report the date (see `Clock.reference`).
+    The date comes from frames of another type (see `Clock.reference`).
 
     Args:
         sensor: the sensor that declares the clock.
@@ -168,9 +168,9 @@ class ClockEpoch:
 
         Args:
             reference: the date of a clock reading.
-            reading: the clock reading of the packet, ns.
-            time: the unwrapped time of the packet, ns.
-            host: the arrival time of the packet, ns; 0 if unknown.
+            reading: the clock reading of any packet, ns.
+            time: the unwrapped time of this packet, ns.
+            host: the arrival time of this packet, ns; 0 if unknown.
         """
         passed = self._fold_step(reference.reading_ns - reading)
         if host and reference.host_ns:
@@ -189,7 +189,7 @@ class ClockEpoch:
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
     def _fold_step(self, step: int) -> int:
-        """Return a step of the clock, reduced to at most half a wrap period, ns."""
+        """Return a step modulo the wrap period, at most half a period up or down, ns."""
         return (step + self._period_ns // 2) % self._period_ns - self._period_ns // 2
 
 
@@ -333,17 +333,17 @@ def part_times(
 
 
 def _has_fields_in_parts(clock: Clock, place: tuple[str, str]) -> bool:
-    return any(path.startswith(f"{_prefix(place)}.") for path in clock_fields(clock))
+    return any(path.startswith(f"{_get_prefix(place)}.") for path in clock_fields(clock))
 
 
-def _prefix(place: tuple[str, str]) -> str:
+def _get_prefix(place: tuple[str, str]) -> str:
     return ".".join(filter(None, place))
 
 
 def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -> Times:
     """Return the reading of the clock in each part, (k,) ns."""
     assert sensor.clock is not None
-    own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in clock_fields(sensor.clock))
+    own = tuple(path.removeprefix(f"{_get_prefix(place)}.") for path in clock_fields(sensor.clock))
     return _sum_fields(own, table, sensor.id)
 
 
@@ -366,7 +366,7 @@ def clock_fields(clock: Clock) -> tuple[str, ...]:
 def clock_terms(
     fields: tuple[str, ...], schema: Schema, sensor: str
 ) -> list[tuple[str, Any, Any, int]]:
-    """Return (path, step, zero, limit) of each field whose sum is the clock.
+    """Return (path, step, zero, limit) of the fields that add up to a clock.
 
     `step` is the ns per raw step, and `zero` is the ns at the raw value 0. Raw values up to `limit`
     cannot overflow; `limit` is 0 if `step` or `zero` is a fraction.

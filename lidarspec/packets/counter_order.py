@@ -170,7 +170,7 @@ class CounterOrder:
         The index also counts lost packets.
         """
         count = len(batch)
-        readings = self._read(batch, times)
+        readings = self._read_batch(batch, times)
         self._gaps.read(batch.table)
         index = np.empty(count, np.int64)
         odd_rows = [*self._find_unexpected(readings), count]
@@ -201,7 +201,7 @@ class CounterOrder:
         self._arrived = None
         self._gaps.forget()
 
-    def _read(self, batch: Batch, times: Times | None) -> CounterReadings:
+    def _read_batch(self, batch: Batch, times: Times | None) -> CounterReadings:
         """Return the counter and the clock of a batch."""
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
@@ -326,13 +326,14 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Return the place and the counter of a packet if counter and clock disagree.
+        """Correct the counter of a packet if it contradicts the clock.
 
-        The place follows from the clock, and the counter from the place. If this counter agrees
-        with the previous one that contradicted the clock, it was reset, and is kept.
+        The counter is kept if it continues the last counter that contradicted the clock, because
+        the sensor has then reset its counter.
 
         Returns:
-            How many places the packet is ahead of the newest packet, and the counter.
+            How many places the packet is ahead of the newest packet, by the clock; and the
+            corrected counter.
         """
         ahead = max(round(by_clock), 1)
         suspect = self._suspect

@@ -79,13 +79,13 @@ class Sector:
         """Return whether an angle is in the sector."""
         return forward_step(angle - self.start, self.direction) < self.width
 
-    def common(self, other: Sector) -> Sector | None:
+    def intersect(self, other: Sector) -> Sector | None:
         """Return the overlap of two sectors; None if they do not overlap."""
         offset = forward_step(other.start - self.start, self.direction)
         if offset < self.width:
             return Sector(other.start, min(self.width - offset, other.width), self.direction)
         if other.contains(self.start):
-            return other.common(self)
+            return other.intersect(self)
         return None
 
 
@@ -200,7 +200,7 @@ class SectorFinder:
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
-            common = gap.common(other)
+            common = gap.intersect(other)
             is_same = common is not None and common.width > MIN_COMMON_SHARE * max(
                 gap.width, other.width
             )
@@ -260,7 +260,7 @@ class MaskedGaps:
     def __init__(self, sensor: SensorDescription) -> None:
         self._reader = AngleReader(sensor)
         self._angles: Angles | None = None  # of the current packets
-        self._first_unnoted = 0  # the first row that `_finder` has not seen
+        self._first_unrecorded = 0  # the first row that `_finder` has not seen
         self._finder: SectorFinder | None = None
         self._losses = list[GapLoss]()  # at the gaps that `_finder` remembers
         self.masked = 0  # packets that the masked sector leaves out
@@ -273,7 +273,7 @@ class MaskedGaps:
             self._angles = self._reader.angles(table)
         else:
             self._angles = None
-        self._first_unnoted = 0
+        self._first_unrecorded = 0
         if self._angles is not None and self._finder is None:
             direction = self._reader.direction(table)
             self._finder = SectorFinder(direction) if direction else None
@@ -281,8 +281,8 @@ class MaskedGaps:
     def _record_angles_before(self, row: int) -> None:
         """Record that the angles of the current packets before a row are not masked."""
         if self._finder is not None and self._angles is not None:
-            self._finder.add_angles(self._angles[self._first_unnoted : row])
-        self._first_unnoted = row
+            self._finder.add_angles(self._angles[self._first_unrecorded : row])
+        self._first_unrecorded = row
 
     def forget(self) -> None:
         """Forget the masked sector, because the sensor may have been configured again."""

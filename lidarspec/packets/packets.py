@@ -44,8 +44,8 @@ class Packets:
         is_clocked: whether the packets are ordered by the sensor's clock, not by a counter.
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
             the last frame before each packet.
-        masked: (n,) the number of packets directly before each packet that a masked sector leaves
-            out; None if no masked sector was found.
+        masked: (n,) how many packets a masked sector leaves out directly before each packet; None
+            if no masked sector was found.
         stats: the counters of the decoder.
         backend: the back end that computes points: "auto", "numpy" or "jit".
     """
@@ -155,7 +155,7 @@ class Packets:
 
     @property
     def frame_type(self) -> str:
-        """The frame type of the packets, also for parts, whose `frame` is a path."""
+        """The frame type of the packets, or for parts, of the frames that contain them."""
         return self.frame.partition(".")[0]
 
     def count(self, array: str) -> NDArray[np.intp]:
@@ -418,8 +418,8 @@ def _nested_dtype(
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
     """Return the forms that a name has in the branches of a struct.
 
-    A form is a pair: whether the name is a value, not a struct; and the number of arrays of this
-    name, one in another.
+    A form is a pair: whether the name is a value, not a struct; and the number of array axes that
+    belong to this name.
     """
     parts = [
         (path, info)

@@ -283,7 +283,7 @@ class PacketStream:
         }
 
     def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
-        """Return the frames of the types that packets need as their state, by name."""
+        """Return the new frames that packets need as their state, by frame type."""
         selected: dict[str, list[OtherFrames]] = {}
         packet_count = 0
         for part in parts:
@@ -455,11 +455,9 @@ class OwnFrames:
 def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
     """Return the default data frame type of an input.
 
-    It is the configured type. Without a configured type it is the type of the first data frame
-    that arrived.
-
-    Returns None for a sensor without points, and as long as none of several possible types has
-    arrived.
+    If the sensor has several data frame types, and none is configured, this is the type of the
+    first data frame in the input. Returns None if the input has no data frame, and for a sensor
+    without points.
     """
     names = sensor.data_frames
     if not sensor.has_points:
