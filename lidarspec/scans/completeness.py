@@ -140,7 +140,7 @@ class OpenScan(NamedTuple):
         return self.lost > 0 or self.is_broken
 
     def add(self, packets: PacketCounts) -> OpenScan:
-        """Return the counts of the scan after adding packets, at least one."""
+        """Add one or more packets, and return the counts of the scan."""
         since = self.since
         if not self.packets:
             since = packets.times.item(0)

@@ -173,7 +173,7 @@ class ScanCutter:
                 continue
             start += row
             cuts.append(start)
-            if is_overdue and abs(self._step_ns(counts, start)) < self._limits.longest_ns / 2:
+            if is_overdue and abs(self._find_step_ns(counts, start)) < self._limits.longest_ns / 2:
                 packets.stats.unended = self._warning
             elif not is_overdue:
                 self._usual_packets *= 2  # in case the number was wrong
@@ -181,7 +181,7 @@ class ScanCutter:
             counts.share_with_next_scan(start)
         return np.array(cuts, np.intp)
 
-    def _step_ns(self, counts: PacketCounts, row: int) -> int:
+    def _find_step_ns(self, counts: PacketCounts, row: int) -> int:
         """Return the time from the previous packet to the packet of a row, ns."""
         if row:
             return counts.times.item(row) - counts.times.item(row - 1)

@@ -28,8 +28,8 @@ FIRST_CHUNK_ROWS = 64
 class Rotation:
     """Finds the direction in which an angle rotates.
 
-    At first, the direction is the one from the start to the current angle. After half a turn, it
-    only reverses when the angle has moved back by half a turn.
+    In the first half turn, the direction is that from the first angle to the current one. After
+    that, the direction reverses when the angle has moved back by half a turn.
     """
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class Rotation:
         """Reverse the direction, or set the first direction.
 
         Args:
-            total: the turns from the start to this step.
+            total: the turns from the start to the row at which the direction changes.
         """
         if self._direction:
             self._direction = -self._direction
@@ -151,10 +151,10 @@ class WrapDetector:
         else:
             behind_earlier = _reduce_to_turn(direction * (before - at), full)
         passed = np.flatnonzero(behind_earlier - behind > full / 2)
-        passes = self._select_armed(passed, behind, full)
+        passes = self._select_real_passes(passed, behind, full)
         return passes, 1 - (behind_earlier[passes] - behind[passes]) / full
 
-    def _select_armed(
+    def _select_real_passes(
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
         """Return the rows of the passes that jitter cannot have caused.

@@ -76,7 +76,7 @@ class EndFinder:
     def use_sector(self, sector: Sector, angle: float | None) -> None:
         """Cut scans in a masked sector from now on.
 
-        If the user has configured an angle to cut at, it stays in use.
+        An angle that the user has configured for cuts stays in use.
 
         Args:
             sector: the masked sector.
@@ -148,7 +148,7 @@ class EndFinder:
         """Return the scan ends at which the angle in a field passes the cut angle.
 
         Args:
-            passes: finds these rows; it knows the cut angle.
+            passes: detects passes of the cut angle.
             packets: the packets.
             points: the points of the packets.
         """

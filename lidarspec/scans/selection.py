@@ -118,7 +118,7 @@ class Selection:
     def needs_all_scans(self) -> bool:
         """Whether all earlier scans are needed to select a scan or to find its time.
 
-        This is the case if scans are counted, or if times are in UTC. A file is then not read in
+        This is the case if `is_counted` is true, or if times are in UTC. A file is then not read in
         pieces.
         """
         return self.is_counted or self.time == "utc"
@@ -149,8 +149,8 @@ class TimeSlice:
     """The selected times of one stream.
 
     Attributes:
-        first: the first time so far, ns; None if there was none.
-        last: the last time so far, ns; None if there was none.
+        first: the first time of the stream, ns; None before it is known.
+        last: the newest time of the stream, ns; None before it is known.
         ended: whether the end of the slice has passed, so that no later time is selected.
     """
 
@@ -170,8 +170,8 @@ class TimeSlice:
             if self.first is None:
                 self.first = int(at[0])
             self.last = int(at[-1])
-        begin = self.ns(self._times[0])
-        end = self.ns(self._times[1])
+        begin = self.to_ns(self._times[0])
+        end = self.to_ns(self._times[1])
         self.ended = end is not None and self.last is not None and self.last >= end
         if begin is None:
             wanted = np.ones(len(at), np.bool_)
@@ -206,9 +206,9 @@ class TimeSlice:
         """The time from the first time of the stream to the start of the slice, ns."""
         if self._times[0] is None:
             return 0
-        return (self.ns(self._times[0]) or 0) - (self.first or 0)
+        return (self.to_ns(self._times[0]) or 0) - (self.first or 0)
 
-    def ns(self, moment: Moment | None) -> int | None:
+    def to_ns(self, moment: Moment | None) -> int | None:
         """Return a limit of the slice in ns; None if there is no limit.
 
         A limit in seconds counts from the first time of the stream. Returns None until this time is

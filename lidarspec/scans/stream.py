@@ -114,7 +114,7 @@ class ScanStream:
         return scans
 
     def _add_ordered(self, batches: list[Packets]) -> list[Scan]:
-        """Return the scans that sorted packets complete."""
+        """Add sorted packets, and return the scans that they complete."""
         if self._masking is not None:
             batches = [marked for packets in batches for marked in self._masking.push(packets)]
         return self._add_marked(batches)
@@ -185,7 +185,7 @@ class ScanStream:
         return self._cut(packets, points, parts_before)
 
     def _cut(self, packets: Packets, points: EvaluatedPoints, parts_before: int) -> list[Scan]:
-        """Return the scans that points complete, and keep the points after them."""
+        """Divide points into scans, return these scans, and keep the remaining points."""
         cuts = self._cutter.cut(packets, points)
         indices = [cut.point for cut in cuts]
         if self._start is None:
