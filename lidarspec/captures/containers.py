@@ -213,7 +213,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         UsageError: for an archive with several captures, or if a library is missing.
     """
     for _ in range(MAX_NESTING):
-        packing = _packing(peek_head(file))
+        packing = _detect_packing(peek_head(file))
         if packing is None:
             break
         if packing is ZIP:
@@ -227,7 +227,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
     return file
 
 
-def _packing(start: bytes) -> Packing | None:
+def _detect_packing(start: bytes) -> Packing | None:
     return next(
         (packing for beginning, packing in PACKINGS.items() if re.match(beginning, start)), None
     )
@@ -289,7 +289,7 @@ def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
     """Return whether a file of an archive is a capture, a recording or compressed."""
     with archive.open(member) as file:
         start = file.read(HEAD_BYTES)
-    return is_capture(start) or start.startswith(MAGIC) or _packing(start) is not None
+    return is_capture(start) or start.startswith(MAGIC) or _detect_packing(start) is not None
 
 
 def refuse_container(path: str, start: bytes) -> None:

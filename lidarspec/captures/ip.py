@@ -210,7 +210,7 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
         if protocol == _FRAGMENT_PROTOCOL:
             raise NoDatagramError("malformed")
         if protocol != _UDP_PROTOCOL:
-            raise _other_protocol_error(protocol)
+            raise _make_protocol_error(protocol)
         source, destination, length, _ = _UDP_HEADER.unpack_from(packet.body, start)
     except struct.error:
         raise NoDatagramError("short") from None
@@ -310,7 +310,7 @@ def _find_ip(frame: bytes, link: int) -> int:
         return _skip_loopback_header(frame)
     if link in _ETHERTYPE_LINKS:
         type_offset, header_size = _ETHERTYPE_LINKS[link]
-        return _skip_ethertype(frame, _ethertype_at(frame, type_offset), header_size)
+        return _skip_ethertype(frame, _read_ethertype(frame, type_offset), header_size)
     raise NoDatagramError("link", _UNSUPPORTED_LINKS.get(link, f"link type {link}"))
 
 
@@ -327,7 +327,7 @@ def _skip_loopback_header(frame: bytes) -> int:
 def _skip_ethertype(frame: bytes, ethertype: int, start: int) -> int:
     """Return the offset of the IP header after an EtherType and VLAN tags."""
     while ethertype in _VLAN_ETHERTYPES:
-        ethertype = _ethertype_at(frame, start + 2)
+        ethertype = _read_ethertype(frame, start + 2)
         start += _VLAN_TAG_BYTES
     if ethertype in (_IPV4_ETHERTYPE, _IPV6_ETHERTYPE):
         return start
@@ -339,11 +339,11 @@ def _skip_ethertype(frame: bytes, ethertype: int, start: int) -> int:
     raise NoDatagramError("other", name)
 
 
-def _ethertype_at(frame: bytes, offset: int) -> int:
+def _read_ethertype(frame: bytes, offset: int) -> int:
     return frame[offset] << 8 | frame[offset + 1]
 
 
-def _other_protocol_error(protocol: int) -> NoDatagramError:
+def _make_protocol_error(protocol: int) -> NoDatagramError:
     return NoDatagramError("other", _PROTOCOL_NAMES.get(protocol, f"IP protocol {protocol}"))
 
 
@@ -356,7 +356,7 @@ def _parse_ipv4(frame: bytes, start: int) -> IpPacket:
     if header_size < _IPV4_HEADER.size or length < header_size:
         raise NoDatagramError("malformed")
     if protocol != _UDP_PROTOCOL:
-        raise _other_protocol_error(protocol)
+        raise _make_protocol_error(protocol)
     body_start = start + header_size
     body = frame[body_start : start + length]
     fragment = _make_fragment(
@@ -388,7 +388,7 @@ def _parse_ipv6(frame: bytes, start: int) -> IpPacket:
             more=bool(offset_and_flags & 1),
         )
     if protocol != _UDP_PROTOCOL and protocol not in _EXTENSION_PROTOCOLS:
-        raise _other_protocol_error(protocol)
+        raise _make_protocol_error(protocol)
     if fragment is not None and missing_bytes:
         raise NoDatagramError("short")
     return IpPacket(source, destination, protocol, body[offset:], body_start + offset, fragment)

@@ -407,7 +407,7 @@ class PcapngBlocks:
             if len(body) < 8 or len(self._interfaces) == _MAX_INTERFACES:
                 self._knows_all = False
                 raise DamagedRecordError
-            self._interfaces.append(_interface(self.order, body))
+            self._interfaces.append(_parse_interface(self.order, body))
         if kind in _PACKETS:
             return (
                 _parse_packet_block(self.order, kind, body, self._interfaces)
@@ -553,7 +553,7 @@ def _is_possible_length(length: int) -> bool:
     return length >= 12 and length % 4 == 0
 
 
-def _interface(order: str, body: bytes) -> Interface:
+def _parse_interface(order: str, body: bytes) -> Interface:
     link, snap_length = struct.unpack_from(order + "HxxI", body)
     ticks = 1_000_000
     offset = 0
@@ -665,24 +665,24 @@ class CaptureFormat(NamedTuple):
     size: Callable[[bytes | bytearray, int], int]
 
 
-def _pcapng_head(link: int) -> bytes:
+def _make_pcapng_head(link: int) -> bytes:
     """Return a section header and an interface with times in ns, little-endian."""
-    section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
-    return section + _block(
+    section = _make_block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    return section + _make_block(
         _INTERFACE,
         struct.pack("<HHIHHB3xHH", link, 0, MAX_PACKET_BYTES, _TIME_RESOLUTION, 1, 9, 0, 0),
     )
 
 
-def _pcapng_record(data: bytes, at: int) -> bytes:
+def _make_pcapng_record(data: bytes, at: int) -> bytes:
     if not 0 <= at < 1 << 63:
         raise UsageError(f"capture time {at} ns is before 1970")
     _refuse_size(data)
     head = struct.pack("<IIIII", 0, at >> 32, at & 0xFFFFFFFF, len(data), len(data))
-    return _block(ENHANCED_PACKET, head + data + bytes(-len(data) % 4))
+    return _make_block(ENHANCED_PACKET, head + data + bytes(-len(data) % 4))
 
 
-def _block(kind: int, body: bytes) -> bytes:
+def _make_block(kind: int, body: bytes) -> bytes:
     size = struct.pack("<I", len(body) + 12)
     return struct.pack("<I", kind) + size + body + size
 
@@ -691,8 +691,8 @@ def _block(kind: int, body: bytes) -> bytes:
 WRITINGS = {
     ".pcap": CaptureFormat(capture_head, packet_record, record_size),
     ".pcapng": CaptureFormat(
-        _pcapng_head,
-        _pcapng_record,
+        _make_pcapng_head,
+        _make_pcapng_record,
         lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little"),
     ),
 }

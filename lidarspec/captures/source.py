@@ -52,18 +52,18 @@ class BufferedInput:
 
     def __init__(self, file: BinaryIO, *, largest: int = MIN_BUFFER_BYTES) -> None:
         self._file = file
-        self._read_into = _read_into(file)
+        self._read_into = _get_read_function(file)
         self._largest = largest
         self._viewed_buffers: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
         self._last_view: weakref.ref[Any] | None = None
         self._data = memoryview(b"")
         self._bytes_dropped = 0  # bytes of the file before `storage`
         self.record = self.at = 0
-        self._use_buffer(np.empty(_first_size(file, largest) + SLACK_BYTES, np.uint8), 0)
+        self._use_buffer(np.empty(_choose_buffer_size(file, largest) + SLACK_BYTES, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the arguments for pickling. The copy continues at the same offset."""
-        return _source_at, (self._file, self._largest, self.offset)
+        """Return the arguments for pickling; the unpickled reader has the same offset."""
+        return _open_source_at, (self._file, self._largest, self.offset)
 
     @property
     def stop(self) -> int:
@@ -79,7 +79,7 @@ class BufferedInput:
 
         Both sources share the position of the file, so call `seek` before using this source again.
         """
-        return _source_at(self._file, MIN_BUFFER_BYTES, offset)
+        return _open_source_at(self._file, MIN_BUFFER_BYTES, offset)
 
     def seek(self, offset: int) -> None:
         """Continue at an offset of a seekable file."""
@@ -103,13 +103,13 @@ class BufferedInput:
 
         At the end of the input, returns fewer bytes.
         """
-        self._has(size)
+        self._fill_buffer(size)
         return self._data[self.at : self.at + size]
 
     def begin_record(self) -> bool:
         """Mark the start of a record; return False at the end of the input."""
         self.record = self.offset
-        return self._has(1)
+        return self._fill_buffer(1)
 
     def take(self, size: int) -> bytes:
         """Return the next `size` bytes, and advance.
@@ -119,7 +119,7 @@ class BufferedInput:
         Raises:
             TruncatedError: if fewer bytes are left.
         """
-        if not self._has(size):
+        if not self._fill_buffer(size):
             raise TruncatedError
         self.at += size
         return bytes(self._data[self.at - size : self.at])
@@ -132,7 +132,7 @@ class BufferedInput:
         """
         while size:
             step = min(size, MIN_BUFFER_BYTES)
-            if not self._has(step):
+            if not self._fill_buffer(step):
                 raise TruncatedError
             self.at += step
             size -= step
@@ -142,7 +142,7 @@ class BufferedInput:
 
         This may replace `storage` and change `at`.
         """
-        return self._has(len(self._data) - self.at + 1)
+        return self._fill_buffer(len(self._data) - self.at + 1)
 
     def view(self) -> NDArray[np.uint8]:
         """Return the bytes in the buffer, (n,), uint8, read-only.
@@ -154,7 +154,7 @@ class BufferedInput:
         self._last_view = weakref.ref(array)
         return array
 
-    def _has(self, size: int) -> bool:
+    def _fill_buffer(self, size: int) -> bool:
         have = len(self._data) - self.at
         if have >= size:
             return True
@@ -212,7 +212,7 @@ class BufferedInput:
         self.at = 0
 
 
-def _source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
+def _open_source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
     """Return a source of a seekable file that starts at an offset."""
     file.seek(offset)
     source = BufferedInput(file, largest=largest)
@@ -220,7 +220,7 @@ def _source_at(file: BinaryIO, largest: int, offset: int) -> BufferedInput:
     return source
 
 
-def _read_into(file: BinaryIO) -> Callable[[memoryview], int | None]:
+def _get_read_function(file: BinaryIO) -> Callable[[memoryview], int | None]:
     """Return a function that reads the available bytes into a buffer.
 
     For a buffered pipe this is `readinto1`, because `readinto` blocks until the buffer is full.
@@ -229,16 +229,16 @@ def _read_into(file: BinaryIO) -> Callable[[memoryview], int | None]:
         return file.readinto1
     if isinstance(file, io.RawIOBase):
         return file.readinto
-    return functools.partial(_copy, file)
+    return functools.partial(_copy_bytes, file)
 
 
-def _copy(file: BinaryIO, buffer: memoryview) -> int:
+def _copy_bytes(file: BinaryIO, buffer: memoryview) -> int:
     data = file.read(len(buffer))
     buffer[: len(data)] = data
     return len(data)
 
 
-def _first_size(file: BinaryIO, largest: int) -> int:
+def _choose_buffer_size(file: BinaryIO, largest: int) -> int:
     try:
         status = os.fstat(file.fileno())
     except (AttributeError, OSError):
