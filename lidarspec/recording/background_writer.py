@@ -234,7 +234,9 @@ class BackgroundWriter:
         self._raise_failure()
 
     def wait_for_room(self) -> None:
-        """Wait until there is memory for more records; for sources that can wait.
+        """Wait until there is memory for more records.
+
+        Readers of sources that can wait, such as files, call this regularly.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
@@ -255,7 +257,7 @@ class BackgroundWriter:
         """Remove a closed file that contains no records.
 
         Returns:
-            False if an existing file had the same path; this file was kept.
+            False if the path still has a file, because an older file was kept.
         """
         if not self._file.replaces:
             with contextlib.suppress(OSError):

@@ -7,8 +7,8 @@ A recording is a sequence of independent records. The first is the header, in JS
     4       1     kind: 0 header, 1 received, 2 sent, 3 event
     5       1     flags: 1 a datagram, 2 the line was interrupted before it,
                   4 the line was silent before it
-    6       1     a, bytes of addresses
-    7       2     n, bytes of data
+    6       1     a, the length of the addresses in bytes
+    7       2     n, the length of the data in bytes
     9       8     arrival time, ns since 1970, signed; the lowest number: unknown
     17      a     sender, receiver: each a length byte, that many bytes of address,
                   and, if there are any, the port in 2 bytes
@@ -106,7 +106,7 @@ class Header:
     def to_json(self) -> bytes:
         """Return the header as JSON. Options that JSON does not support become text."""
         return json.dumps(
-            {item.name: getattr(self, item.name) for item in fields(self)}, default=_plain
+            {item.name: getattr(self, item.name) for item in fields(self)}, default=_to_plain
         ).encode()
 
     def known_sensor(self, folder: Path) -> Sensor:
@@ -167,7 +167,7 @@ def read_header(data: bytes) -> Header:
     return Header(**entries)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, Learned):
@@ -216,7 +216,7 @@ def pack_record(
         UsageError: if the data or an address is too long, or a port or time is invalid.
     """
     if sender or receiver:
-        addresses = _endpoint(sender) + _endpoint(receiver)
+        addresses = _pack_endpoint(sender) + _pack_endpoint(receiver)
     else:
         addresses = b""
     try:
@@ -324,7 +324,7 @@ class Recording(ClosingContext):
                     high = middle
                 else:
                     low = record[1]
-            self._move(low)
+            self._move_to(low)
         return low > here
 
     def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
@@ -332,7 +332,7 @@ class Recording(ClosingContext):
 
         Records without a time are ignored.
         """
-        self._move(start)
+        self._move_to(start)
         while self.offset < stop and self._fill_window(1):
             size = self._find_valid_length()
             place = self._place
@@ -345,7 +345,7 @@ class Recording(ClosingContext):
                 self._skip_to_mark()
         return None
 
-    def _move(self, offset: int) -> None:
+    def _move_to(self, offset: int) -> None:
         self._file.seek(offset)
         self._window = b""
         self._place = 0
@@ -465,7 +465,7 @@ def _unpack_record(record: bytes) -> tuple[int, Record]:
 
 
 @lru_cache(maxsize=256)
-def _endpoint(address: Address | None) -> bytes:
+def _pack_endpoint(address: Address | None) -> bytes:
     if address is None or not address[0]:
         return b"\0"
     host = address[0].encode()

@@ -103,7 +103,7 @@ class Recorder(BackgroundWriter):
         baud: int | None = None,
         overwrite: bool = False,
     ) -> None:
-        self.header = _header(sensor, str(source), datagrams=datagrams, baud=baud)
+        self.header = _make_header(sensor, str(source), datagrams=datagrams, baud=baud)
         super().__init__(path, _record_size, overwrite=overwrite)
         self._put(MAGIC + pack_record(HEADER, self.header.to_json(), self.header.wall_ns))
         try:
@@ -138,10 +138,10 @@ class Recorder(BackgroundWriter):
         Args:
             at: the time, ns since 1970; by default now.
         """
-        self._put(_event(name, time.time_ns() if at is None else at, details))
+        self._put(_make_event(name, time.time_ns() if at is None else at, details))
 
     def _make_drop_record(self, dropped: int) -> bytes:
-        return _event("dropped", time.time_ns(), {"records": dropped})
+        return _make_event("dropped", time.time_ns(), {"records": dropped})
 
 
 class PcapRecorder(BackgroundWriter):
@@ -211,17 +211,17 @@ class FrameRecorder(BackgroundWriter):
         Bytes that may belong to an incomplete frame are kept for the next call.
         """
         for item in frames:
-            self._skip(item.offset - self._base)
-            self._packet(len(item.data), item.at or self._at)
-        self._skip(len(self._held) - self._decoder.stats.pending)
+            self._write_gap(item.offset - self._base)
+            self._write_packet(len(item.data), item.at or self._at)
+        self._write_gap(len(self._held) - self._decoder.stats.pending)
 
-    def _skip(self, size: int) -> None:
+    def _write_gap(self, size: int) -> None:
         while size > 0:
             part = min(size, MAX_GAP_BYTES)
-            self._packet(part, self._at)
+            self._write_packet(part, self._at)
             size -= part
 
-    def _packet(self, size: int, at: int) -> None:
+    def _write_packet(self, size: int, at: int) -> None:
         self._put(self._writing.record(bytes(self._held[:size]), at), size)
         del self._held[:size]
         self._base += size
@@ -328,7 +328,7 @@ def get_recorder(
     return recorder, True
 
 
-def _header(
+def _make_header(
     sensor: Sensor | str | None, source: str, *, datagrams: bool | None, baud: int | None
 ) -> Header:
     if isinstance(sensor, str) and sensor and datagrams is None:
@@ -359,7 +359,7 @@ def _header(
     )
 
 
-def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
+def _make_event(name: str, at: int, details: dict[str, Any]) -> bytes:
     return pack_record(EVENT, json.dumps({"event": name, **details}, default=str).encode(), at)
 
 
