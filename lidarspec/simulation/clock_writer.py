@@ -188,7 +188,7 @@ class ClockWriter:
         write_raw(table, finest.path, _clip(info, finest_raw))
 
     def _round(self, readings: Times) -> Times:
-        """Return readings rounded to the resolution, if it is a whole number of ns."""
+        """Round readings to the resolution, if this is a whole number of ns."""
         step = round(self.resolution_ns)
         if step != self.resolution_ns or step < 2:
             return readings
@@ -422,9 +422,9 @@ class FrameClock:
 
 
 def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
-    """Return the clock of a frame type; None if it has no clock.
+    """Return the clock to write into frames of a type; None if they have no clock.
 
-    Frames that provide the date for the clock of the data frames have a clock as well.
+    Frames that report the date for the sensor's clock also contain this clock.
     """
     clock = find_clock(sensor, frame)
     shared = sensor.clock
@@ -568,7 +568,13 @@ class StatusWriter:
     def _calculate(
         self, table: CompiledTable, paths: Sequence[str], raws: Sequence[NDArray[np.int64]]
     ) -> NDArray[np.float64]:
-        """Return the status for each combination of raw values of some fields, (n,)."""
+        """Return the status for n combinations of field values, (n,).
+
+        Args:
+            table: a table; its first frame has the values of all other fields.
+            paths: paths of the fields.
+            raws: the raw values of each field, (n,) each.
+        """
         source = self._status.source
         assert callable(source)
         frames = _repeat_first(table, len(raws[0]))

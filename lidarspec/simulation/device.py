@@ -62,10 +62,10 @@ REQUEST_TIMEOUT_NS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class ReceivedCommand:
-    """A received command, with the raw values of the fields of its frame by path.
+    """A received command, with the raw values in its frame by field path.
 
-    The texts that match placeholders of the command's templates are among the values, by the name
-    in braces, for example "{handle}".
+    The values include the texts that match placeholders of the command. The key of such a text is
+    the name of the placeholder in braces, for example "{handle}".
     """
 
     name: str
@@ -199,10 +199,10 @@ class ReplyMaker:
         if isinstance(answer, int | float):
             return ReplyPart(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
-        given = {**self._matching_values(name, request), **values}
+        given = {**self._find_reply_values(name, request), **values}
         return ReplyPart(name, self._frames.make(name, given, now))
 
-    def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
+    def _find_reply_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
         """Return a reply's fixed values, and the values that it repeats from its request.
 
         The values are physical.
@@ -266,7 +266,7 @@ def _rank(command: Command) -> tuple[int, int]:
 def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
     """Return a decoder for the frames that a link transmits to the sensor."""
     frames = {
-        name: _as_incoming(frame)
+        name: _make_incoming(frame)
         for name, frame in sensor.frames.items()
         if frame.direction == "out"
     }
@@ -274,7 +274,7 @@ def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
 
 
 @functools.lru_cache(maxsize=256)
-def _as_incoming(frame: Frame) -> Frame:
+def _make_incoming(frame: Frame) -> Frame:
     """Return an outgoing frame type as an incoming type, as the sensor receives it.
 
     The result is cached, so that its layout is computed only once.
@@ -466,7 +466,7 @@ class SimulatedDevice:
         """Return the link of this name with its faults.
 
         TCP and HTTP lose no bytes, so these links have no faults. A byte stream other than the data
-        link is TCP.
+        link is treated as TCP.
         """
         link = self.sensor.links[name]
         stream = not is_datagram(link)
@@ -549,7 +549,7 @@ class SimulatedDevice:
         self._switch_plug(now)
         if self.present:
             for request in self._replies.find_requests(data, now, link):
-                self._reply(request, self._clock(now))
+                self._reply(request, self._find_device_time(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
         """Return the data that is due until `now`, in order, as (link, bytes).
@@ -566,7 +566,7 @@ class SimulatedDevice:
         self._switch_plug(now)
         if not self.present:
             return []
-        self._time = self._clock(now) + (MAX_BATCH_NS if math.isinf(self.rate) else 0)
+        self._time = self._find_device_time(now) + (MAX_BATCH_NS if math.isinf(self.rate) else 0)
         packets: dict[str, list[Packet]] = {}
         for link, frame, data in self._take_due(self._time):
             packets.setdefault(link, []).append((frame, data))
@@ -612,7 +612,7 @@ class SimulatedDevice:
             return None
         return self._powered + math.ceil(max(times) / self.rate)
 
-    def _clock(self, now: int) -> float:
+    def _find_device_time(self, now: int) -> float:
         """Return the time of the device, ns since power-on.
 
         With an infinite rate, it advances when data is requested.

@@ -1,8 +1,8 @@
-"""Make frames from physical values by path; all other fields are 0.
+"""Make frames from the physical values of some fields.
 
-Constants and checksums are filled in. Unlike `build`, `FrameMaker` makes many frames at once, and
-requires values for only some fields, for example the fields that a `sweep` returns. As in a
-decoder, the values of header fields, such as counts, determine the layout of a frame.
+A `sweep` returns such values. Constants and checksums are filled in; all other fields are 0. Unlike
+`build`, `FrameMaker` makes many frames at once. The values of header fields, such as counts,
+determine the layout of a frame, as they do in a decoder.
 """
 
 from __future__ import annotations

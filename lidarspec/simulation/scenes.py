@@ -97,7 +97,7 @@ class Mover:
     def at(self, time: Value) -> tuple[Vector, Vector]:
         """Return the lowest and highest corner at a time, in metres.
 
-        x and y have the shape of `time`.
+        x and y have the shape of `time`; z is a number.
         """
         points = np.array(self.path, np.float64)
         along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])

@@ -1,4 +1,4 @@
-"""Make the frames that a sensor would send from a scene, and their times.
+"""Make the frames that a sensor would send in a scene, and calculate their times.
 
 A block of packets is made in four steps:
 
@@ -199,7 +199,7 @@ class Measurement:
                 blind = ~np.isclose(ranges, before)
             before = ranges
             ranges = np.where(blind, 0, ranges)
-            values = self._values(table, beams, ranges, steps)
+            values = self._to_raw_values(table, beams, ranges, steps)
             if written and all(np.array_equal(written[path], raw) for path, raw in values.items()):
                 break
             written = values
@@ -225,7 +225,7 @@ class Measurement:
             arrays, axes, _, shape = align_points(parts, batch)
         depth = len(shape)
         full = {
-            name: _with_depth(np.asarray(array, np.float64), depth)
+            name: _add_leading_axes(np.asarray(array, np.float64), depth)
             for name, array in zip(parts, arrays, strict=True)
         }
         places = None
@@ -267,10 +267,10 @@ class Measurement:
             np.broadcast_to(metres, np.broadcast_shapes(metres.shape, beams.range.shape))
         )
 
-    def _values(
+    def _to_raw_values(
         self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
-        """Return the raw values of the fields that give these ranges, by path."""
+        """Convert ranges to raw values of fields, and return them by path."""
         if self._encode is not None:
             polar = Polar(
                 ranges,
@@ -291,7 +291,7 @@ class Measurement:
         return raw_values
 
     def _find_max_raw(self, table: CompiledTable, path: str) -> float:
-        """Return the largest raw value of a field that can be sent."""
+        """Return the largest raw value that can be sent in a field."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
         leaves = [
@@ -332,8 +332,8 @@ class Measurement:
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
         """Return the fields that `points` converts to ranges by a linear function.
 
-        Fields in metres may have an offset. For all other fields, only array elements without a
-        unit are considered, and ranges must be proportional to them.
+        Only fields in metres, and array elements without a unit, are tried. To elements without a
+        unit, the ranges must be proportional.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -421,15 +421,17 @@ class PointPlacement(Measurement):
         self, table: CompiledTable, numbers: Sequence[int], scene: Scene, times: Floats
     ) -> None:
         beams = self.beams(table)
-        azimuth, elevation = self._directions(numbers, beams.range.shape[1:])
+        azimuth, elevation = self._get_directions(numbers, beams.range.shape[1:])
         beams = replace(beams, azimuth=azimuth, elevation=elevation)
         ranges = self._measure(beams, scene, times)
-        for path, raw in self._values(table, beams, ranges, []).items():
+        for path, raw in self._to_raw_values(table, beams, ranges, []).items():
             write_raw(table, path, raw)
         if self._intensity and not self._encode:
             self._fill_intensity(table, _select_inner(ranges, self._targets[0].inner) * 1000)
 
-    def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    def _get_directions(
+        self, numbers: Sequence[int], shape: tuple[int, ...]
+    ) -> tuple[Floats, Floats]:
         """Return the declared azimuths and elevations of packets, (n, *shape) each.
 
         Packets with fewer points are padded with nan.
@@ -458,11 +460,11 @@ class PointPlacement(Measurement):
                 directions[:, index][(slice(None), *corner)] = stacked
         return directions[0], directions[1]
 
-    def _values(
+    def _to_raw_values(
         self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
         if self._encode is not None:
-            return super()._values(table, beams, ranges, steps)
+            return super()._to_raw_values(table, beams, ranges, steps)
         raw_values: dict[str, NDArray[Any]] = {}
         aims = ranges * beams.unit()
         for inner in dict.fromkeys(target.inner for target in self._targets):
@@ -596,7 +598,7 @@ def _select_inner(array: Floats, inner: tuple[int, ...]) -> Floats:
     return np.asarray(array[corner])
 
 
-def _with_depth(array: Floats, depth: int) -> Floats:
+def _add_leading_axes(array: Floats, depth: int) -> Floats:
     return array.reshape(*(1,) * (depth - array.ndim), *array.shape)
 
 
@@ -714,7 +716,7 @@ class RestingImu:
             )
         return np.stack(
             [
-                np.broadcast_to(_with_depth(np.asarray(array, np.float64), len(shape)), shape)
+                np.broadcast_to(_add_leading_axes(np.asarray(array, np.float64), len(shape)), shape)
                 for array in arrays
             ]
         )
@@ -753,17 +755,17 @@ class PacketTimes:
         if self._rate:
             return np.asarray(np.rint(np.arange(len(table)) * 1e9 / self._rate), np.int64)
         if self._sensor.clock:
-            return self._by_clock(table)
+            return self._read_clock_times(table)
         if self._point:
             steps = beams().counts * self._point * 1e9
         else:
             if self._baud:
-                steps = _sizes(table) * BITS_PER_BYTE * 1e9 / self._baud
+                steps = _get_frame_sizes(table) * BITS_PER_BYTE * 1e9 / self._baud
             else:
                 steps = np.zeros(len(table))
         return np.asarray(np.rint(np.concatenate([[0], np.cumsum(steps[:-1])])), np.int64)
 
-    def _by_clock(self, table: CompiledTable) -> Times:
+    def _read_clock_times(self, table: CompiledTable) -> Times:
         assert self._sensor.clock is not None
         steps = np.diff(clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))))
         if self._sensor.clock.wraps_at:
@@ -788,7 +790,7 @@ def _seconds_per_point(beams: Beams) -> float:
     return 0.0
 
 
-def _sizes(table: CompiledTable) -> NDArray[np.intp]:
+def _get_frame_sizes(table: CompiledTable) -> NDArray[np.intp]:
     sizes = np.zeros(len(table), np.intp)
     for group in table.groups:
         sizes[group.where] = group.layout.size
@@ -801,8 +803,8 @@ class PacketBlock:
 
     Attributes:
         frames: the bytes of each packet.
-        times: time of each packet, and of the packet after the last, since the first packet of the
-            block, (n + 1,) int64 ns.
+        times: time of each packet since the first packet of the block, (n + 1,) int64 ns. The last
+            entry is the time of the packet after the block.
     """
 
     frames: list[bytes]
@@ -837,9 +839,9 @@ class FrameSimulation:
         self._frame = frame
         self._sweep = sweep
         self._maker = FrameMaker(sensor, frame)
-        self._blocked_values = self._angle_values(sweep(1)) if blocked else {}
-        length = len(self._maker.frame(self._sweep_values(range(1))[0]))
-        swept = self._sweep_values(
+        self._blocked_values = self._select_angle_values(sweep(1)) if blocked else {}
+        length = len(self._maker.frame(self._call_sweep(range(1))[0]))
+        swept = self._call_sweep(
             range(min(MAX_PROBED_PACKETS, max(MAX_PROBED_BYTES // length, MIN_PROBED_PACKETS)))
         )
         table = self._maker.table(swept)
@@ -851,7 +853,7 @@ class FrameSimulation:
         self._measurement = Measurement.of(
             sensor, frame, self._with_points(table), {path for values in given for path in values}
         )
-        self._pace = PacketTimes(sensor, frame, table, self._beams(table))
+        self._pace = PacketTimes(sensor, frame, table, self._find_beams(table))
         self._rest = (
             RestingImu(sensor, frame, {path for values in swept for path in values})
             if sensor.frames[frame].imu
@@ -866,7 +868,7 @@ class FrameSimulation:
         Raises:
             UsageError: if it cannot be written.
         """
-        table = self._maker.table(self._sweep_values(range(CLOCK_PROBE_PACKETS)))
+        table = self._maker.table(self._call_sweep(range(CLOCK_PROBE_PACKETS)))
         return FrameClock(self._sensor, self._frame, table)
 
     def block(
@@ -890,8 +892,8 @@ class FrameSimulation:
             timeline: the faults of the sensor's clock; None for no faults.
         """
         numbers = range(start, start + count + EXTRA_PACKETS)
-        table = self._maker.table(self._sweep_values(numbers))
-        times = self._pace.times(table, functools.partial(self._beams, table))
+        table = self._maker.table(self._call_sweep(numbers))
+        times = self._pace.times(table, functools.partial(self._find_beams, table))
         seconds = since + times / 1e9
         measured = self._with_points(table)
         if isinstance(measured, PartRows):
@@ -917,7 +919,7 @@ class FrameSimulation:
             return PartRows(table, self._parts)
         return table
 
-    def _beams(self, table: CompiledTable) -> Beams:
+    def _find_beams(self, table: CompiledTable) -> Beams:
         """Return the beams of the frames, or of the parts in the frames."""
         measured = self._with_points(table)
         beams = self._measurement.beams(measured)
@@ -926,12 +928,12 @@ class FrameSimulation:
         counts = np.bincount(measured.which, beams.counts, len(table))
         return replace(beams, counts=counts.astype(np.intp))
 
-    def _sweep_values(self, numbers: range) -> list[Mapping[str, Any]]:
+    def _call_sweep(self, numbers: range) -> list[Mapping[str, Any]]:
         """Return the values that the sweep gives for packets."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
             return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
-    def _angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def _select_angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return those values of a frame that change only because the rotor turns."""
         fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
