@@ -179,7 +179,7 @@ class Column(NDArrayOperatorsMixin):
         return function(*plain, **kwargs)
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Column:
-        """Return `function` of the values, which are first aligned by their axes.
+        """Apply a function to the values, after aligning the values by their axes.
 
         Plain arrays align by their last axes, as in NumPy.
         """
@@ -271,14 +271,13 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """For each value of the column, return the row of a table with this number.
+        """Return, for each value of the column, the row of a table at this index.
 
-        The result has one more axis, for the k numbers of a row: the axis of the array in the frame
-        that has k elements.
+        The k numbers of a row are on an additional axis: the axis of the array in the frame that
+        has k elements.
 
         Args:
-            table: (m + 1, k); the rows for the values from 0 to m - 1, and a row of nan for all
-                other values.
+            table: (m + 1, k); the last row is nan, and is used for values outside of 0 to m - 1.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -648,13 +647,11 @@ def align_points(
 
     Returns:
         The arrays, the names of their axes, the smallest `ready` of the columns (see `Column`), and
-        the common shape
-        of the arrays, (n, ...).
+        the common shape of the arrays, (n, ...).
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
-            or if plain arrays
-        vary along an axis, but no field does.
+            or if plain arrays vary along an axis, but no field does.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),
