@@ -130,9 +130,9 @@ class _DatagramBatch:
             mode: the search state, which determines the active types.
 
         Returns:
-            The datagrams as frames, and for each invalid datagram the reason. The reason is a
-            status, 0 if the datagram
-            has the constants of no type, or `PLUGIN` if it must be checked alone.
+            The datagrams as frames, and the reason why each invalid datagram is not a frame. The
+            reason is a status, 0 if the datagram has the constants of no type, or `PLUGIN` if it
+            must be checked alone.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)

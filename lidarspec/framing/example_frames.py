@@ -129,7 +129,7 @@ def draw_row(
         row = _find_encodable(sensor, frame, rows)
         if row is not None:
             return layout, row
-    return _make_along_sweep(sensor, frame, engine, source, drawn, tries)
+    return _draw_from_sweep(sensor, frame, engine, source, drawn, tries)
 
 
 def make_random_header(
@@ -143,9 +143,9 @@ def make_random_header(
         drawn: functions that draw the raw values of certain fields, by path.
 
     Raises:
-        SpecError: if hundreds of random headers lead to no layout.
+        SpecError: if hundreds of random headers have no layout.
     """
-    keys = sorted(switch_keys(engine.frame.tree))
+    keys = sorted(iter_switch_keys(engine.frame.tree))
     for _ in range(MAX_HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _draw_header(engine.frame, source, drawn, keys)
@@ -172,7 +172,7 @@ def _draw_header(
                 values[unknown.leaf.info.path] = _draw_value(source, unknown.leaf, keys)
 
 
-def switch_keys(root: Node) -> Iterator[int]:
+def iter_switch_keys(root: Node) -> Iterator[int]:
     """Yield the integer keys of all `Select` nodes, except for keys that have a label."""
     for node in nodes(root):
         if isinstance(node, Select):
@@ -348,7 +348,7 @@ def _find_encodable(
     return next((row for row in rows if encode(row.tobytes()) is not None), None)
 
 
-def _make_along_sweep(
+def _draw_from_sweep(
     sensor: SensorDescription,
     frame: str,
     engine: Codec,
@@ -420,7 +420,7 @@ def _store_drawn(
 
 
 def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return a function for each header field of a sweep, which returns its raw value.
+    """Return the raw values of the header fields of a sweep as functions, by path.
 
     Args:
         values: the values of the sweep in units, by path.

@@ -74,7 +74,7 @@ class CandidateChecker:
 
     Attributes:
         checks: the conditions in the arguments `met` and `checks`.
-        is_complete: whether these are all conditions on values, so that the plausibility function
+        is_complete: whether `checks` contains all conditions, so that the plausibility function
             need not be called.
     """
 
@@ -179,7 +179,7 @@ def _check_valid_parts(
     errors: list[PluginError],
     sums: Sums | None,
 ) -> None:
-    """Check the parts of the candidates that are valid so far.
+    """Check the parts of the valid candidates, and set the status of these candidates.
 
     The parts have to fill their region, and their checksums have to be correct.
     """
@@ -279,7 +279,7 @@ class StructConditions:
         return [self._check(condition, leaves) for condition, leaves in every]
 
     def make_checks(self, layout: Layout) -> list[Check] | None:
-        """Return the checks on rows of bytes that frames of a layout have to pass.
+        """Return the checks that frames of a layout have to pass.
 
         Returns None if the plausibility function has to be called.
         """

@@ -224,10 +224,10 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
 
 
 def _may_have_constants(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether any row has the constants of a second frame type.
+    """Return whether any row has the constants of a frame type.
 
     Args:
-        kind: the index of the second type.
+        kind: the index of this type.
         other: the index of the type that the first row matches.
     """
     if are_contradictory(framing.marks[kind], framing.marks[other]):

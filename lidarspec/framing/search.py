@@ -240,10 +240,10 @@ def count_rejected(
     candidates: Candidates,
     stays: list[tuple[int, str | None]],
 ) -> None:
-    """Count the rejected candidates outside the frames.
+    """Count the rejected candidates outside of the accepted frames.
 
-    At the first byte of a frame, rejected candidates of types that are declared earlier count as
-    well.
+    At the first byte of an accepted frame, rejected candidates of types that are declared earlier
+    count as well.
 
     Args:
         stays: for each stretch with the same active types, its offset and the value of

@@ -116,8 +116,8 @@ class LayoutFamilies:
             return None
         constants = tuple(sorted(layout.constants.items()))
         lengths = tuple(sorted(layout.held.items()))
-        seals = tuple(_seal_key(seal, layout.size) for seal in layout.seals)
-        tests = tuple(_test_key(check) for check in checker.checks)
+        seals = tuple(_make_seal_key(seal, layout.size) for seal in layout.seals)
+        tests = tuple(_make_test_key(check) for check in checker.checks)
         key = constants, lengths, seals, tests, checker.is_complete
         if key not in self._numbers:
             if len(self._numbers) >= MAX_KEYS:
@@ -131,7 +131,7 @@ def _ignores_trailing_zeros(seal: Seal) -> bool:
     return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
 
 
-def _seal_key(seal: Seal, size: int) -> Hashable:
+def _make_seal_key(seal: Seal, size: int) -> Hashable:
     *spans, (start, stop) = seal.spans
     leaves = tuple(
         (_find_checksum_position(leaf, seal, size), leaf.size, leaf.shape, leaf.wire, leaf.elements)
@@ -150,7 +150,7 @@ def _find_checksum_position(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int
     return ("start", leaf.offset)
 
 
-def _test_key(check: Check) -> Hashable:
+def _make_test_key(check: Check) -> Hashable:
     if isinstance(check, LookupCondition):
         return (check.table, check.offset, check.shape[1:], check.strides)
     return None

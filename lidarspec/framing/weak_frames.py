@@ -132,20 +132,20 @@ def find_runs(
     ends_here = count
     waits = count + 1
     stops = frames.starts + frames.sizes
-    rows, is_found = _find(frames.starts, stops)
+    rows, is_found = _find_rows(frames.starts, stops)
     following = np.full(count + 2, ends_here, np.intp)
     following[-1] = waits
     own = following[:count]  # a view
     own[is_found] = rows[is_found]
     if not final:
         own[(stops >= len(frames.buffer)) | (is_found & is_short[rows])] = waits
-    rows, is_found = _find(earlier.starts, stops)
+    rows, is_found = _find_rows(earlier.starts, stops)
     own[is_found] = np.where(earlier.status[rows[is_found]] == SHORT, waits, ends_here)
     own[is_short] = waits
     return WeakRuns(frames, following, confirm, is_single)
 
 
-def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
+def _find_rows(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Return the rows of wanted values in an ascending array, and whether each exists."""
     if not len(values):
         return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)

@@ -35,7 +35,7 @@ from lidarspec.frames.layout import Leaf
 from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.framing.example_frames import LOW_NUMBERS, draw_frame, switch_keys
+from lidarspec.framing.example_frames import LOW_NUMBERS, draw_frame, iter_switch_keys
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scan import Scan
@@ -403,7 +403,7 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
     if info.allowed:
         return st.sampled_from(info.allowed)
     low, high = info.limits
-    keys = switch_keys(sensor.frames[frame].tree)
+    keys = iter_switch_keys(sensor.frames[frame].tree)
     named = sorted({key for key in (*info.labels, *keys) if low <= key <= high})
     numbers = _mostly_low(low, high)
     if named:
