@@ -101,7 +101,7 @@ def _merge_values(
     """Return the fields of `value`; fields in `values` override them.
 
     Raises:
-        UsageError: for a path without the index of an array.
+        UsageError: if a path in `values` leads to an array element, but has no index.
     """
     nested = {name: new for name, new in values.items() if not name.isidentifier()}
     merged: dict[str, Any] = {**value, **values}
@@ -138,7 +138,7 @@ class _ValueChecker:
         if info is not None and info.adapter is not None:
             return value  # the adapter of the field encodes it
         if isinstance(value, Mapping):
-            return self._mapping(value, path, shown)
+            return self._check_mapping(value, path, shown)
         if info is not None and info.kind == "bytes" and isinstance(value, bytes | bytearray):
             return bytes(value)
         if isinstance(value, np.ndarray):
@@ -152,9 +152,9 @@ class _ValueChecker:
             return elements
         if info is None or value is None:
             return value
-        return self._number(info, value, shown)
+        return self._to_raw_number(info, value, shown)
 
-    def _mapping(self, value: Mapping[str, Any], path: str, shown: str) -> Container:
+    def _check_mapping(self, value: Mapping[str, Any], path: str, shown: str) -> Container:
         checked = Container()
         for name, element in value.items():
             if name.startswith("_"):
@@ -183,7 +183,7 @@ class _ValueChecker:
                 f" {numbers!r:.60}"
             ) from None
 
-    def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:
+    def _to_raw_number(self, info: FieldInfo, value: Any, shown: str) -> Any:
         if isinstance(value, np.generic):
             value = value.item()
         if isinstance(value, str | WireNaN | bytes):

@@ -250,9 +250,7 @@ def _insert_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> s
 
 
 def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
-    """Return the fault of a frame without an end.
-
-    Either the bytes end too early, or the header leads to no layout.
+    """Return the fault of a truncated frame, or of a header without a layout.
 
     Raises:
         Exception: any error of an expression of the struct.
@@ -295,7 +293,7 @@ def _describe_shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fa
 
 
 def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
-    """Return the fault of a header that leads to no layout."""
+    """Return the fault of a header without a layout."""
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):

@@ -106,7 +106,7 @@ class _Encoder:
             parts[axis] = self._encode_parts(node)
             self._totals[node.total.path] = sum(map(len, parts[axis]))
         self._measure_texts()
-        layout = self._layout()
+        layout = self._find_layout()
         for seal in layout.seals:
             for leaf in seal.leaves:
                 self._checksums.add(leaf.info.path)
@@ -152,7 +152,7 @@ class _Encoder:
                 raise self._make_value_error(shown, expected, value)
             self._totals[ending.size.path] = len(data)
 
-    def _layout(self) -> Layout:
+    def _find_layout(self) -> Layout:
         """Return the layout that the values of the header fields select."""
         try:
             return self._layouts.layout_for(self._read_header)
@@ -248,7 +248,7 @@ class _Encoder:
         return encoded
 
     def _collect(self, node: Node, value: Any, path: str, shown: str, layout: Layout) -> None:
-        """Add the values of a node to the columns.
+        """Add the values of a node to the values of their fields.
 
         Args:
             value: the given value; None if it is missing.

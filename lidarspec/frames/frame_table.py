@@ -121,14 +121,14 @@ class CompiledTable:
             leaf = group.layout.column(path)
             # The general path handles empty arrays: an array in an empty one has length 0,
             # whatever its declared length.
-            if leaf is not None and 0 not in _outer_shape(leaf):
+            if leaf is not None and 0 not in _find_outer_shape(leaf):
                 values = self._load(leaf, path, group)[group.stream_order]
                 return values.astype(dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.full((len(self), *lengths), None if dtype.hasobject else 0, dtype)
         for group in self.groups:
             leaf = group.layout.column(path)
-            if leaf is not None and 0 not in _outer_shape(leaf):
+            if leaf is not None and 0 not in _find_outer_shape(leaf):
                 values = self._load(leaf, path, group)
                 corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
                 column[corner] = values
@@ -466,7 +466,7 @@ def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
     """Stack arrays of rows; nothing is copied if they follow one another in memory."""
     base = parts[0].base
     width = parts[0].shape[1]
-    addresses = [_address(part) for part in parts]
+    addresses = [_get_address(part) for part in parts]
     follow = (
         address + part.size == after
         for address, part, after in zip(addresses, parts, addresses[1:], strict=False)
@@ -483,11 +483,11 @@ def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
         (count, width),
         np.uint8,
         base.data.cast("B") if base.ndim else base,
-        addresses[0] - _address(base),
+        addresses[0] - _get_address(base),
     )
 
 
-def _address(array: NDArray[Any]) -> int:
+def _get_address(array: NDArray[Any]) -> int:
     return int(array.__array_interface__["data"][0])
 
 
@@ -776,7 +776,7 @@ def _are_numbers(found: list[Any]) -> bool:
     )
 
 
-def _outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
+def _find_outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
     """Return the lengths of the arrays that contain a field.
 
     A field of bytes with an adapter is one value, so its axis of bytes is left out.

@@ -422,7 +422,7 @@ class Seal:
     Attributes:
         algorithm: the algorithm.
         leaves: the fields with the checksum, low bits first.
-        spans: the byte ranges that it covers.
+        spans: the byte ranges that the checksum covers.
         absent: the stored values that mean that the sensor has computed no checksum.
     """
 
@@ -624,7 +624,7 @@ def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> 
 
 @dataclass(frozen=True, eq=False)
 class LayoutRefusal:
-    """The reason why a header leads to no layout.
+    """The reason why frames with a certain header have no layout.
 
     Attributes:
         error: the error of a plugin expression that failed.

@@ -80,10 +80,11 @@ def find_layout(
     Args:
         values: the raw values of the fields that the layout depends on, by path.
         limit: the maximum size of a frame, in bytes.
-        given: for parts, the raw values of fields of the outer frame, by their path in it.
+        given: for parts, the raw values of fields of the outer frame, by their path in the outer
+            frame.
 
     Raises:
-        UnknownSelectorError: if the layout depends on another field.
+        UnknownSelectorError: if the layout depends on a field that is not in `values`.
         TooLongError: if the frame would be longer than `limit`, or have no bytes.
         UnknownPartError: if the constants of a part match no kind of parts.
         NotCompilableError: if only construct can parse the struct.
@@ -127,7 +128,10 @@ ValueRequest = Callable[[Leaf | MeasuredSize, "HeaderWalk"], int]
 
 @dataclass
 class HeaderWalk:
-    """A walk through a tree, and its results, for given values of header fields."""
+    """A walk through the tree of a frame type, for given values of header fields.
+
+    The attributes from `cursor` on are the results.
+    """
 
     values: Mapping[str, int]
     limit: int
@@ -238,10 +242,12 @@ class HeaderWalk:
             case tree.PartSequence():
                 self._add_parts(node, path)
             case tree.When():
-                self.branches[node] = node.then if self._value(node.condition) else node.otherwise
+                self.branches[node] = (
+                    node.then if self._evaluate(node.condition) else node.otherwise
+                )
                 self.visit(self.branches[node], path, shape, strides)
             case tree.Select():
-                self.branches[node] = dict(node.cases).get(self._value(node.key), node.default)
+                self.branches[node] = dict(node.cases).get(self._evaluate(node.key), node.default)
                 self.visit(self.branches[node], path, shape, strides)
             case tree.Check() if 0 not in shape:
                 self.conditions[node] = Condition.of(node)
@@ -272,7 +278,7 @@ class HeaderWalk:
     def _add_array(
         self, node: tree.Repeat, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        count = self._count(node.count, path)
+        count = self._evaluate_count(node.count, path)
         start = self.cursor
         self.lengths[node.axis] = 0 if 0 in shape else count
         if count:
@@ -334,10 +340,10 @@ class HeaderWalk:
 
         If no header field contains the total size of the parts, `request` has to return it.
         """
-        given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
+        given = {ref.path: int(self._evaluate(ref) or 0) for ref in node.outer}
         rule = PartRule(
             *(
-                None if formula is None else self._count(formula, path)
+                None if formula is None else self._evaluate_count(formula, path)
                 for formula in (node.count, node.size, node.within)
             )
         )
@@ -355,7 +361,7 @@ class HeaderWalk:
         if rule.within is not None:
             size = rule.within
         else:
-            size = int(self._value(tree.Ref(node.total.path, node.total)))
+            size = int(self._evaluate(tree.Ref(node.total.path, node.total)))
         if size == -FAILED:
             raise ValueError(f"an expression in {path} fails")
         if size < 0:
@@ -367,7 +373,7 @@ class HeaderWalk:
     def _add_empty_array(
         self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add the fields of an array without elements, which has no bytes and constants."""
+        """Add the fields of an array without elements; it has no bytes or constants."""
         start = self.cursor
         constants = dict(self.constants)
         try:
@@ -395,16 +401,16 @@ class HeaderWalk:
                 else:
                     wire = None
                     elements = (whole_bytes(size, order, signed=node.kind == "int"),)
-                self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
+                self._add_leaf(Leaf(info, self.cursor, shape, strides, size, wire, elements))
                 if info.const is not None:
-                    self._constant(node.encode(info.const))
+                    self._add_constant(node.encode(info.const))
             case tree.Blob():
                 if node.ending is not None:
                     measured = TextSize(node.ending.size, node.ending, self.cursor, self.limit)
                     self.parts[node.ending.size.path] = measured
-                size = self._count(node.size, path)
+                size = self._evaluate_count(node.size, path)
                 if node.name:
-                    self._add(
+                    self._add_leaf(
                         Leaf(
                             node.info,
                             self.cursor,
@@ -414,17 +420,17 @@ class HeaderWalk:
                             np.dtype("u1"),
                         )
                     )
-                self._constant(node.const or b"")
+                self._add_constant(node.const or b"")
                 if node.ending is not None:
                     self.cursor += size
                     size = len(node.ending.terminator)
-                    self._constant(node.ending.terminator)
+                    self._add_constant(node.ending.terminator)
             case tree.Block():
                 size = node.size
-                self._block(node, path, shape, strides)
+                self._add_block(node, path, shape, strides)
         self.cursor += size
 
-    def _block(
+    def _add_block(
         self, node: tree.Block, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         groups: dict[str, list[BitField]] = {}
@@ -438,25 +444,25 @@ class HeaderWalk:
             inside = len(info.axes) > len(shape)
             if name:
                 own = (*shape, len(elements)) if inside else shape
-                self._add(
+                self._add_leaf(
                     Leaf(info, self.cursor, own, strides, node.size, elements=tuple(elements))
                 )
             if info.const is not None:
                 for element in elements:
-                    self._bit_constant(element, int(info.const))
+                    self._add_bit_constant(element, int(info.const))
 
-    def _constant(self, data: bytes) -> None:
+    def _add_constant(self, data: bytes) -> None:
         self.constants.update(
             {self.cursor + index: (0xFF, byte) for index, byte in enumerate(data)}
         )
 
-    def _bit_constant(self, element: BitField, value: int) -> None:
+    def _add_bit_constant(self, element: BitField, value: int) -> None:
         for part in element.segments:
             mask, bits = self.constants.get(self.cursor + part.byte, (0, 0))
             byte = bits | (value >> part.target << part.low) & part.mask
             self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
 
-    def _add(self, leaf: Leaf) -> None:
+    def _add_leaf(self, leaf: Leaf) -> None:
         is_partial = leaf.info.adapter is not None and leaf.info.adapter.is_partial
         if leaf.info.allowed is not None or is_partial:
             self.conditions[leaf.info] = Condition.of(leaf.info)
@@ -514,11 +520,11 @@ class HeaderWalk:
             return part.info.const
         return self.read(path)
 
-    def _value(self, formula: tree.Formula) -> Any:
+    def _evaluate(self, formula: tree.Formula) -> Any:
         return tree.evaluate(formula, self.read)
 
-    def _count(self, formula: tree.Formula, path: str) -> int:
-        count = operator.index(self._value(formula))
+    def _evaluate_count(self, formula: tree.Formula, path: str) -> int:
+        count = operator.index(self._evaluate(formula))
         if not 0 <= count <= self.limit:
             raise TooLongError(path, count)
         return count
@@ -727,8 +733,7 @@ def _depends_on(formula: tree.Formula, info: tree.FieldInfo) -> bool:
 def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
     """Return whether a formula of a node counts bytes, elements or parts.
 
-    If so, all numbers larger than the maximum frame size have the same result, because each part
-    has at least one byte (`HeaderWalk._add_parts`), and an array with more elements is refused.
+    The frame is refused if the result of such a formula is larger than the maximum frame size.
     """
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
@@ -996,7 +1001,7 @@ class HeaderTree:
         return self._find_end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for these values of header fields.
+        """Return the layout for given values of header fields.
 
         Args:
             read: a function that returns the value of a header field that the layout depends on.
@@ -1094,9 +1099,9 @@ class HeaderTree:
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants of a walk that the search has not checked yet.
+        """Return the constants of a walk, without those that all frames begin with.
 
-        The search checks the constants that all frames begin with.
+        The search has already checked the constants that all frames begin with.
         """
         return {
             offset: bits

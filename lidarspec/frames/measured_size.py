@@ -1,7 +1,7 @@
 """Sizes that are found by reading the content of a frame, not its header.
 
-The layout of a frame depends on header fields and on these sizes, so they have the methods of a
-field. The sizes of sequences of parts are in `parts`.
+The layout of a frame depends on header fields and on these sizes. `MeasuredSize` therefore has the
+methods of a field. The sizes of sequences of parts are in `parts`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ MAX_WINDOW_BYTES = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSize(ABC):
-    """A size that is found by reading the content, with the methods of a header field.
+    """A size that is found by reading the content of a frame.
+
+    The layout depends on it, so it has the methods of a header field (`Leaf`).
 
     Attributes:
         info: the size as a field.
@@ -60,8 +62,8 @@ class MeasuredSize(ABC):
 
         Returns:
             The indices of the candidates in which the size was found (None for all candidates), and
-            the sizes. If the content cannot be
-            valid, the size is the status of the frame with a minus sign.
+            the sizes. If the content cannot be valid, the size is the status of the frame with a
+            minus sign.
         """
 
     @abstractmethod

@@ -251,8 +251,8 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     """Return the values of a frame without verifying it.
 
     Raises:
-        WireError: if the frame is truncated, if its header leads to no layout, or if a value cannot
-            be decoded.
+        WireError: if the frame is truncated, if its header has no layout, or if a value cannot be
+            decoded.
     """
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilableError):
@@ -347,7 +347,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
 
 
 def _find_leaf(layout: Layout, path: str) -> Leaf:
-    """Return the position of a field, or of the field that a derived value is a copy of."""
+    """Return the position of a field; of the original field, if the field is a copy."""
     leaf = layout.column(path)
     assert isinstance(leaf, Leaf)
     return leaf
@@ -421,7 +421,7 @@ def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
     """Return a reader of one value at each offset.
 
     Args:
-        offsets: ascending.
+        offsets: the offsets in the frame, ascending.
         order: the byte order, as in `struct`.
         code: the format character, as in `struct`.
     """
@@ -505,8 +505,8 @@ def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequen
 def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
     """Return a reader of bit blocks.
 
-    Each block is read as one number. The byte order of this number is the one in which the values
-    consist of fewer runs of bits.
+    Each block is read as one number, in the byte order in which the values consist of fewer runs of
+    bits.
     """
     leaf = _find_leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
@@ -539,9 +539,10 @@ def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[A
 def _find_bit_runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """Return the runs of bits of a value in a block that is read as one number.
+    """Return the runs of consecutive bits that a value has in its bit block.
 
-    Each run is (lowest bit in the block, mask, lowest bit of the value).
+    The block is read as one number. Each run is (lowest bit in the block, mask, lowest bit of the
+    value).
     """
     runs = list[tuple[int, int, int]]()
     for segment in sorted(field.segments, key=lambda segment: segment.target):

@@ -48,7 +48,7 @@ ANY_SIZE = -1
 
 
 class LayoutLookup(Protocol):
-    """Returns the layouts of a frame type or of a kind of parts.
+    """Finds the layouts of a frame type or of a kind of parts.
 
     `HeaderTree` implements it.
     """
@@ -72,7 +72,11 @@ class LayoutLookup(Protocol):
         """
 
     def layout_for(self, read: Callable[[Leaf | MeasuredSize], int]) -> Layout:
-        """Return the layout for the values of header fields, which `read` returns."""
+        """Return the layout for given values of header fields.
+
+        Args:
+            read: a function that returns the value of a header field that the layout depends on.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +193,7 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the layout was chosen by the measured size of its parts.
+        """Whether the layout was found by measuring the size of its parts.
 
         If so, all frames of this layout have complete parts, but checksums and conditions of the
         parts may still be wrong.
@@ -212,7 +216,11 @@ class Region:
         return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
     def find_parts(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
-        """Find the parts of frames given as rows of bytes; return a buffer and the parts in it."""
+        """Find the parts of frames given as rows of bytes.
+
+        Returns:
+            A buffer with the bytes of the frames, and the parts in this buffer.
+        """
         return view_span(rows), self.walk(view_span(rows), np.arange(len(rows)) * rows.strides[0])
 
     def is_valid(self, frame: bytes) -> bool:

@@ -175,7 +175,7 @@ def _group_word_masks(
         number: the number of words, as returned by `load_words`.
 
     Returns:
-        The indices of the words with equal masks, and these masks (low, high), as pairs.
+        Pairs of the indices of the words with equal masks, and these masks (low, high).
     """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
@@ -269,10 +269,8 @@ def _plan_words(
 
     Returns:
         The number of words; the copies of whole words, as (first word, number of words, offset in
-        the row); and the
-        copies of parts of a word, as (word, offset of eight bytes in the row, right shift, mask or
-        None, left shift).
-        The shifts and the mask are applied in this order.
+        the row); and the copies of parts of a word, as (word, offset of eight bytes in the row,
+        right shift, mask or None, left shift). The shifts and the mask are applied in this order.
     """
     total = _count_bytes(spans)
     number = -(-total // 8)
@@ -379,9 +377,10 @@ def _compute_by_position(
     poly: int,
     refin: bool,
 ) -> NDArray[Any]:
-    """Return `compute_registers` of a few short rows, by a table for each position.
+    """Return the result of `compute_registers` for a few short rows.
 
-    The result is the XOR of the contributions of all bytes to the final register.
+    It is the XOR of the contributions of all bytes. A table for each position contains these
+    contributions.
     """
     table, firsts, begun = make_place_tables(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(
@@ -446,7 +445,7 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return a word for each row, whose register equals that of the row, (n,).
+    """Reduce each row to one word with the same register, (n,).
 
     The polynomial `poly` must have eight bits.
     """

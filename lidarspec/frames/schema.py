@@ -245,9 +245,10 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the array of parts that a path leads to, or through.
+        """Return the path of the array of parts that contains a field; None without one.
 
-        Returns None if the path leads to no array of parts.
+        Args:
+            path: the path of the array itself, or of a field in its elements.
         """
         if not self.parts:
             return None

@@ -189,7 +189,8 @@ def examine(
 
     Args:
         limit: the maximum size of a frame, in bytes.
-        given: for a part, the values of fields of the outer frame, by their path in it.
+        given: for a part, the values of fields of the outer frame, by their path in the outer
+            frame.
         start: for a part, its offset in the frame.
         prefix: for a part, its path in the frame.
         is_bounded: for a part, whether the frame has bytes after its parts.
@@ -298,9 +299,9 @@ class _Cursor:
                     below = f"{node.path}.{child.name}".strip(".")
                     yield from self.visit(child, below, f"{shown}.{name}".strip("."))
             case tree.Repeat():
-                yield from self._array(node, path, shown)
+                yield from self._iter_array(node, path, shown)
             case tree.PartSequence():
-                yield from self._parts(node)
+                yield from self._iter_parts(node)
             case tree.When() | tree.Select():
                 branch = self._known.branches.get(node)
                 if branch is None:
@@ -308,13 +309,13 @@ class _Cursor:
                 else:
                     yield from self.visit(branch, path, shown)
             case tree.Number():
-                yield self._value(node.info, shown, node.size, _make_number_decoder(node))
+                yield self._take_value(node.info, shown, node.size, _make_number_decoder(node))
             case tree.Blob():
-                yield from self._blob(node, path, shown)
+                yield from self._iter_blob(node, path, shown)
             case tree.Block():
-                yield from self._block(node, shown)
+                yield from self._iter_block(node, shown)
 
-    def _array(self, node: tree.Repeat, path: str, shown: str) -> Iterator[WireField]:
+    def _iter_array(self, node: tree.Repeat, path: str, shown: str) -> Iterator[WireField]:
         count = node.count if isinstance(node.count, int) else self._known.lengths.get(node.axis)
         if count is None:
             self._is_over = True
@@ -328,7 +329,7 @@ class _Cursor:
                 self._is_over = True
                 return
 
-    def _parts(self, node: tree.PartSequence) -> Iterator[WireField]:
+    def _iter_parts(self, node: tree.PartSequence) -> Iterator[WireField]:
         region = self._examined.region(node.axis)
         if region is not None:
             for part in self._examined.list_parts_of(node.axis):
@@ -338,24 +339,24 @@ class _Cursor:
         else:
             self._offset = region.start + region.size
 
-    def _blob(self, node: tree.Blob, path: str, shown: str) -> Iterator[WireField]:
+    def _iter_blob(self, node: tree.Blob, path: str, shown: str) -> Iterator[WireField]:
         if node.const is not None and not node.name:
             info = tree.FieldInfo("", kind="bytes", const=node.const)
-            yield self._value(info, shown, len(node.const), bytes)
+            yield self._take_value(info, shown, len(node.const), bytes)
         elif path not in self._known.leaves:
             self._is_over = True
         else:
             size = self._known.leaves[path].size
             terminator = b"" if node.ending is None else node.ending.terminator
             # The terminator is shown with the bytes that it ends.
-            yield self._value(
+            yield self._take_value(
                 node.info,
                 shown,
                 size + len(terminator),
                 lambda data: _decode_bytes(node.info, data[:size]),
             )
 
-    def _block(self, node: tree.Block, shown: str) -> Iterator[WireField]:
+    def _iter_block(self, node: tree.Block, shown: str) -> Iterator[WireField]:
         start = self._examined.start + self._offset
         block = self._take(node.size)
         for part in node.parts:
@@ -369,7 +370,7 @@ class _Cursor:
             if block is None:
                 return
 
-    def _value(self, info: tree.FieldInfo, shown: str, size: int, decode: Any) -> WireField:
+    def _take_value(self, info: tree.FieldInfo, shown: str, size: int, decode: Any) -> WireField:
         start = self._examined.start + self._offset
         data = self._take(size)
         raw = None if data is None else decode(data)

@@ -260,7 +260,7 @@ def _make_part_path(shown: str, part: tree.Part) -> str:
 
 
 def _describe_bits(part: tree.Part) -> tuple[str, str]:
-    """Return the size and type of a part of a block.
+    """Return the size and the type of a part of a bit block, as texts.
 
     The size is in bits. For an integer that is wider than 64 bits, the size is in bytes.
     """
