@@ -103,7 +103,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def _find_by_suffix(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> Format | None:
-    """Return the format with the longest suffix of a file name; None if it is unknown."""
+    """Return the format with the longest suffix that a file name has; else None."""
     name = Path(path).name.lower()
     return max(
         (format for suffix, format in formats_by_suffix.items() if name.endswith(suffix)),
@@ -176,8 +176,8 @@ def write(
 
     Raises:
         UnknownFormat: for an unknown suffix.
-        UsageError: if times repeat, so that a file would be overwritten. Also if `organized` is not
-            possible for the format, the sensor or the number of scans, or if the format cannot
+        UsageError: if times repeat, so that a file would be overwritten; if `organized` is not
+            possible for the format, the sensor or the number of scans; or if the format cannot
             store `packets`.
         SourceError: if the file cannot be written.
     """

@@ -185,7 +185,9 @@ class _ZarrColumn:
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a folder with the columns of the first scan, and arrays about the scans.
+    """Write a Zarr folder with the columns of the points, and arrays about the scans.
+
+    The columns are those of the first scan.
 
     The dimension of point columns is "points"; the column `scan` has the number of each point's
     scan. The dimension of `stamp_ns`, `rate_hz` and `complete` is "scans". Arrays have the

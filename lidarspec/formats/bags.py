@@ -48,7 +48,7 @@ class BagWriter:
         self.types = self._messages.types
         self.units = dict[str, str]()
 
-    def messages(
+    def iter_messages(
         self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
     ) -> Iterator[RosMessage]:
         """Yield the messages of scans and packets, merged by time if both are in order.
@@ -87,7 +87,7 @@ def write_mcap(
     with path.open("wb") as file:
         log = mcap.Writer(file, chunk_size=CHUNK_BYTES, compression=mcap.CompressionType.NONE)
         log.start(profile="ros2", library="lidarspec")
-        for kind, at, data in bag_writer.messages(scans, packets, every_point=every_point):
+        for kind, at, data in bag_writer.iter_messages(scans, packets, every_point=every_point):
             if kind not in channels:
                 text, _ = bag_writer.types.generate_msgdef(kind, ros_version=2)
                 channels[kind] = log.register_channel(
@@ -107,7 +107,7 @@ def write_ros1(
     _record(
         import_library("rosbags.rosbag1", "ros").Writer(path),
         bag_writer,
-        bag_writer.messages(scans, packets, every_point=every_point),
+        bag_writer.iter_messages(scans, packets, every_point=every_point),
     )
 
 
@@ -137,7 +137,9 @@ def write_ros2(
         log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
         try:
             bag_writer = BagWriter("ROS2_HUMBLE")
-            _record(log, bag_writer, bag_writer.messages(scans, packets, every_point=every_point))
+            _record(
+                log, bag_writer, bag_writer.iter_messages(scans, packets, every_point=every_point)
+            )
         except sqlite3.Error as error:
             raise OSError(str(error)) from None
         (bag if storage == "mcap" else bag / "scans.db3").rename(path)

@@ -102,7 +102,7 @@ class RerunRecording:
         with _translate_errors(), os.fdopen(self._copy.end, "wb"):
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
-    def scan(self, scan: Scan, *, every_point: bool = False) -> None:
+    def log_scan(self, scan: Scan, *, every_point: bool = False) -> None:
         """Log a scan; before the first scan, log the facts about its sensor.
 
         Raises:
@@ -288,7 +288,7 @@ def write_rerun(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None
     with RerunRecording() as log:
         log.save(path)
         for scan in scans:
-            log.scan(scan, every_point=every_point)
+            log.log_scan(scan, every_point=every_point)
 
 
 RERUN = Format(".rrd", "a recording for Rerun's viewer", write_rerun)

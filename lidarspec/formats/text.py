@@ -50,7 +50,7 @@ def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
     """Write a .csv file.
 
-    The columns are those of the first scan, and `scan`, the number of the scan.
+    It has the columns of the first scan, and a column `scan` with the number of the scan.
     """
     names: tuple[str, ...] = ()
     with open_text_file(path, is_zipped=is_zipped) as put:

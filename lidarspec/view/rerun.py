@@ -45,7 +45,7 @@ def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> 
         while not live.ended and time.monotonic() < until:
             live.read(time.monotonic() + LOOK_S)
             for scan in live.scans:
-                log.scan(scan)
+                log.log_scan(scan)
                 if last is None or not 0 <= scan.stamp_ns - last < STATISTICS_PERIOD_S * 1e9:
                     now = time.monotonic()
                     is_live = live.device.is_live
