@@ -88,7 +88,7 @@ class BatchColumns(ColumnSource):
         self.grids = grids
         self.nominal = nominal
         if grids:
-            self.grid = grids.between(0, size)
+            self.grid = grids.grid_between(0, size)
         else:
             self.grid = make_grid(self._plan.shape, self._plan.axes)
         self._computed: dict[str, NDArray[Any]] = {}

@@ -380,7 +380,7 @@ class CloudColumns(ColumnSource):
         self.grids = grids
         self.nominal = bool(cloud.nominal)
         if grids:
-            self.grid = grids.between(0, self.size)
+            self.grid = grids.grid_between(0, self.size)
         else:
             self.grid = find_grid(cloud)
         if isinstance(cloud, LazyCloud):
@@ -427,7 +427,7 @@ class LazyCloud(PointCloud):
         """Return a cloud that reads its columns from a source.
 
         Args:
-            stamp_ns: the time that the times of the source count from, ns.
+            stamp_ns: the time from which the times of the source count, ns.
         """
         lazy = LazyColumns(source)
         cloud = object.__new__(cls)

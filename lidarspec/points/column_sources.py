@@ -54,7 +54,7 @@ class ColumnSource:
     def grid_between(self, start: int, stop: int) -> Grid:
         """Return how the points from `start` to `stop` are organised."""
         if self.grids:
-            return self.grids.between(start, stop)
+            return self.grids.grid_between(start, stop)
         return whole_columns(self.grid, start, stop - start)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -199,7 +199,7 @@ class Grids(NamedTuple):
     which: NDArray[np.intp]
     grids: Sequence[Grid]
 
-    def between(self, start: int, stop: int) -> Grid:
+    def grid_between(self, start: int, stop: int) -> Grid:
         """Return how the points from `start` to `stop` are organised.
 
         The points are not organised if their packets are organised differently, or if the points

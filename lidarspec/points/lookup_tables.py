@@ -62,9 +62,9 @@ class FieldWindow:
 
 
 def find_window(leaf: Leaf) -> FieldWindow | None:
-    """Return the window of a field.
+    """Return the one or two bytes that contain a field.
 
-    Returns None if the field is in more than two bytes, or if it is an array inside a bit block.
+    Returns None if the field is in more bytes, or if it is an array inside a bit block.
     """
     if leaf.wire is not None:
         if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
@@ -79,9 +79,10 @@ def find_window(leaf: Leaf) -> FieldWindow | None:
 
 
 def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
-    """Return the raw value of a field for every value of its window.
+    """Return the raw value of a field for every value of the bytes that contain it.
 
-    The shape is (256,) or (65536,)."""
+    The shape is (256,) or (65536,).
+    """
     codes = np.arange(1 << (8 * field_window.size)).astype(field_window.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)
     start = field_window.offset - leaf.offset

@@ -100,8 +100,7 @@ class Plan:
         shape: the shape of the points of a packet, one length for each axis in `axes`.
         expressions: the columns that back ends compute, by name, as nodes or arrays.
         extra: the types of the columns in `extra`, by name.
-        sent: the columns in `extra` with the raw integers of a field: the field, by the name of the
-            column.
+        sent: the fields with the raw integers of columns in `extra`, by the name of the column.
         exact: whether coordinates and range are computed in float64 in the order in which they are
             written. All other columns are always computed in this way.
         positive: nodes whose values have to be positive numbers for the plan to be valid.

@@ -6,9 +6,9 @@ byte is the change of the checksum that this byte alone causes. Each offset has 
 shares, which is made by running the algorithm. If shares are equal to the bytes, words of eight
 bytes are XORed instead.
 
-Long CRCs, and CRCs of more than 16 bits, are computed eight bytes at a time by eight tables of 256
-entries ("slicing by eight"). Four rows are computed side by side, because each step of a row
-depends on its previous step.
+CRCs of many bytes, and CRCs of more than 16 bits, are computed eight bytes at a time by eight
+tables of 256 entries ("slicing by eight"). Four rows are computed side by side, because each step
+of a row depends on its previous step.
 """
 
 from __future__ import annotations

@@ -140,10 +140,10 @@ class Trig:
 class Expressions(KernelWriter):
     """Writes traced expressions into the loops of a kernel."""
 
-    def double(self, value: Any, depth: int = 0) -> KernelValue:
+    def write_double(self, value: Any, depth: int = 0) -> KernelValue:
         """Write an expression in float64, or a condition, and return its value."""
         if not isinstance(value, Node):
-            return self.constant(value, depth)
+            return self.write_constant(value, depth)
         return self.get_or_make(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
 
     def _write_double(self, node: Node) -> KernelValue:
@@ -171,12 +171,12 @@ class Expressions(KernelWriter):
         """
         index = node.args[0]
         table = node.args[1] if table is None else table
-        row = self.double(index)
+        row = self.write_double(index)
         start = self.get_or_make(
             ("row", index, table.shape),
             lambda: self.let(
                 row.level,
-                f"row_at({row.text}, {self.number(len(table))}) * {self.number(table.shape[1])}",
+                f"row_at({row.text}, {self.format_number(len(table))}) * {self.format_number(table.shape[1])}",
             ),
         )
         place = self.index_text(
@@ -185,7 +185,7 @@ class Expressions(KernelWriter):
                 for own, length in zip(index.shape, node.shape, strict=True)
             )
         )
-        name = self.array(
+        name = self.add_array(
             self.get_or_make(
                 ("cast", id(table), kind), lambda: (table.astype(kind, copy=False), table)
             )[0]
@@ -215,7 +215,7 @@ class Expressions(KernelWriter):
         ):
             return self.add_argument(node)
         if node.function is side_by_side and len(node.shape) == depth + 1:
-            parts = [self.double(arg, depth) for arg in node.args]
+            parts = [self.write_double(arg, depth) for arg in node.args]
             chain = "".join(
                 f"{part.text} if i{depth} == {at} else " for at, part in enumerate(parts[:-1])
             )
@@ -225,15 +225,15 @@ class Expressions(KernelWriter):
         if len(node.shape) != depth:
             return self.add_argument(node)
         if isinstance(node.function, TableLookup) and len(node.function.entries):
-            index = self.double(node.args[0])
-            table = self.array(node.function.entries)
+            index = self.write_double(node.args[0])
+            table = self.add_array(node.function.entries)
             return self.let(index.level, f"look_up({table}, {index.text})")
         if node.function is np.where and len(node.args) == 3:
-            return self._write_where(*(self.double(arg, depth) for arg in node.args))
+            return self._write_where(*(self.write_double(arg, depth) for arg in node.args))
         template = self._find_template(node)
         if template is None:
             return self.add_argument(node)
-        args = [self.double(arg, depth) for arg in node.args]
+        args = [self.write_double(arg, depth) for arg in node.args]
         return self.let(
             max(arg.level for arg in args), template.format(*(arg.text for arg in args))
         )
@@ -268,7 +268,7 @@ class Expressions(KernelWriter):
 
     def _write_physical(self, node: Node) -> KernelValue:
         leaf = self.layout.leaves.get(node.path)
-        raw = self.raw(leaf) if leaf is not None else None
+        raw = self.write_raw(leaf) if leaf is not None else None
         if raw is None or leaf is None:
             return self.add_argument(node)
         info = leaf.info
@@ -281,7 +281,7 @@ class Expressions(KernelWriter):
             ),
         )
 
-    def single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
+    def write_single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
         """Return an expression in float32: a `KernelValue`, or a `DeferredFloat`.
 
         Args:
@@ -291,7 +291,7 @@ class Expressions(KernelWriter):
                 in float32.
         """
         if not isinstance(value, Node):
-            return self.constant(value, len(self.shape), "float32")
+            return self.write_constant(value, len(self.shape), "float32")
         return self.get_or_make(
             ("single", value, exact), lambda: self._write_single(value, exact=exact, root=root)
         )
@@ -310,12 +310,12 @@ class Expressions(KernelWriter):
                 return along
             if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
-                return self.combine(sign, *(self.single(arg) for arg in node.args))
+                return self.combine(sign, *(self.write_single(arg) for arg in node.args))
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
-                return Trig(node.function.__name__, self.angle_of(node.args[0]))
+                return Trig(node.function.__name__, self.add_angle(node.args[0]))
         if node.kind == "rows" and not self.is_shared(node.args[0]) and not exact:
             return self._look_up_row(node, "float32")
-        made = self.double(node)
+        made = self.write_double(node)
         return self.let(
             made.level, f"np.float32({made.text if not exact else f'replace_nan({made.text})'})"
         )
@@ -364,7 +364,7 @@ class Expressions(KernelWriter):
                 and not leaf.info.offset
             )
             if leaf is not None and is_short:
-                sent = self.raw(leaf)
+                sent = self.write_raw(leaf)
             else:
                 sent = None
             if leaf is not None and leaf.info.scaled and not raw:
@@ -387,7 +387,7 @@ class Expressions(KernelWriter):
             return self.let(
                 self.inner, f"{made.text} if np.float32(0) < {made.text} else np.float32(nan)"
             )
-        flag = self.double(node.args[0], len(node.shape))
+        flag = self.write_double(node.args[0], len(node.shape))
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
@@ -411,30 +411,30 @@ class Expressions(KernelWriter):
         values = tabulate_values(node, leaf)
         assert values is not None
         straight = find_line(leaf, values, exact=exact)
-        raw = self.raw(leaf) if straight is not None else None
+        raw = self.write_raw(leaf) if straight is not None else None
         if straight is not None and raw is not None:
             return self.let(self.inner, straight.text(raw.text))
         if node.function in (np.cos, np.sin) and node.args[0] in self.both:
             return self.look_up_trig(node, leaf)
         return self.look_up(node, source, np.float32, 1.0)
 
-    def angle_of(self, node: Node) -> int:
+    def add_angle(self, node: Node) -> int:
         """Return the index of an angle in `angles`; add the angle on first use."""
 
         def make() -> int:
-            self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
+            self.angles.append(self.write_angle(node, 1 / np.pi, len(node.shape)))
             return len(self.angles) - 1
 
         return int(self.get_or_make(("angle", node), make))
 
-    def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
+    def write_angle(self, value: Any, factor: float, depth: int) -> KernelValue:
         """Return an angle in half turns, in float64.
 
         Args:
-            factor: converts the angle to half turns.
+            factor: a number by which the angle is multiplied to get half turns.
         """
         if not isinstance(value, Node):
-            return self.constant(np.asarray(value) * factor, depth)
+            return self.write_constant(np.asarray(value) * factor, depth)
         if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
             return self._write_scaled(value, factor)
         source = get_only_field(value)
@@ -450,9 +450,9 @@ class Expressions(KernelWriter):
         args = node.args
         depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
         if function in FACTORS:
-            return self.angle(args[0], factor * FACTORS[function], depth)
+            return self.write_angle(args[0], factor * FACTORS[function], depth)
         if function in (np.add, np.subtract):
-            first, second = (self.angle(arg, factor, depth) for arg in args)
+            first, second = (self.write_angle(arg, factor, depth) for arg in args)
             return self.let(
                 max(first.level, second.level),
                 f"{first.text} {'+' if function is np.add else '-'} {second.text}",
@@ -460,18 +460,21 @@ class Expressions(KernelWriter):
         if function is np.multiply and any(not isinstance(arg, Node) for arg in args):
             constant, other = args if not isinstance(args[0], Node) else args[::-1]
             if np.size(constant) == 1:
-                return self.angle(other, factor * float(np.asarray(constant).reshape(())), depth)
-            row = self.constant(np.asarray(constant) * factor, depth)
-            made = self.double(other)
+                return self.write_angle(
+                    other, factor * float(np.asarray(constant).reshape(())), depth
+                )
+            row = self.write_constant(np.asarray(constant) * factor, depth)
+            made = self.write_double(other)
             return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
         if function is np.where and len(args) == 3:
             return self._write_where(
-                self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:])
+                self.write_double(args[0], depth),
+                *(self.write_angle(arg, factor, depth) for arg in args[1:]),
             )
         return self._write_scaled(node, factor)
 
     def _write_scaled(self, node: Node, factor: float) -> KernelValue:
-        made = self.double(node)
+        made = self.write_double(node)
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
@@ -533,7 +536,7 @@ class KernelText:
 class KernelAssembly:
     """Writes the lines of a kernel that store columns.
 
-    They are in the nested loops, or in the flat loop over points.
+    The lines are in the nested loops, or in the flat loop over points.
     """
 
     def __init__(self, writer: Expressions) -> None:
@@ -542,7 +545,7 @@ class KernelAssembly:
         self._kept: dict[str, str] = {}
         self.scratch: list[str] = []
 
-    def column(self, name: str, value: Any) -> None:
+    def store_column(self, name: str, value: Any) -> None:
         """Add the line that stores a column."""
         if isinstance(value, KernelValue):
             self.writer.lines[-1].append(f"put(out_{name}, o, {value.text})")
@@ -584,7 +587,7 @@ class KernelAssembly:
             self.writer.lines[-1].append(f"put({name}, k, {value.text})")
         return f"at({self._kept[value.text]}, k)"
 
-    def turns(self) -> list[str]:
+    def list_turns(self) -> list[str]:
         """Return the lines of the flat loop over points that compute cosines and sines."""
         return [
             f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
@@ -619,8 +622,8 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
         assembly.store_coordinates(places)
     for name, value in made.items():
         if name not in places:
-            assembly.column(name, value)
-    turns = assembly.turns()
+            assembly.store_column(name, value)
+    turns = assembly.list_turns()
     return KernelText(
         HEAD + _write_function(writer, assembly, turns, columns), writer.wanted, columns
     )
@@ -639,18 +642,18 @@ def _find_cos_sin_angles(expressions: Iterable[Any]) -> set[Node]:
 def _make_value(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
     exact = plan.is_exact(name)
     if name in plan.sent:
-        raw = writer.raw(plan.sent[name])
+        raw = writer.write_raw(plan.sent[name])
     else:
         raw = None
     if name in plan.sent:
-        made = raw or writer.double(value, len(writer.shape))
+        made = raw or writer.write_double(value, len(writer.shape))
         return writer.let(made.level, f"np.{plan.extra[name].dtype}({made.text})")
     if name == "azimuth" or (exact and name != "intensity"):
-        made = writer.double(value, len(writer.shape))
+        made = writer.write_double(value, len(writer.shape))
         return writer.let(
             made.level, f"{'narrow_angle' if name == 'azimuth' else 'np.float32'}({made.text})"
         )
-    return writer.single(value, exact=name == "intensity", root=True)
+    return writer.write_single(value, exact=name == "intensity", root=True)
 
 
 def _write_function(
@@ -660,9 +663,9 @@ def _write_function(
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
     """Return the source of the function with its signature and its loops."""
-    width = writer.number(writer.width)
+    width = writer.format_number(writer.width)
     if turns:
-        held = writer.number(max(SCRATCH_POINTS // writer.width, 1))
+        held = writer.format_number(max(SCRATCH_POINTS // writer.width, 1))
     else:
         held = "count"
     loops = _write_loops(writer, width)
@@ -713,7 +716,9 @@ def _write_loops(writer: KernelWriter, width: str) -> list[str]:
     for level in range(2, writer.inner + 1):
         length = writer.shape[level - 2]
         if length > 1:
-            lines.append(f"{'    ' * depth}for i{level - 2} in range({writer.number(length)}):")
+            lines.append(
+                f"{'    ' * depth}for i{level - 2} in range({writer.format_number(length)}):"
+            )
             depth += 1
         if level == writer.inner:
             lines += [f"{'    ' * depth}{text}" for text in _write_indices(writer, width)]

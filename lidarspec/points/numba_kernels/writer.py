@@ -310,7 +310,7 @@ class KernelWriter:
         self._known: dict[Any, Any] = {}
         self._made = 0
 
-    def number(self, value: int) -> str:
+    def format_number(self, value: int) -> str:
         """Return the text of a length or offset: a number, or an argument if it varies."""
         if not self.varying or value in (0, 1):
             return str(value)
@@ -332,7 +332,8 @@ class KernelWriter:
     def index_text(self, shape: tuple[int, ...]) -> str:
         """Return the text of the current element's index in an array of this shape."""
         return self.format_index(
-            shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
+            shape,
+            tuple(self.format_number(math.prod(shape[axis + 1 :])) for axis in range(len(shape))),
         )
 
     def format_index(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
@@ -344,7 +345,7 @@ class KernelWriter:
         ]
         return " + ".join(parts) or "0"
 
-    def array(self, values: NDArray[Any]) -> str:
+    def add_array(self, values: NDArray[Any]) -> str:
         """Add a constant array to the arguments, flattened, and return its name."""
         flat = np.ascontiguousarray(values).reshape(-1)
         return str(
@@ -355,7 +356,7 @@ class KernelWriter:
         self.wanted.arrays.append(flat)
         return f"c{len(self.wanted.arrays) - 1}"
 
-    def constant(self, value: Any, depth: int, kind: str = "float64") -> KernelValue:
+    def write_constant(self, value: Any, depth: int, kind: str = "float64") -> KernelValue:
         """Return the text of a constant number, or of an element of a constant array."""
         array = np.asarray(value)
         if array.size == 1:
@@ -364,7 +365,7 @@ class KernelWriter:
             )
             return KernelValue(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
         shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
-        name = self.array(
+        name = self.add_array(
             self.get_or_make(("cast", id(value), kind), lambda: (array.astype(kind), value))[0]
         )
         element: KernelValue = self.get_or_make(
@@ -396,13 +397,13 @@ class KernelWriter:
         )
         return flag
 
-    def raw(self, leaf: Leaf) -> KernelValue | None:
+    def write_raw(self, leaf: Leaf) -> KernelValue | None:
         """Return the text of a field's raw value; None if only NumPy can read the field."""
         if leaf.info.path not in self._known:
-            self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
+            self._known[leaf.info.path] = self._write_float(leaf) or self._write_integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
 
-    def _integer(self, leaf: Leaf) -> KernelValue | None:
+    def _write_integer(self, leaf: Leaf) -> KernelValue | None:
         word = None if self.varying else find_word(leaf, self.layout)
         if word is not None:
             place, shift, mask = word
@@ -413,18 +414,18 @@ class KernelWriter:
                 f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} &"
                 f" np.uint32({mask}))",
             )
-        text = write_integer(leaf, lambda offset: self.byte(leaf, offset).text)
+        text = write_integer(leaf, lambda offset: self.write_byte(leaf, offset).text)
         if text is None:
             return None
         return self.let(1 + count_used_axes(leaf.shape), text)
 
-    def _float(self, leaf: Leaf) -> KernelValue | None:
+    def _write_float(self, leaf: Leaf) -> KernelValue | None:
         if leaf.wire is None or leaf.wire.kind != "f" or leaf.wire.itemsize < 4:
             return None
         order = "big" if leaf.wire.byteorder == ">" else "little"
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
-    def byte(self, leaf: Leaf, offset: int) -> KernelValue:
+    def write_byte(self, leaf: Leaf, offset: int) -> KernelValue:
         """Return the text that reads a byte.
 
         The offset counts from the start of the array element, or of the frame.
@@ -448,7 +449,7 @@ class KernelWriter:
         if self._has_fixed_offset(leaf):
             place = str(offset)
         else:
-            place = self.number(offset)
+            place = self.format_number(offset)
         return self.get_or_make(  # type: ignore[no-any-return]
             (reader, shape, leaf.strides, offset),
             lambda: self.let(level, f"{reader}(rows, {steps.text} + {place})"),
@@ -456,7 +457,7 @@ class KernelWriter:
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:
         """Return the strides of a field's arrays as texts: numbers or arguments."""
-        strides = [self.number(stride) for stride in leaf.strides]
+        strides = [self.format_number(stride) for stride in leaf.strides]
         if leaf.strides and len(leaf.info.axes) == max(
             len(other.info.axes) for other in self.layout.leaves.values()
         ):
@@ -494,10 +495,10 @@ class KernelWriter:
         field_window = find_window(leaf) if leaf is not None else None
         if leaf is None or field_window is None:
             return None
-        table = self._table(node, leaf, kind, factor)
-        return self.let(self.inner, f"at({self.array(table)}, {self._code(leaf)})")
+        table = self._make_table(node, leaf, kind, factor)
+        return self.let(self.inner, f"at({self.add_array(table)}, {self._write_code(leaf)})")
 
-    def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
+    def _make_table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
         field_window = find_window(leaf)
         assert field_window is not None
         name = (
@@ -516,13 +517,13 @@ class KernelWriter:
             )
         return self._tables[name]
 
-    def _code(self, leaf: Leaf) -> str:
+    def _write_code(self, leaf: Leaf) -> str:
         field_window = find_window(leaf)
         assert field_window is not None
-        first = self.byte(leaf, field_window.offset).text
+        first = self.write_byte(leaf, field_window.offset).text
         if field_window.size == 1:
             return first
-        return f"({first} | {self.byte(leaf, field_window.offset + 1).text} << 8)"
+        return f"({first} | {self.write_byte(leaf, field_window.offset + 1).text} << 8)"
 
     def look_up_trig(self, node: Node, leaf: Leaf) -> KernelValue:
         """Return the text of a lookup of a cosine or sine.
@@ -535,9 +536,9 @@ class KernelWriter:
             self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(
                 np.float32
             )
-        table = self.array(self._tables[name])
+        table = self.add_array(self._tables[name])
         index = self.get_or_make(
-            ("spot", name), lambda: self.let(self.inner, f"{self._code(leaf)} << 1")
+            ("spot", name), lambda: self.let(self.inner, f"{self._write_code(leaf)} << 1")
         )
         return self.let(
             self.inner, f"at({table}, {index.text}{' + 1' if node.function is np.sin else ''})"

@@ -105,7 +105,7 @@ class Compiler:
         if register is not None:
             return register
         read = RegisterRead(self._compile_double(node))
-        return self.program.step(
+        return self.program.add_step(
             "as float32",
             "single",
             lambda run, out: np.copyto(out, read(run), casting="same_kind"),
@@ -125,7 +125,7 @@ class Compiler:
         is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
         if node.function is np.multiply or is_offset:
             first, second = (self._compile_factor(arg) for arg in node.args)
-            return self.program.call(name, "single", node.function, first, second)
+            return self.program.add_call(name, "single", node.function, first, second)
         return None
 
     def _compile_factor(self, value: Any) -> Callable[[ProgramRun], Any]:
@@ -145,7 +145,7 @@ class Compiler:
         if is_fixed and all(part.full is None for part in parts):
             return self._compile_turned(function, parts)
         angle = self._make_once(("angle", value), lambda: self._compile_full_angle(value))
-        return self.program.call(function.__name__, "single", function, RegisterRead(angle))
+        return self.program.add_call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
         """Compile the cosine or sine of a sum of angles.
@@ -163,7 +163,8 @@ class Compiler:
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *self._shape)
             angle = sum(
-                row * add_axes(execution.part(execution.values(low)), depth) for low, row in moving
+                row * add_axes(execution.take_chunk(execution.values(low)), depth)
+                for low, row in moving
             )
             near = (angle - np.rint(angle / TURN_RAD) * TURN_RAD).astype(np.float32)
             if function is np.cos:
@@ -173,12 +174,12 @@ class Compiler:
                 np.multiply(np.sin(near), fixed_cos, out=target)
                 np.add(target, np.cos(near) * fixed_sin, out=target)
 
-        return self.program.step(f"{function.__name__} by addition", "single", run)
+        return self.program.add_step(f"{function.__name__} by addition", "single", run)
 
     def _compile_full_angle(self, value: Node) -> int:
         """Compile an angle to float32, wrapped to -pi to pi."""
         angle = RegisterRead(self._compile_double(value))
-        scratch = RegisterRead(self.program.register("double"))
+        scratch = RegisterRead(self.program.add_register("double"))
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             radians = angle(execution)
@@ -188,7 +189,7 @@ class Compiler:
             np.multiply(turns, TURN_RAD, out=turns)
             np.subtract(radians, turns, out=out, casting="same_kind")
 
-        return self.program.step("wrap the angle to [-pi, pi]", "single", run, angle, scratch)
+        return self.program.add_step("wrap the angle to [-pi, pi]", "single", run, angle, scratch)
 
     def _compile_double(self, value: Any) -> int:
         """Compile an expression to float64, or a condition to flags."""
@@ -213,7 +214,7 @@ class Compiler:
         return register
 
     def _compile_lookup(self, node: Node, kind: str) -> int | None:
-        """Compile a lookup of table rows or of one field.
+        """Compile a lookup of table rows, or an expression of one field.
 
         Returns None for all other expressions.
         """
@@ -246,7 +247,7 @@ class Compiler:
         )
         table = self._make_table(node, leaf, field_window, kind)
         bits = (len(table) - 1).bit_length()
-        return self.program.step(
+        return self.program.add_step(
             f"{node.path or source.path}: table of {len(table)} by {bits} bits",
             kind,
             lambda run, out: table.take(index(run), out=out, mode="wrap"),
@@ -289,7 +290,7 @@ class Compiler:
             if info.offset:
                 np.add(out, out.dtype.type(info.offset), out=out)
 
-        return self.program.step(f"{info.path} in its unit", kind, scale, raw)
+        return self.program.add_step(f"{info.path} in its unit", kind, scale, raw)
 
     def _load_raw(self, leaf: Leaf, kind: str) -> int:
         """Load the raw values of a field."""
@@ -297,26 +298,26 @@ class Compiler:
             return self._load(leaf, leaf.wire, leaf.offset, kind)
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
-            rows = execution.part(execution.rows)
+            rows = execution.take_chunk(execution.rows)
             np.copyto(out.reshape(-1, *leaf.shape), leaf.load(rows), casting="unsafe")
 
-        return self.program.step(f"{leaf.info.path}: bits", kind, run)
+        return self.program.add_step(f"{leaf.info.path}: bits", kind, run)
 
     def _load(self, leaf: Leaf, dtype: np.dtype[Any], offset: int, kind: str) -> int:
         """Load the bytes at an offset in every element of a field."""
         shape = leaf.shape[: len(leaf.strides)]
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
-            rows = execution.part(execution.rows)
+            rows = execution.take_chunk(execution.rows)
             column = view_elements(rows, dtype, offset, shape, leaf.strides)
             np.copyto(out.reshape(column.shape), column, casting="unsafe")
 
-        return self.program.step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
+        return self.program.add_step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
 
     def _look_up_rows(self, node: Node, kind: str) -> int | None:
         """Compile a lookup of rows of a table.
 
-        Returns None unless a row has exactly the values of the points that share its index.
+        Returns None if the result is not a sequence of whole rows of the table.
         """
         index, table = node.args
         inner = table.shape[1]
@@ -327,12 +328,12 @@ class Compiler:
         rows = table.astype(TYPES[kind])
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
-            numbers = row_numbers(execution.part(execution.values(index)), len(rows))
+            numbers = row_numbers(execution.take_chunk(execution.values(index)), len(rows))
             packets = len(out) // self._width
             each = np.broadcast_to(numbers, (packets, *index.shape)).reshape(-1)
             rows.take(each, axis=0, out=out.reshape(-1, inner), mode="clip")
 
-        return self.program.step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
+        return self.program.add_step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
         """Compile a sum of which some terms have one value for each packet or block.
@@ -359,14 +360,14 @@ class Compiler:
         def product(execution: ProgramRun, part: Term) -> NDArray[Any]:
             if part.low is None:
                 return part.row
-            numbers = add_axes(execution.part(execution.values(part.low)), depth)
+            numbers = add_axes(execution.take_chunk(execution.values(part.low)), depth)
             return np.asarray(part.row * numbers)
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             *others, last = [product(execution, part) for part in parts]
             np.add(sum(others), last, out=out.reshape(-1, *shape))
 
-        return self.program.step(f"sum of {len(parts)} products", "double", run)
+        return self.program.add_step(f"sum of {len(parts)} products", "double", run)
 
     def _add_term(self, sum_: int, part: Term) -> int:
         """Add a term with a value for each point to a sum."""
@@ -379,7 +380,7 @@ class Compiler:
             np.multiply(full(execution), factor, out=out)
             np.add(before(execution), out, out=out)
 
-        return self.program.step(f"add {factor:.6g} times", "double", run, before, full)
+        return self.program.add_step(f"add {factor:.6g} times", "double", run, before, full)
 
     def _compile_call(self, node: Node, kind: str) -> int:
         """Compile a call that has no method of its own; NumPy evaluates it unchanged."""
@@ -401,7 +402,7 @@ class Compiler:
                 target[...] = function(*(read(execution) for read in reads))
 
         name = getattr(function, "__name__", "function")
-        return self.program.step(f"copy {name}", kind, run, *used)
+        return self.program.add_step(f"copy {name}", kind, run, *used)
 
     def _make_argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
         if not isinstance(value, Node):
@@ -411,20 +412,24 @@ class Compiler:
             shape = (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
-        return lambda run: add_axes(run.part(run.values(value)), depth)
+        return lambda run: add_axes(run.take_chunk(run.values(value)), depth)
 
     def _broadcast(self, value: Any, kind: str) -> int:
         """Broadcast a constant, or a value for each packet or block, to all points."""
         shape = self._shape
         if not isinstance(value, Node):
-            return self.program.tile(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)
+            return self.program.add_tile(
+                np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind
+            )
         self.low.append(value)
         depth = len(shape)
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
-            out.reshape(-1, *shape)[...] = add_axes(execution.part(execution.values(value)), depth)
+            out.reshape(-1, *shape)[...] = add_axes(
+                execution.take_chunk(execution.values(value)), depth
+            )
 
-        return self.program.step("already computed per packet", kind, run)
+        return self.program.add_step("already computed per packet", kind, run)
 
 
 def _make_constant(value: Any) -> Callable[[ProgramRun], Any]:

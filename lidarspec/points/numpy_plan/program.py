@@ -56,7 +56,7 @@ class ProgramRun:
     start: int = 0
     stop: int = 0
 
-    def part(self, array: NDArray[Any]) -> NDArray[Any]:
+    def take_chunk(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return the rows of the current chunk; an array with a single row is returned whole."""
         if len(array) > 1:
             return array[self.start : self.stop]
@@ -115,12 +115,12 @@ class Program(ColumnMaker):
         self.outputs: dict[str, int] = {}
         self._tiles: dict[int, NDArray[Any]] = {}
 
-    def register(self, kind: str) -> int:
+    def add_register(self, kind: str) -> int:
         """Add a register, and return its number."""
         self.kinds.append(kind)
         return len(self.kinds) - 1
 
-    def step(
+    def add_step(
         self,
         text: str,
         kind: str,
@@ -128,20 +128,22 @@ class Program(ColumnMaker):
         *reads: Callable[[ProgramRun], Any],
     ) -> int:
         """Add a step, and return the register that it fills."""
-        output = self.register(kind)
+        output = self.add_register(kind)
         registers = tuple(read.register for read in reads if isinstance(read, RegisterRead))
         self.steps.append(ProgramStep(text, run, output, registers))
         return output
 
-    def call(self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]) -> int:
+    def add_call(
+        self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]
+    ) -> int:
         """Add a call of a function that accepts `out`, and return the register that it fills."""
-        return self.step(
+        return self.add_step(
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
         )
 
-    def tile(self, row: NDArray[Any], kind: str) -> int:
+    def add_tile(self, row: NDArray[Any], kind: str) -> int:
         """Add a register with the same values in every packet, and return its number."""
-        register = self.register(kind)
+        register = self.add_register(kind)
         self._tiles[register] = np.tile(row.reshape(-1), self.chunk)
         return register
 
