@@ -175,7 +175,7 @@ class FrameRows:
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
         if info.allowed is not None and field.raw not in info.allowed:
             return f"wrong: {field.raw}, expected {format_values(info.allowed)}"
-        if info.held and self._fault is not None and self._fault.path == field.path:
+        if info.is_enforced and self._fault is not None and self._fault.path == field.path:
             return f"wrong: {field.raw}, expected {self._fault.expected}"
         return ""
 

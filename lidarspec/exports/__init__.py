@@ -191,7 +191,7 @@ def find_required_formulas(node: tree.Node) -> dict[str, tree.Formula]:
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)
-        if info.held and info.rebuilt is not None
+        if info.is_enforced and info.rebuilt is not None
     }
 
 

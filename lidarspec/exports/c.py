@@ -415,7 +415,7 @@ def _iter_value_checks(layout: CLayout) -> Iterator[str]:
                     yield _format_check(
                         entry, f"!({_format_allowed(access.expression, access.info.allowed)})"
                     )
-                elif access.info.held and access.info.rebuilt is not None:
+                elif access.info.is_enforced and access.info.rebuilt is not None:
                     yield _format_check(
                         entry,
                         f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}",

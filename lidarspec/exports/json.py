@@ -313,7 +313,7 @@ def _info_data(info: tree.FieldInfo) -> dict[str, Any]:
     }
     if info.allowed is not None:
         facts["allowed"] = list(info.allowed)
-    if info.held and info.rebuilt is not None:
+    if info.is_enforced and info.rebuilt is not None:
         facts["equals"] = formula_data(info.rebuilt)
     return {**facts, "labels": {str(value): name for value, name in info.labels.items()}}
 

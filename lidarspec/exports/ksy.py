@@ -593,7 +593,7 @@ class _KaitaiWriter:
             sealed = ""
         else:
             sealed = f"{seal.algorithm.describe()} over {_span(seal)}, which is not checked here"
-        if info.held:
+        if info.is_enforced:
             unchecked = "a length, which is not checked here"
         else:
             unchecked = ""

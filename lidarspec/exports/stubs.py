@@ -251,7 +251,7 @@ def _write_build(message: ExportedFrame) -> str:
         and not keyword.iskeyword(member.name)
         and not (
             isinstance(member, Number | Blob)
-            and (member.info.const is not None or member.info.held)
+            and (member.info.const is not None or member.info.is_enforced)
         )
     )
     more = f", units: bool = False{fields}, **values: Any"

@@ -192,7 +192,7 @@ def _iter_length_faults(
     right = row.copy()
     set_bits(right, layout.held)
     for leaf in layout.leaves.values():
-        if not leaf.info.held:
+        if not leaf.info.is_enforced:
             continue
         is_wrong = (leaf.load(row) != leaf.load(right))[0]
         if not is_wrong.any():
@@ -299,7 +299,7 @@ def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPa
     if isinstance(failure, UnknownPartError):
         return Fault(LENGTH, path, end, "only parts of declared kinds", None, end)
     length = next((each for each in examined.fields() if each.path == path), None)
-    if length is not None and length.info.held:
+    if length is not None and length.info.is_enforced:
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)
     if failure.number is not None:
         return Fault(COUNT, path, end, f"at most {examined.limit}", failure.number, end)

@@ -194,7 +194,7 @@ class _Encoder:
         if isinstance(value, list) and names in self._indices:
             value = value[self._indices[names]]
         info = self._schema.columns[path]
-        if value is None or (info.rebuilt is not None and not info.held):
+        if value is None or (info.rebuilt is not None and not info.is_enforced):
             value = self._find_implied(info)
         if value is None:
             return None
@@ -204,7 +204,7 @@ class _Encoder:
         """Return the value of a field that the caller omits; None if the field is required."""
         if info.const is not None:
             return info.const
-        if info.rebuilt is not None and not info.held:
+        if info.rebuilt is not None and not info.is_enforced:
             return evaluate(info.rebuilt, self.read)
         return evaluate(info.default, self.read)
 
@@ -339,7 +339,7 @@ class _Encoder:
             size: the size of a field of bytes, in bytes.
         """
         column = self._columns.setdefault(path, [])
-        if info.held and info.rebuilt is not None:
+        if info.is_enforced and info.rebuilt is not None:
             column.append(0)  # written with the lengths of the layout
             return
         if value is None or info.rebuilt is not None:
@@ -531,7 +531,7 @@ def remove_computed_count(
 ) -> None:
     """Remove the count field of a formula from the values, if it is always computed."""
     path = None if formula is None else find_count_field(formula, fields)
-    if path is not None and fields[path].held:
+    if path is not None and fields[path].is_enforced:
         holder, name = _find_holder(given, path)
         holder.pop(name, None)
 

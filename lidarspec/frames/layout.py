@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.frames.row_checksums import compute_over_spans
 from lidarspec.spec.bits import BitField, Segment
-from lidarspec.spec.checksums import Checksum, Single, single
+from lidarspec.spec.checksums import Checksum, Single, make_single
 from lidarspec.spec.tree import (
     Check,
     FieldInfo,
@@ -509,7 +509,7 @@ class Seal:
 
     @cached_property
     def _single(self) -> Single:
-        return single(self.algorithm)
+        return make_single(self.algorithm)
 
     def are_valid(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.bool_]:
         """Return whether the checksum of each frame is correct, (n,).

@@ -490,7 +490,7 @@ class HeaderWalk:
             A mask and the value of the masked bits, by byte offset.
         """
         rows = np.zeros((2, self.cursor), np.uint8)
-        held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.held]
+        held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.is_enforced]
         for leaf in held_leaves:
             (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
             if rebuilt is not None:
@@ -509,7 +509,7 @@ class HeaderWalk:
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
         """Yield pairs of a field and its value, if the value follows from the header."""
         for leaf in self.leaves.values():
-            if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
+            if leaf.info.rebuilt is not None and not leaf.info.is_enforced and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
                 with contextlib.suppress(Exception):
                     yield leaf, operator.index(tree.evaluate(leaf.info.rebuilt, self._read_known))
@@ -650,7 +650,7 @@ class _ValueClasses:
             if _depends_on(formula, info)
         ]
         if any(
-            own.rebuilt is not None and not own.held and _depends_on(own.rebuilt, info)
+            own.rebuilt is not None and not own.is_enforced and _depends_on(own.rebuilt, info)
             for node in nodes
             for own in tree.infos(node)
         ):

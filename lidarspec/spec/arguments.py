@@ -141,7 +141,7 @@ class Address:
 
 @dataclass(frozen=True)
 class Octets:
-    """Plain bytes; a plugin writes `bytes` after the path."""
+    """Plain bytes; in a command, a plugin writes `bytes` instead."""
 
     def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""

@@ -1,7 +1,7 @@
 """Checksum algorithms as values, and the CRCs in common use by name.
 
 An algorithm is immutable and hashable, and equal to another algorithm with the same parameters. It
-is called with the bytes of one message. `single` returns a function that is faster for many calls.
+is called with the bytes of one message. `make_single` returns a faster function.
 `lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the
 common CRCs, by the names of CRC catalogues.
 
@@ -99,7 +99,7 @@ class Crc(Checksum):
         _require(self, refin=(False, True), refout=(False, True), order=("little", "big"))
 
     def __call__(self, data: Bytes) -> int:
-        return _single_crc(self)(bytes(data))
+        return _make_single_crc(self)(bytes(data))
 
     def describe(self) -> str:
         digits = -(-self.width // 4)
@@ -195,7 +195,7 @@ class WordXor(Checksum):
             )
 
     def __call__(self, data: Bytes) -> int:
-        return _single_word_xor(self)(bytes(data))
+        return _make_single_word_xor(self)(bytes(data))
 
     def describe(self) -> str:
         return f"XOR-16 of {'+'.join(map(str, self.groups))}-byte words" + (
@@ -405,7 +405,7 @@ def name_of(crc: Crc) -> str:
     return _NAMES.get(crc, "")
 
 
-def single(algorithm: Checksum) -> Single:
+def make_single(algorithm: Checksum) -> Single:
     """Return a fast function that computes the checksum of a single frame."""
     kind = type(algorithm)  # not isinstance: a subclass may compute another checksum
     if kind is Xor:
@@ -414,13 +414,13 @@ def single(algorithm: Checksum) -> Single:
         mask = (1 << algorithm.width) - 1
         return lambda data: sum(data) & mask
     if kind is Crc:
-        return _single_crc(algorithm)
+        return _make_single_crc(algorithm)
     if kind is WordXor:
-        return _single_word_xor(algorithm)
+        return _make_single_word_xor(algorithm)
     return algorithm
 
 
-def _zlib_crc(algorithm: Crc) -> Single | None:
+def _make_zlib_crc(algorithm: Crc) -> Single | None:
     """Return a function that computes a CRC by zlib; None if zlib lacks its polynomial."""
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (
         32,
@@ -435,10 +435,10 @@ def _zlib_crc(algorithm: Crc) -> Single | None:
 
 
 @lru_cache(maxsize=256)
-def _single_crc(algorithm: Crc) -> Single:
+def _make_single_crc(algorithm: Crc) -> Single:
     init = algorithm.init
     xorout = algorithm.xorout
-    compiled = _zlib_crc(algorithm)
+    compiled = _make_zlib_crc(algorithm)
     if compiled is not None:
         return compiled
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (
@@ -450,7 +450,7 @@ def _single_crc(algorithm: Crc) -> Single:
         return lambda data: binascii.crc_hqx(data, init) ^ xorout
     table = byte_table(algorithm.width, algorithm.poly, algorithm.refin)
     if algorithm.width > 8:
-        return functools.partial(_wide_crc, algorithm, table, algorithm.start)
+        return functools.partial(_compute_wide_crc, algorithm, table, algorithm.start)
     spare = 8 - algorithm.width
     leaving = [register if algorithm.refin else register >> spare for register in range(256)]
     if algorithm.refin != algorithm.refout:
@@ -469,14 +469,14 @@ def _narrow_crc(table: tuple[int, ...], register: int, leaving: bytes, data: byt
     return leaving[register]
 
 
-def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes) -> int:
+def _compute_wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes) -> int:
     for byte in data:
         register = table[(register ^ byte) & 0xFF] ^ register >> 8
     return algorithm.finish(register)
 
 
 @lru_cache(maxsize=256)
-def _single_word_xor(algorithm: WordXor) -> Single:
+def _make_single_word_xor(algorithm: WordXor) -> Single:
     """Return a fast function that computes a `WordXor`.
 
     It XORs whole groups of words, and then splits the result into words.

@@ -139,9 +139,8 @@ class Frame:
             fixed.
         plausible: a function of `Fields` that is False for values that no sensor sends. A packet is
             plausible if all values of the result are true.
-        after: the name of another frame type that must precede this frame type. This frame is valid
-            only if, of all frame types that are named in any `after`, the named type was the last
-            to arrive.
+        after: the name of another frame type that must precede this frame type. If the `after` of
+            several frame types names different types, only the one that arrived last counts.
         confirm: the number of consecutive valid frames of this type that must arrive before any of
             them is accepted.
         simulation: facts for the simulation of this frame type. Needed if the sensor has several

@@ -12,7 +12,7 @@ it.
     Blob            plain bytes; the name of an unnamed constant is ""
     Block           bytes that contain one or more integers as bits (`Part`)
     Repeat          an array: one element, repeated
-    Parts           frames within the frame, one after another, each with its own size
+    PartSequence    frames within the frame, one after another, each with its own size
     When            one of two nodes, by a condition
     Select          one of several nodes, by a key
     Empty           no bytes
@@ -29,11 +29,11 @@ The tree contains two nodes for each kind of part. The paths in `Kind.element` s
 the frame, as in the plugin's struct. `Kind.root` describes the part as a frame of its own, so its
 paths start at the part. Layouts and tables are made from `Kind.root`.
 
-If a field declares the size of a part (`FieldInfo.held`), its formula is the sum of the sizes of
-the nodes in this part (`size`). The size of padding is a formula as well. An array is identified by
-its axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of an array
-contains an index. A wire form, which decodes the bytes before they are parsed, belongs to the
-`Frame`, not to the tree.
+If a field declares the size of a part (`FieldInfo.is_enforced`), its formula is the sum of the
+sizes of the nodes in this part (`size`). The size of padding is a formula as well. An array is
+identified by its axis (`Repeat.axis`, `FieldInfo.axes`). The path of a `Ref` to a single element of
+an array contains an index. A wire form, which decodes the bytes before they are parsed, belongs to
+the `Frame`, not to the tree.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class FieldInfo:
             supplies the value.
         default: the raw value, or its formula, in a built frame if the caller supplies no value.
             For bytes, it is one byte that is repeated to fill the field.
-        held: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
+        is_enforced: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
         labels: the names of raw values (construct's Enum).
         optional: whether some frames do not have the field.
         measured: whether the plugin declares a unit, or declares that the value is a plain number.
@@ -183,7 +183,7 @@ class FieldInfo:
     allowed: tuple[int, ...] | None = None
     rebuilt: Formula | None = None
     default: Any = None
-    held: bool = False
+    is_enforced: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
     measured: bool = False
@@ -545,17 +545,18 @@ def width(formula: Formula) -> int:
     return max(args)
 
 
-def move_to_part(formula: Formula, axis: str) -> Formula:
-    """Return a formula of a part with paths that start at the top of the outer frame.
+def to_outer_paths(formula: Formula, axis: str) -> Formula:
+    """Return a formula of a part with paths that start at the top of the frame.
 
     Args:
+        formula: a formula with paths that start at the part.
         axis: the path of the array of parts.
     """
     match formula:
         case Ref(path):
             return replace(formula, path=path[2:] if path.startswith("_.") else f"{axis}.{path}")
         case Op(symbol, args):
-            return Op(symbol, tuple(move_to_part(arg, axis) for arg in args))
+            return Op(symbol, tuple(to_outer_paths(arg, axis) for arg in args))
     return formula
 
 
@@ -816,7 +817,7 @@ class PartSequence:
         """
         if kind.following is None:
             return None
-        return move_to_part(kind.following, self.axis)
+        return to_outer_paths(kind.following, self.axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -1027,10 +1028,10 @@ def size(node: Node) -> Formula | None:
                     ),
                 ]
             )
-    return total(size(below) for below in children(node))
+    return sum_sizes(size(below) for below in children(node))
 
 
-def total(sizes: Iterable[Formula | None]) -> Formula | None:
+def sum_sizes(sizes: Iterable[Formula | None]) -> Formula | None:
     """Return the sum of sizes as a formula; None if any size is None."""
     sum_: Formula | None = 0
     for each in sizes:
@@ -1062,7 +1063,7 @@ def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula 
 
 
 def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
-    """Return the formula of the size of alternatives.
+    """Return the size of a node with alternatives, as a formula.
 
     Args:
         cases: the condition and the size of each alternative.
@@ -1070,7 +1071,7 @@ def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formul
     first = cases[0][1] if cases else 0
     if all(each == first for _, each in cases):
         return first
-    return total(combine("*", holds, each) for holds, each in cases)
+    return sum_sizes(combine("*", holds, each) for holds, each in cases)
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:

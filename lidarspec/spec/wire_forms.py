@@ -201,7 +201,7 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the frame of each byte of the struct, and at last `end`.
+        """The offset in the frame of each byte of the struct; the last item is `end`.
 
         The offset of a byte is the offset of the field that contains it.
         """
@@ -340,7 +340,7 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
 
 
 def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
-    """Return for each offset the first place at this offset or after it, (n,).
+    """Return for each offset the first of `places` that is not before it, (n,).
 
     Args:
         places: the offsets of some bytes, ascending.

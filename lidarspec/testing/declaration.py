@@ -438,7 +438,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
             if (
                 path in sealing
                 or leaf.info.const is not None
-                or leaf.info.held
+                or leaf.info.is_enforced
                 or path in reported
                 or 0 in leaf.shape
             ):

@@ -87,7 +87,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     free = [
         info
         for info in get_codec(frame).schema.fields.values()
-        if info.const is None and not info.held and info.path not in fixed
+        if info.const is None and not info.is_enforced and info.path not in fixed
     ]
     require(
         len(set(examples)) > 1 or not free or len(examples) < 2,
@@ -126,7 +126,9 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
         return
     sealed = material.find_checksum_paths(subject.sensor, name, b"")
     follows = {
-        info.path for info in engine.schema.fields.values() if info.rebuilt is not None or info.held
+        info.path
+        for info in engine.schema.fields.values()
+        if info.rebuilt is not None or info.is_enforced
     }
     for data in _changed_examples(subject, name):
         try:
@@ -414,7 +416,7 @@ def has_free_values(info: FieldInfo | None) -> bool:
         and info.kind == "int"
         and info.const is None
         and info.rebuilt is None
-        and not info.held
+        and not info.is_enforced
     )
 
 

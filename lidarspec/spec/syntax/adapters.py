@@ -53,8 +53,8 @@ class Trial:
         valid: the raw values that can be decoded.
         values: the decoded values.
         failed: whether some raw values cannot be decoded.
-        lost: a raw value that is changed by decoding and encoding, and the raw value that results;
-            None if no value is changed.
+        lost: a raw value that decoding and encoding change, and the raw value that results; None if
+            no value changes.
     """
 
     valid: tuple[Any, ...]
@@ -108,7 +108,7 @@ def is_int_adapter(con: Construct) -> bool:
 
 @functools.lru_cache(maxsize=4096)
 def try_values(con: Construct) -> Trial:
-    """Return the results of an adapter of an integer for trial values."""
+    """Apply an adapter of an integer to many values, and return the results."""
     bits = _int_bits(con.subcon)
     if bits <= 8:
         raws: Sequence[int] = range(1 << bits)
@@ -292,7 +292,7 @@ def _find_byte_decoder(con: Construct) -> Callable[[NDArray[np.uint8]], NDArray[
 
 
 def _find_xor(con: Construct) -> construct.ProcessXor | None:
-    """Return the ProcessXor that a part is, or that its FixedSized contain; else None."""
+    """Return the ProcessXor of a part, which may be in a FixedSized; else None."""
     while isinstance(con, construct.FixedSized):
         con = con.subcon
     return con if isinstance(con, construct.ProcessXor) else None

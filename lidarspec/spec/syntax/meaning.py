@@ -359,9 +359,9 @@ class _Builder:
             elif isinstance(con, LimitedNumber):
                 place = place.with_changes(allowed=con.allowed)
             elif isinstance(con, CountField):
-                place = place.with_changes(held=True)
+                place = place.with_changes(is_enforced=True)
             elif isinstance(con, SizeField):
-                place = place.with_changes(rebuilt=self._measure_part(con, place), held=True)
+                place = place.with_changes(rebuilt=self._measure_part(con, place), is_enforced=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
                 if place.scope is None:
@@ -506,18 +506,18 @@ class _Builder:
                 inside = replace(
                     inside,
                     bytes_left=tree.combine(
-                        "-", place.bytes_left, tree.total(map(tree.size, members))
+                        "-", place.bytes_left, tree.sum_sizes(map(tree.size, members))
                     ),
                 )
             members.append(self.node(child, inside))
         for index, member in enumerate(members):
             if isinstance(member, tree.Derived) and member.kind == "peeked":
-                members[index] = _check_peeked(member, members[index + 1 :])
+                members[index] = _make_peeked(member, members[index + 1 :])
         self.scopes[info.path] = scope
         made = tree.Struct(place.name, info.path, tuple(members), info.docs)
         for index, sizing in self._measured.pop(scope):
             part = _find_below(made, sizing.of[sizing.levels_up :])
-            self.sizes[index] = tree.total(
+            self.sizes[index] = tree.sum_sizes(
                 (
                     _sum_member_sizes(members, sizing.since, part.name)
                     if sizing.since
@@ -569,10 +569,10 @@ class _Builder:
     def _make_elements(
         self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
     ) -> tree.Node:
-        """Return the node for elements that fill a part, or end with a certain element.
+        """Return the node of construct's GreedyRange or RepeatUntil.
 
-        The node is an array if all elements have the same fixed size. Otherwise, it is a sequence
-        of parts. If neither is possible, only construct can read the elements.
+        It is an array if all elements have the same fixed size, else a `PartSequence`. If neither
+        is possible, it is a node that only construct can read.
         """
         axis = axis_path(place.info)
         element = self.node(
@@ -977,7 +977,7 @@ def _find_offset_after(
     start: Callable[[], tree.Formula | None], members: Sequence[tree.Node], count: int
 ) -> tree.Formula | None:
     """Return the offset after the first `count` members of a struct."""
-    return tree.combine("+", start(), tree.total(map(tree.size, members[:count])))
+    return tree.combine("+", start(), tree.sum_sizes(map(tree.size, members[:count])))
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
@@ -996,11 +996,11 @@ def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
 
 
 def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
-    """Return a description of a field, changed to that of a computed integer."""
+    """Return the description of a field with the type of computed integers."""
     return replace(info, dtype=np.dtype(np.int64), kind="int", bits=64)
 
 
-def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
+def _make_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
     """Return the node of a field that construct's Peek reads.
 
     If the field may extend beyond the frame, the result is a node that only construct can read.
@@ -1051,7 +1051,7 @@ def _sum_member_sizes(
         last: the name of the last member; "" for `first` alone.
     """
     names = [member.name for member in members]
-    return tree.total(
+    return tree.sum_sizes(
         map(tree.size, members[names.index(first) : names.index(last) + 1 if last else None])
     )
 
@@ -1270,9 +1270,7 @@ def _make_ended_adapter(con: Construct) -> tree.Adapter | None:
 
 
 def _find_constant(con: Const) -> Any:
-    """Return the raw value of a constant.
-
-    If the constant is a name of construct's Enum, this is the number of the name.
+    """Return the raw value of a constant, which may be a name of an Enum.
 
     Raises:
         SpecError: if the Enum does not have the name.

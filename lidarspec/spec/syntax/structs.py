@@ -346,7 +346,7 @@ def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Con
 
 
 def _expand_content(con: Construct, content: Construct) -> list[Construct]:
-    """Return the members that replace a member, given the member without its name."""
+    """Return the members that replace a member if `content` is its content."""
     return _expand_macro(construct.Renamed(content, newname=con.name, newdocs=con.docs))
 
 
@@ -475,7 +475,7 @@ def _is_count(part: Construct, name: str, array: Construct, array_name: str) -> 
 
 
 def _expand_padded(con: Construct, inner: Subconstruct) -> tuple[list[Construct], tuple[str, str]]:
-    """Return the members inside a padded part, and the names of the first and the last."""
+    """Return the members of a padded part, and the names of its first and last member."""
     members = _expand_content(con, inner.subcon)
     return members, (members[0].name, members[-1].name)
 
@@ -841,9 +841,9 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of values in an element of an array of arrays.
+    """Return the number of values that an element of an array contains.
 
-    It is 1 for an element that is not an array, or if its length is not known yet.
+    It is 1 unless the element is itself an array of known length.
     """
     with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
