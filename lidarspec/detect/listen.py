@@ -292,7 +292,7 @@ class _StartProbe:
         end = time.monotonic() + timeout
         while not is_done() and time.monotonic() < end:
             self._session.tick(time.monotonic_ns())
-            for out in self._session.outgoing():
+            for out in self._session.take_outgoing():
                 if out.lines:
                     self._opened.lines(**out.lines)
                 self._opened.write(out.data)

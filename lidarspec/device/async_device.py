@@ -52,7 +52,7 @@ class AsyncDevice:
 
     @property
     def device(self) -> Device:
-        """The device.
+        """The `Device` whose methods are called.
 
         Raises:
             UsageError: if the device is not open yet.

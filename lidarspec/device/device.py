@@ -343,7 +343,7 @@ class Device(ClosingContext):
                 raise self.make_timeout_error()
 
     def newest(self, wait: float) -> Scan | None:
-        """Return the newest whole scan like `latest`, or None after `wait` seconds.
+        """Return the newest whole scan; None if no new scan arrives within `wait` seconds.
 
         Raises:
             SourceError: if the input has ended or the device was closed.
@@ -589,7 +589,7 @@ class Device(ClosingContext):
                 yield batch
 
     def _next_batch(self, wait: float) -> FrameBatch | None:
-        """Return the next batch, and keep the first frames for `warnings`."""
+        """Return the next batch; store the first frames, which `_check_first_frames` needs."""
         batch = self._input.next(wait)
         if self._is_checked or batch is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
             return batch

@@ -280,7 +280,7 @@ def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:
-    """Return the frames that packets use, and the row of each packet's frame.
+    """Return a table without the frames that no packet uses, and the new rows of the packets.
 
     Args:
         table: frames of another type.

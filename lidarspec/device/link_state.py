@@ -99,7 +99,7 @@ class LinkState:
 
     @property
     def warnings(self) -> list[str]:
-        """A warning about the current problem of the link; empty without a problem."""
+        """A list with a warning about the current problem of the link, if there is one."""
         name = self.name
         if name == "disconnected":
             text = "the device is disconnected; waiting for it to return"

@@ -4,8 +4,8 @@ The capture threads queue chunks, which are decoded together every few milliseco
 
 `next` decodes the chunks that have arrived and returns the frames. While it waits, it also runs the
 `Session`: it sends requests, and passes frames that may be replies to the session. Only one thread
-may run the decoders at a time. A call of `send` in another thread waits until this thread has found
-its reply. `LinkState` watches the data link.
+may run the decoders at a time. If another thread calls `send` meanwhile, the thread that runs the
+decoders finds the reply for it. `LinkState` watches the data link.
 """
 
 from __future__ import annotations
@@ -590,7 +590,7 @@ class LiveInput(DeviceInput):
             The error; None if everything was sent.
         """
         failure: LidarSpecError | None = None
-        for outgoing in self._session.outgoing():
+        for outgoing in self._session.take_outgoing():
             try:
                 self._write(outgoing)
             except CommandError:

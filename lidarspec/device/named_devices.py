@@ -57,8 +57,8 @@ class NamedDevice:
         mount: the pose of the sensor; None if not given.
         options: options of the sensor.
         file: the settings file.
-        shadowed_file: another settings file that has a device of this name, which is ignored; "" if
-            there is none.
+        shadowed_file: another settings file, whose device of the same name is ignored; "" if there
+            is none.
         is_trusted: whether the settings file is the user's own, or in a folder that the user has
             allowed.
     """
@@ -134,7 +134,7 @@ def find_device(source: str | Path) -> NamedDevice | None:
     """Return the device with this name; None for every other SOURCE.
 
     Raises:
-        UsageError: for a mistake in the device's file (the message names table and key), for a
+        UsageError: for a mistake in the settings file (the message names table and key), for a
             device that is allowed only in a trusted folder, or for a word that is neither a name
             nor a file.
         SourceError: if the settings file cannot be read.

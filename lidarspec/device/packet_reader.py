@@ -65,9 +65,9 @@ class PacketReader:
         return None
 
     def add(self, batch: FrameBatch) -> Packets | None:
-        """Return the packets in a batch of frames; None while their type is unknown.
+        """Return the packets in a batch of frames; None if their type is not known yet.
 
-        Until the type is known, the frames are kept.
+        Frames that arrive before their type is known are stored for a later call.
         """
         if batch.replaced:
             self._undecided.clear()

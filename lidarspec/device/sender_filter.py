@@ -28,7 +28,7 @@ MAX_SENDERS = 16
 
 
 class SenderCheck:
-    """Checks that one sensor sends all frames of a file.
+    """Checks that all frames of a file are from one sensor.
 
     Args:
         source: the file, for messages.
@@ -177,7 +177,7 @@ class SenderFilter(SenderCheck):
         count_before = len(self._other_senders)
         for name, sender in sent:
             if sender not in self._other_senders:
-                self._find_port(name, sender)
+                self._update_port(name, sender)
                 if self._sensor.frames[name].data:
                     self._owner = sender
         if len(self._other_senders) == count_before or len(sent) < len(frames):
@@ -204,7 +204,8 @@ class SenderFilter(SenderCheck):
         names = self._find_frame_types(sender, chunk)
         if self._is_sure:
             if names:  # the stream comes from another port
-                self._owner = self._find_port("", sender)
+                self._update_port("", sender)
+                self._owner = sender
             return False
         self._is_sure = any(self._sensor.frames[name].data for name in names)
         if self._is_sure or (names and owner is None):
@@ -234,11 +235,10 @@ class SenderFilter(SenderCheck):
         decoder = self._probes.setdefault(sender, self._sensor.decoder(stream=not self._datagrams))
         return {item.frame for item in decoder.feed(chunk.data)}
 
-    def _find_port(self, name: str, sender: Sender) -> Sender:
-        """Return the port that frames of a type come from.
+    def _update_port(self, name: str, sender: Sender) -> None:
+        """Store `sender` as the current port of a frame type.
 
-        If `sender` alternates with other ports, `sender` is returned, and the other ports are added
-        to `_other_senders`.
+        If other ports send this type at the same time, they are added to `_other_senders`.
         """
         concurrent_port = self._find_concurrent_port(name, sender)
         if concurrent_port is not None:
@@ -248,7 +248,6 @@ class SenderFilter(SenderCheck):
                 del self._other_senders[next(iter(self._other_senders))]
             self._current[name] = sender
             self._previous[name] = {}
-        return self._current[name]
 
     def _count_foreign(self, sender: Sender | None) -> None:
         self.foreign += 1

@@ -185,7 +185,7 @@ class ExpectedReply:
         ]
 
     def overlaps(self, other: ExpectedReply) -> bool:
-        """Return whether the same frame could be the reply to this and to another request."""
+        """Return whether one frame could be this reply as well as another expected reply."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -360,7 +360,7 @@ class Session:
         Args:
             name: the name of the command.
             now: the current time, ns.
-            timeout: seconds to wait in total; by default the command's timeout for each sending.
+            timeout: seconds to wait in total; by default, the command's timeout after each sending.
             arguments: the arguments of the command, in their units.
 
         Raises:
@@ -396,8 +396,8 @@ class Session:
         self._advance(command.link, now)
         return pending
 
-    def outgoing(self) -> list[OutgoingData]:
-        """Return everything that has to be sent now, in order, and remove it."""
+    def take_outgoing(self) -> list[OutgoingData]:
+        """Return the data to send now, in order, and remove it from the session."""
         out = self._out
         self._out = []
         return out

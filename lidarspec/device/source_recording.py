@@ -103,7 +103,7 @@ class TimedLog:
 
     @property
     def seconds(self) -> float | None:
-        """The time from the first to the last arrival in the file; None if it has none."""
+        """The time from the first to the last recorded arrival; None if nothing has arrived."""
         if self.first is None or self.last is None:
             return None
         return (self.last - self.first) / 1e9
@@ -345,7 +345,8 @@ class SourceRecording:
         """Update `elapsed`, and return whether a limit is reached.
 
         Args:
-            is_timed: whether the time limit applies to the time since the source was opened.
+            is_timed: whether the recording ends at the time limit; if not, only at the maximum
+                count.
 
         Raises:
             SourceError: if the recorder has failed.

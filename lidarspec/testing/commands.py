@@ -256,7 +256,7 @@ def _run_exchange(
     link = sensor.commands[name].link
     decoder = sensor.decoder(stream=not is_datagram(sensor.links[link]))
     while not pending.done:
-        for out in session.outgoing():
+        for out in session.take_outgoing():
             device.receive(out.data, now, out.link)
         now += STEP_NS
         received = [data for arrived, data in device.outgoing(now) if arrived == link]

@@ -130,7 +130,7 @@ def test_a_reply_without_the_value_is_a_command_error(
 def test_a_command_without_its_value_is_not_sent() -> None:
     session = Session(HANDLES)
     assert "handle is unknown" in str(session.request("start", 0).failure)
-    assert session.outgoing() == []
+    assert session.take_outgoing() == []
 
 
 def test_a_reported_port_that_refuses_the_connection_is_an_error() -> None:

@@ -29,7 +29,7 @@ def ack(code: int, result: int = 0) -> Found:
 
 def sent(session: Session) -> list[str]:
     """Return the messages that are sent now, as hexadecimal bytes."""
-    return [one.data.hex() for one in session.outgoing()]
+    return [one.data.hex() for one in session.take_outgoing()]
 
 
 def receive(sensor: Sensor, session: Session, data: bytes, now: int) -> None:
@@ -86,14 +86,14 @@ def test_what_is_not_documented_is_not_confirmed() -> None:
     session = Session(SENSOR)
     reply = session.request("stop", 5).result()
     assert (reply.confirmed, reply.frame, reply.values, reply.at) == (False, None, None, 5)
-    assert len(session.outgoing()) == 1
-    assert session.outgoing() == []
+    assert len(session.take_outgoing()) == 1
+    assert session.take_outgoing() == []
 
 
 def test_lines_are_moved_without_a_byte() -> None:
     session = Session(SENSOR)
     assert not session.request("spin", 0).result().confirmed
-    (out,) = session.outgoing()
+    (out,) = session.take_outgoing()
     assert (out.link, out.data, dict(out.lines)) == ("data", b"", {"dtr": True})
 
 
@@ -105,7 +105,7 @@ def test_a_wrong_request_sends_nothing() -> None:
         session.request("speed", 0, rate=10, trim=0, turbo=1)
     with pytest.raises(UnknownCommand):
         session.request("spede", 0)
-    assert session.outgoing() == []
+    assert session.take_outgoing() == []
     assert session.deadline is None
     assert not session.busy
 
@@ -117,16 +117,16 @@ def test_requests_go_out_one_at_a_time_and_after_the_settling() -> None:
         session.request("stop", 0),
         session.request("speed", 0, rate=10.0, trim=0),
     )
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     session.receive([ack(1)], 300)
     assert first.done
     assert second.done
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     assert session.deadline == 300 + SECOND // 10  # stop settles for 0.1 s
     session.tick(session.deadline - 1)
-    assert session.outgoing() == []
+    assert session.take_outgoing() == []
     session.tick(session.deadline)
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     session.receive([ack(3)], session.deadline or 0)
     assert third.result()["code"] == 3
 
@@ -163,7 +163,7 @@ def test_the_caller_can_wait_longer_or_shorter() -> None:
     )
     session.request("ask", 0, timeout=0.15)
     session.tick(SECOND // 10)
-    assert len(session.outgoing()) == 2
+    assert len(session.take_outgoing()) == 2
     assert session.deadline == 150_000_000  # not sent a third time
 
 
@@ -178,11 +178,11 @@ def test_a_repeatable_command_is_retried_then_fails() -> None:
     pending = session.request("ask", 0)
     for now in (0, 100_000_000, 200_000_000):
         session.tick(now)
-        assert len(session.outgoing()) == 1
+        assert len(session.take_outgoing()) == 1
     session.tick(300_000_000)
     with pytest.raises(ReplyTimeout, match=r"within 0\.3 s, sent 3 times"):
         pending.result()
-    assert session.outgoing() == []
+    assert session.take_outgoing() == []
 
 
 def test_a_late_answer_is_not_the_next_ones() -> None:
@@ -191,11 +191,11 @@ def test_a_late_answer_is_not_the_next_ones() -> None:
     session.tick(SECOND)
     again = session.request("start", SECOND + 1)
     # The second command waits, because the reply to the first could be taken for its reply.
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     session.receive([ack(1)], SECOND + 2)
     assert not again.done
     assert session.late == 1
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     session.receive([ack(1)], SECOND + 3)
     assert again.result().at == SECOND + 3
     assert session.late == 1
@@ -206,10 +206,10 @@ def test_a_missing_reply_delays_the_next_command_for_a_limited_time() -> None:
     session.request("start", 0)
     session.tick(SECOND)
     again = session.request("start", SECOND)
-    session.outgoing()
+    session.take_outgoing()
     assert session.deadline == 2 * SECOND
     session.tick(2 * SECOND)
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     session.receive([ack(1)], 2 * SECOND + 1)
     assert again.done
     assert session.late == 0
@@ -220,7 +220,7 @@ def test_distinguishable_replies_do_not_delay_commands() -> None:
     session.request("start", 0)
     session.tick(SECOND)
     other = session.request("speed", SECOND, rate=10.0, trim=0.0)
-    assert len(session.outgoing()) == 2
+    assert len(session.take_outgoing()) == 2
     session.receive([ack(1)], SECOND + 1)
     assert session.late == 1
     assert not other.done
@@ -277,7 +277,7 @@ def test_links_do_not_wait_for_each_other() -> None:
     )
     session = Session(sensor)
     start, ask = session.request("start", 0), session.request("ask", 0)
-    assert [out.link for out in session.outgoing()] == ["data", "control"]
+    assert [out.link for out in session.take_outgoing()] == ["data", "control"]
     assert (
         session.awaited_frames(),
         session.awaited_frames("control"),
@@ -307,7 +307,7 @@ def test_echoed_fields_distinguish_replies() -> None:
     session.request("get_config", 0, key=0x70, timeout=1)
     session.tick(SECOND)
     pending = session.request("get_config", SECOND, key=0x7C)
-    assert len(session.outgoing()) == 2  # the answer to another key is no danger
+    assert len(session.take_outgoing()) == 2  # the answer to another key is no danger
     for key, name in ((0x70, "mode_count"), (0x7C, "typical_mode")):
         answer = sensor.build(
             "config", {"descriptor": {"length": 6}, "key": key, "value": {name: 3}}
@@ -324,12 +324,12 @@ def test_a_heartbeat_continues_until_it_is_abandoned() -> None:
     session.request("beat", 0)
     for second in (1, 2, 3):
         assert session.deadline == second * SECOND
-        session.outgoing()
+        session.take_outgoing()
         session.tick(second * SECOND)
-        assert len(session.outgoing()) == 1
+        assert len(session.take_outgoing()) == 1
     session.abandon("closed")
     session.tick(9 * SECOND)
-    assert session.outgoing() == []
+    assert session.take_outgoing() == []
     assert session.deadline is None
 
 
@@ -341,7 +341,7 @@ def test_a_heartbeat_without_an_answer_does_not_pile_up() -> None:
     first = session.request("beat", 0)
     for step in range(1, 10):
         session.tick(step * SECOND // 10)
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     assert not first.done
 
 
@@ -352,7 +352,7 @@ def test_abandoning_frees_the_link_at_once() -> None:
     for pending in (first, second):
         with pytest.raises(CommandError, match="the link was lost"):
             pending.result()
-    assert len(session.outgoing()) == 1
+    assert len(session.take_outgoing()) == 1
     assert session.request("stop", 1).done
     assert not session.busy
 
@@ -392,7 +392,7 @@ def test_late_and_lost_replies_never_match_another_request(seed: int) -> None:
         name = source.choice(("once", "twice", "other"))
         pending = session.request(name, now)
         while not pending.done:
-            for out in session.outgoing():
+            for out in session.take_outgoing():
                 if source.random() < 0.8:
                     delay = source.choice((10, 90, 110, 150, 199)) * SECOND // 1000
                     heapq.heappush(
@@ -439,7 +439,7 @@ def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
 
 def read_request(session: Session) -> list[tuple[int, list[int]]]:
     """Return the sequence number and the address of the request that is sent now."""
-    sent = [CONVERSATION.parse(one.data, "order") for one in session.outgoing()]
+    sent = [CONVERSATION.parse(one.data, "order") for one in session.take_outgoing()]
     return [(one.head.number, list(one.host)) for one in sent]
 
 
