@@ -1,4 +1,4 @@
-"""Shared by live transports: reading a stream, waiting, and system errors."""
+"""Functions that live transports share: read a stream, wait, and describe system errors."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _accepts(self, record: Record) -> bool:
-        """Return whether a record is from the requested sender; count it if not."""
+        """Return whether a record is from the requested sender; otherwise add 1 to `foreign`."""
         if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
@@ -189,7 +189,7 @@ def _describe_skipped(path: str, count: int, size: int) -> str:
 def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
     """Return whether a compressed file was decompressed to its end.
 
-    If it was not, the transport gets a warning and the number of unread bytes.
+    Otherwise, a warning and the number of unread bytes are stored in the transport.
     """
     fault = find_damage(file)
     if fault is not None:

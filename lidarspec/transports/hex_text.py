@@ -279,9 +279,13 @@ def _to_ns(seconds: str | None) -> int | None:
 
 
 def _parse_dump_bytes(text: str) -> bytes:
-    """Return the bytes of a line of a dump whose offset was removed.
+    """Return the bytes of a line of a dump.
 
-    The line may end with the bytes as characters. These are between "|" or follow several blanks.
+    At the end of the line, the bytes may be repeated as characters, between "|" or after several
+    blanks.
+
+    Args:
+        text: the line without its offset.
 
     Raises:
         ValueError: if the characters do not match the bytes.

@@ -64,9 +64,9 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return how far the wall clock is ahead of this clock, in ns, after it was set.
+        """Return the lead of the wall clock over this clock, in ns, if the wall clock was set.
 
-        Returns None if the wall clock was not set since the last call, or by 50 ms or less.
+        Returns None if the lead has changed by at most 50 ms since the last result.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns

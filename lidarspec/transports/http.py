@@ -82,7 +82,7 @@ class HttpTransport(LiveTransport):
         self.closed = True
 
     def _send_request(self, method: str, path: str, body: bytes) -> tuple[int, bytes, str]:
-        """Return a reply's status, body and redirection target.
+        """Send a request; return the status, body and redirection target of the reply.
 
         Raises:
             OSError, HTTPException: if the connection fails.

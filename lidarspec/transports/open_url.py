@@ -94,7 +94,7 @@ def resolve(source: str | Path) -> str:
 
 
 def is_live(source: str | Path) -> bool:
-    """Return whether a SOURCE or a device of `lidarspec.toml` is live, so not a file."""
+    """Return whether a SOURCE, or a device of `lidarspec.toml`, is live; False for a file."""
     return live_address(resolve(source)) is not None
 
 

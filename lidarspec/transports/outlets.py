@@ -738,7 +738,7 @@ class Outlet:
 
         Raises:
             Disconnected: if the listener has disconnected.
-            SourceError, UsageError: if `OutletLine.send` raises them.
+            SourceError, UsageError: the errors of `OutletLine.send`.
         """
         self.data.receive()
         if self.data.has_listener:

@@ -36,7 +36,7 @@ class Origin:
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """Return the origin for a text ADDRESS or ADDRESS:PORT.
+        """Return the requested sender for a text ADDRESS or ADDRESS:PORT.
 
         Examples are "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368".
 
@@ -275,7 +275,7 @@ class LiveTransport(Transport):
 
     @property
     def awaits_port(self) -> bool:
-        """Whether the source is not connected, because the sensor must report its port."""
+        """Whether the source waits for the sensor to report the port to connect to."""
         return False
 
     def connect_to(self, port: int) -> None:
@@ -333,7 +333,7 @@ class LiveTransport(Transport):
         """Open the transport of another link of the same device.
 
         Returns:
-            The transport; None if the caller must open the link at its own address.
+            The transport; None if the caller must open it at the address of the link.
         """
         return None
 

@@ -193,9 +193,10 @@ class Replay:
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        """Yield the chunks; handle chunks without a time.
+        """Yield the chunks, and check that each chunk has a time.
 
-        If times are required, such a chunk is an error; otherwise, `is_timed` is set to False.
+        A chunk without a time raises an error if times are required. Otherwise, `is_timed` is set
+        to False.
         """
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:

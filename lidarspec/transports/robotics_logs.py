@@ -59,7 +59,7 @@ class LogKind(NamedTuple):
     Attributes:
         description: name of the kind, for messages to the user.
         module: name of the module of rosbags that reads the log.
-        reader: name of the class in this module.
+        reader: name of the class that reads the log, in `module`.
         form: the serialization format of the messages in the log, "cdr" or "ros1".
     """
 
@@ -210,7 +210,7 @@ class BagTransport(Transport):
 
     @contextmanager
     def _failures(self) -> Iterator[None]:
-        """Convert all exceptions to SourceError, because damaged files cause many types."""
+        """Convert all exceptions to SourceError: a damaged file can cause any exception."""
         try:
             yield
         except LidarSpecError:

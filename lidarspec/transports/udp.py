@@ -246,8 +246,8 @@ class UdpTransport(LiveTransport):
         sensor: the sensor, for suggested commands in messages.
         remote: the destination of `write`. The default is `sender` if it contains a port, else the
             sender that is passed to `accept`.
-        broadcast: whether `remote` is a broadcast address. The sender that is passed to `accept`
-            replaces a broadcast address.
+        broadcast: whether `remote` is a broadcast address. If so, `accept` replaces it by the
+            address of the sensor.
 
     Attributes:
         ports: the open ports.
@@ -630,7 +630,7 @@ def describe_small_buffer(requested: int, granted: int) -> str:
 
 
 def enlarge_buffer_command(requested: int) -> str:
-    """Return the command that allows programs to request a buffer of this size, bytes."""
+    """Return the command that allows programs to request a buffer of `requested` bytes."""
     return f"sudo sysctl -w net.core.rmem_max={requested}"
 
 
