@@ -332,7 +332,7 @@ class RateSeries:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edges of the time steps, (n + 1,) seconds, and their counts, (3, n).
+        """Return the edges of the time steps, (n + 1,) seconds, and the totals in them, (3, n).
 
         Steps are joined so that there are at most `MAX_TIME_BINS`. The last step is omitted,
         because it is incomplete.

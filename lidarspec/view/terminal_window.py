@@ -244,7 +244,7 @@ class Window:
         self._look = new
 
     def _current_look(self) -> CloudAppearance:
-        """Return the appearance of the picture, with the settings of the keys."""
+        """Return the appearance of the picture, with the settings that keys have changed."""
         if self._look is None:
             return CloudAppearance("range", 1.0, 1.0)
         if self._scan is not None and self._look.ramp != self.settings.ramp:

@@ -109,7 +109,7 @@ def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
 
 
 def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) -> None:
-    """Write the colour ramp, and below it the column and the values at both ends."""
+    """Write the colour ramp, and below it the name of the column and its limits."""
     for step in range(RAMP_STEPS):
         window.write(row, column + step, "━", FIRST_STEP + step)
     low, high = look.ends
