@@ -306,7 +306,8 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
-        Texts by role, for example {"serial": "A1234"}. Numbers are followed by their unit.
+        Name in `info` -> value as text, for example {"serial": "A1234"}. Numbers are followed by
+        their unit.
     """
     items = sorted(frames, key=lambda item: item.offset)
     texts = dict[str, str]()
@@ -459,7 +460,7 @@ class Verdict:
 
 
 def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
-    """Return the scores of the installed sensors with a data frame, best first.
+    """Return the scores of the installed sensors that find a data frame, best first.
 
     Args:
         chunks: datagrams, or pieces of a stream.
