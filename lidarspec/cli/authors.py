@@ -121,8 +121,7 @@ def new(
 def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
     """Return the files with a draft of the frames of a capture.
 
-    Only the packets from one sender to one port are used. Of all such pairs, the pair with the most
-    bytes is used.
+    Only the packets from one sender to one port are used: the sender and port with the most bytes.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:

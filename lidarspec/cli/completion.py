@@ -1,8 +1,8 @@
 """Completion of the command line in bash, zsh and fish.
 
 This module extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the
-code to load into bash. `BY_NAME` maps the name of a parameter to the function that completes it in
-all verbs, for example with sensor ids, frames, fields, commands, ports, or the devices of
+code to load into bash. `BY_NAME` has a completion function for each name of a parameter. The
+function returns, for example, sensor ids, frames, fields, ports, or the devices of
 `lidarspec.toml`.
 """
 
@@ -84,7 +84,7 @@ def complete(group: click.Command, instruction: str) -> int:
 
 
 def attach(command: click.Command) -> None:
-    """Add completion to the parameters of a verb, by the names of the parameters."""
+    """Add completion to the parameters of a verb whose names are in `BY_NAME`."""
     for param in command.params:
         list_names = BY_NAME.get(param.name or "")
         if list_names is not None and isinstance(param.type, click.types.StringParamType):

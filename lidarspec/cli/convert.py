@@ -326,7 +326,7 @@ def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
 
 
 def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> None:
-    """Raise UsageError if these packets have a clock and earlier packets have none, or vice versa.
+    """Raise UsageError unless all packets so far have a clock, or none has.
 
     Args:
         frames_by_clock: the first frame type with and without a clock; updated by this function.

@@ -314,7 +314,7 @@ class FrameSelection:
             raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
-        """Print the numbers of frames and bytes of an input after showing it.
+        """Print how many frames and other bytes the input had, after the last one was shown.
 
         Raises:
             UsageError: if the input ends before the selected bytes.
@@ -377,7 +377,7 @@ def _compare(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print the differences between the first frame of the input and the frame `diff`."""
+    """Print the differences between the first frame of the input and the one `diff` names."""
     frames = (
         piece
         for piece in pieces

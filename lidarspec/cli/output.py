@@ -205,7 +205,7 @@ def emit_parts(
     Args:
         parts: texts of one or more lines, or bytes.
         output: the file; None for standard output.
-        colour: the argument of `say`.
+        colour: passed to `say`.
     """
     if output is None or output == "-":
         for part in parts:
@@ -309,7 +309,7 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 
 
 def render(what: Text) -> str:
-    """Convert a text of rich to a string with colour codes.
+    """Convert a text of the library rich to a string with colour codes.
 
     rich is not used to print the text, because it ends the process if the pipe is closed.
     """

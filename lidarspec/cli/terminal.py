@@ -143,7 +143,7 @@ def _discard_stream(stream: Any) -> None:
 
 @contextlib.contextmanager
 def handle_sigterm() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C, so that the verb removes its symbolic link."""
+    """Handle SIGTERM like Ctrl-C, so that the verb cleans up before it ends."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
