@@ -526,7 +526,7 @@ def convert(
         folder: the path or URL of the folder. The path of an output in the folder is the path of
             its source, without the part of the pattern before the first wildcard.
         to: the suffix of a format, such as "parquet".
-        sensor: as in `lidarspec.open`; by default detected for each file.
+        sensor: an id, a path or a Sensor; by default, the sensor of each file is detected.
         jobs: number of processes on this computer.
         scheduler: the address of a Dask scheduler whose workers are used. They must have access to
             the sources and the folder.
@@ -669,9 +669,10 @@ def read(
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
-        sensor: as in `lidarspec.open`; by default detected for each file.
-        every_point: include points without a valid return.
-        select: as in `convert`.
+        sensor: an id, a path or a Sensor; by default, the sensor of each file is detected.
+        every_point: whether to include points without a valid return.
+        select: the selected scans of each file. If they are selected by time or number, files are
+            not cut.
         size: the size of a piece in bytes. The points of a piece take about ten times as much
             memory.
 

@@ -115,8 +115,8 @@ def _list_names(path: str) -> list[str]:
 def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group that one distribution declares.
 
-    If the distribution's file is not UTF-8, it is reported once, in the group `GROUP`: the first
-    entry has no module, and its `load` raises an error.
+    A file that is not UTF-8 is reported by an additional entry in the group `GROUP`. This entry has
+    no module, and its `load` raises an error.
     """
     text = _read_text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP

@@ -37,7 +37,7 @@ class KnownLink(NamedTuple):
 
 
 class Signature(NamedTuple):
-    """The constant bytes that a data frame begins with, and its size.
+    """The constant bytes at the start of a data frame, and the size of the frame.
 
     Attributes:
         sync: hexadecimal digits of each byte, ".." for a byte that is not constant, separated by

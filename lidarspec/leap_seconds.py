@@ -88,7 +88,7 @@ class LeapSeconds:
         return utc_s
 
     def has_expired(self, utc_s: float) -> bool:
-        """Return whether the table may lack leap seconds before a time, s since 1970."""
+        """Return whether the table may lack leap seconds up to a time (seconds since 1970)."""
         return self.expires_s is not None and utc_s >= self.expires_s
 
 
@@ -108,7 +108,7 @@ def read_leap_seconds() -> LeapSeconds:
 
 
 def parse_leap_seconds(text: str, path: str = "") -> LeapSeconds:
-    """Return the table in the text of a file of either format.
+    """Return the table in a text in the format `leapseconds` or `leap-seconds.list`.
 
     Raises:
         ValueError: if the text has no leap seconds.

@@ -92,7 +92,7 @@ def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
 
 @hookspec(firstresult=True)
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
-    """Return the points of a batch of packets; None calls the sensor's own function.
+    """Return the points of a batch of packets; None to use the sensor's own function.
 
     A hook can, for example, apply a calibration.
     """
@@ -346,7 +346,7 @@ class Registry:
                 self._load(entry)
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
-        """Store the sensor of an entry point, and return its id.
+        """Store the sensor of an entry point, and return a list with the sensor's id.
 
         The names of all other entry points of the sensor are added to its aliases.
         """

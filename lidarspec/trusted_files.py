@@ -67,12 +67,13 @@ def find_distrust(path: Path) -> str:
 
 
 def describe_sharing(status: os.stat_result, others: int) -> str:
-    """Return a text such as "belongs to user 0"; "" if a file is the user's own.
+    """Return why a file is not only the user's own, such as "belongs to user 0"; else "".
 
-    On Windows it is always "".
+    On Windows, the result is always "".
 
     Args:
-        others: the mode bits of permissions that others must not have.
+        status: the status of the file.
+        others: the permissions that other users must not have, as mode bits.
     """
     if os.name == "nt":
         return ""
