@@ -312,7 +312,7 @@ def configure(
 
 
 @dataclasses.dataclass(frozen=True)
-class Turning:
+class RotationSweep:
     """The simulated values of each packet, while the sensor turns at one speed.
 
     A revolution consists of a start packet, packets of 25 samples, and a shorter packet. Three
@@ -322,17 +322,18 @@ class Turning:
         hertz: revolutions per second.
         steps: points per revolution.
         exposure: the exposure at the beginning.
-        before: the values of the packets that complete the previous revolution, at another speed.
+        previous_values: the values of the packets that complete the previous revolution, which has
+            another speed.
         firmware: the customer firmware.
-        follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.
+        exposure_follows_speed: whether the exposure follows the speed, as on an M1C1_Mini.
     """
 
     hertz: float = LOW_SPEED_HZ
     steps: int = POINTS_PER_TURN
     exposure: int = HIGH_EXPOSURE  # after power-on (manual 2.2.3, Exp_M)
-    before: tuple[dict[str, float], ...] = ()
+    previous_values: tuple[dict[str, float], ...] = ()
     firmware: int = 0
-    follows_speed: bool = True
+    exposure_follows_speed: bool = True
 
     @property
     def packets(self) -> int:
@@ -341,9 +342,9 @@ class Turning:
 
     def __call__(self, i: int) -> dict[str, float]:
         """Return the values of packet i."""
-        if i < len(self.before):
-            return self.before[i]
-        packet = (i - len(self.before)) % self.packets
+        if i < len(self.previous_values):
+            return self.previous_values[i]
+        packet = (i - len(self.previous_values)) % self.packets
         first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES_PER_PACKET
         samples = 1 if packet == 0 else min(SAMPLES_PER_PACKET, self.steps - first)
         state = {0: round(self.hertz * 10), 1: self.firmware}
@@ -358,8 +359,8 @@ class Turning:
 
     def find_exposure(self, i: int) -> int:
         """Return the exposure of packet i."""
-        turns = (i - len(self.before)) // self.packets
-        if turns < TURNS_BEFORE_EXPOSURE or not self.follows_speed:
+        turns = (i - len(self.previous_values)) // self.packets
+        if turns < TURNS_BEFORE_EXPOSURE or not self.exposure_follows_speed:
             return self.exposure
         if self.hertz < LOW_EXPOSURE_BELOW_HZ:
             return LOW_EXPOSURE
@@ -368,7 +369,7 @@ class Turning:
         return self.exposure
 
 
-def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
+def change_speed(sweep: RotationSweep, i: int, hertz: float) -> RotationSweep:
     """Return the sweep from packet i on; its speed changes after the revolution.
 
     Args:
@@ -377,13 +378,13 @@ def change_speed(sweep: Turning, i: int, hertz: float) -> Turning:
         hertz: the new revolutions per second. The points per second do not change.
     """
     values = map(sweep, itertools.count(i))
-    before = tuple(itertools.takewhile(lambda packet: not packet["mt.start"], values))
+    previous_values = tuple(itertools.takewhile(lambda packet: not packet["mt.start"], values))
     return dataclasses.replace(
         sweep,
         hertz=hertz,
         steps=round(sweep.hertz * sweep.steps / hertz),
         exposure=sweep.find_exposure(i),
-        before=before,
+        previous_values=previous_values,
     )
 
 
@@ -391,7 +392,7 @@ def older_sweep(i: int) -> dict[str, float]:
     """Return the simulated values of packet i of the older M1C1_Mini."""
     return {
         name: value
-        for name, value in Turning()(i).items()
+        for name, value in RotationSweep()(i).items()
         if name not in ("mt.m", "samples.exposure")
     }
 
@@ -505,7 +506,7 @@ M1C1_MINI = Sensor(
     # The commands of the exposure probably set the speed, which the exposure follows: the SDK gives
     # both pairs of names to the same bytes
     simulation=Simulation(
-        Turning(firmware=CUSTOMER_FIRMWARE),
+        RotationSweep(firmware=CUSTOMER_FIRMWARE),
         answers={"start": make_start_packets(3, b"M1C1_Mini", 4), "get_version": VERSION},
         effects={
             "low_exposure": partial(change_speed, hertz=LOW_SPEED_HZ),
@@ -601,14 +602,14 @@ def make_coin(model: str, **facts: Any) -> Sensor:
 def make_coin_simulation(model: str, **turns: Any) -> Simulation:
     """Return a simulated COIN, which sends its model after the start command.
 
-    `turns` are arguments of `Turning`.
+    `turns` are arguments of `RotationSweep`.
     """
     answers = {
         "start": make_start_packets(1, model.encode(), 1, b"\xfa\xfa"),
         "get_version": VERSION,
     }
-    turning = Turning(exposure=LOW_EXPOSURE, follows_speed=False, **turns)
-    return Simulation(turning, answers=answers)
+    sweep = RotationSweep(exposure=LOW_EXPOSURE, exposure_follows_speed=False, **turns)
+    return Simulation(sweep, answers=answers)
 
 
 COIN_D4 = make_coin(
