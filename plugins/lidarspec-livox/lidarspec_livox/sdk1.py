@@ -241,11 +241,11 @@ def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulati
     _, count, returns, _ = DATA_TYPES[name]
     shots = np.arange(count)[:, None] if returns > 1 else np.arange(count)
 
-    def look(i: int) -> tuple[Any, Any]:
+    def simulate_angles(i: int) -> tuple[Any, Any]:
         return simulated_angles(i * count + shots, rate, view)
 
     def sweep(i: int) -> dict[str, Any]:
-        azimuth, elevation = look(i)
+        azimuth, elevation = simulate_angles(i)
         angles = {
             "points.azimuth": np.ravel(azimuth) % 360,
             "points.zenith": 90 - np.ravel(elevation),
@@ -253,7 +253,7 @@ def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulati
         return {**make_header(round(i * count * 1e9 / rate)), **angles}
 
     return Simulation(
-        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more
+        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in simulate_angles(i)), **more
     )
 
 

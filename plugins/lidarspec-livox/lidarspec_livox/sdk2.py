@@ -310,11 +310,11 @@ def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) ->
     """
     points = len(shots)
 
-    def look(i: int) -> tuple[Any, Any]:
+    def simulate_angles(i: int) -> tuple[Any, Any]:
         return simulated_angles(i * points + shots, rate, view)
 
     def sweep(i: int) -> dict[str, Any]:
-        azimuth, elevation = look(i)
+        azimuth, elevation = simulate_angles(i)
         frame, number = divmod(i, int(rate / 10 / points))
         return {
             "time_interval": points / rate,
@@ -327,7 +327,7 @@ def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) ->
         }
 
     return Simulation(
-        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more
+        sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in simulate_angles(i)), **more
     )
 
 
