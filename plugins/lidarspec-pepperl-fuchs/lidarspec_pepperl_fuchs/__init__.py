@@ -318,7 +318,7 @@ COMMANDS = {
 }
 
 
-def answer(**values: Any) -> list[Any]:
+def make_answer(**values: Any) -> list[Any]:
     """Return a simulated reply without an error."""
     page = {**values, "error_code": 0, "error_text": "success"}
     return [("reply", {"status": 200, "body": json.dumps(page).encode()})]
@@ -326,19 +326,19 @@ def answer(**values: Any) -> list[Any]:
 
 SIMULATED_HANDLE = "s10"
 ANSWERS: Mapping[str, Any] = {
-    **{name: answer() for name in COMMANDS},
-    "request_handle": lambda request: answer(
+    **{name: make_answer() for name in COMMANDS},
+    "request_handle": lambda request: make_answer(
         handle=SIMULATED_HANDLE, port=request["{data_port}"] or 1
     ),
-    "get_scan_parameters": answer(
+    "get_scan_parameters": make_answer(
         scan_frequency=SCAN_RATE_HZ,
         samples_per_scan=SAMPLES,
         angular_fov=360,
         radial_range_min=0.1,
         radial_range_max=30,
     ),
-    "get_product": answer(product="OMD30M-R2000", device_family=1),
-    "get_protocol_info": answer(protocol_name="pfsdp", version_major=1, version_minor=4),
+    "get_product": make_answer(product="OMD30M-R2000", device_family=1),
+    "get_protocol_info": make_answer(protocol_name="pfsdp", version_major=1, version_minor=4),
 }
 
 
