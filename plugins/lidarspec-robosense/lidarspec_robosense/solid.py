@@ -66,15 +66,15 @@ class Scanner:
         channels: the number of channels per block.
         packets: the number of packets per frame with single return.
         first: the number of the first packet of a frame.
-        wide, high: the width and height of the simulated field of view in degrees.
+        width_deg, height_deg: the width and height of the simulated field of view.
     """
 
     blocks: int
     channels: int
     packets: int
     first: int
-    wide: float
-    high: float
+    width_deg: float
+    height_deg: float
 
 
 def make_packet(
@@ -119,9 +119,9 @@ RETURN_NUMBER = "return_seq" / Enum(Int8ub, **RETURN_NUMBERS)
 UNCHECKED_NOTE = "not checked: the covered bytes are not documented"
 CRC_AND_COUNTER = ("crc" / Int32ub * UNCHECKED_NOTE, "rolling_counter" / Int16ub)
 
-M2_SCANNER = Scanner(25, 5, 1260, 1, wide=120, high=25)
-MX_SCANNER = Scanner(50, 2, 630, 1, wide=120, high=25)
-E1_SCANNER = Scanner(96, 1, 288, 0, wide=120, high=90)
+M2_SCANNER = Scanner(25, 5, 1260, 1, width_deg=120, height_deg=25)
+MX_SCANNER = Scanner(50, 2, 630, 1, width_deg=120, height_deg=25)
+E1_SCANNER = Scanner(96, 1, 288, 0, width_deg=120, height_deg=90)
 
 M2_DATA = make_packet(
     M2_SCANNER, Int8ub, (RETURN_NUMBER,), ONE_RETURN, "reserved_end" / Bytes(4), *CRC_AND_COUNTER
@@ -279,8 +279,12 @@ def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
     lines = 100
     line, along = np.divmod(progress * lines, 1)
     along = np.where(line % 2, 1 - along, along)
-    azimuth = np.deg2rad((0.5 - (along + np.arange(model.channels)) / model.channels) * model.wide)
-    elevation = np.deg2rad(np.broadcast_to((0.5 - line / (lines - 1)) * model.high, azimuth.shape))
+    azimuth = np.deg2rad(
+        (0.5 - (along + np.arange(model.channels)) / model.channels) * model.width_deg
+    )
+    elevation = np.deg2rad(
+        np.broadcast_to((0.5 - line / (lines - 1)) * model.height_deg, azimuth.shape)
+    )
     offsets = np.arange(model.blocks) / (model.packets * FRAME_RATE_HZ * model.blocks)
     return {
         "pkt_psn": number + model.first,
