@@ -44,7 +44,7 @@ ANGLE_TOLERANCE_DEG = 1e-4
 
 
 @dataclass(frozen=True)
-class Kind:
+class ScannerFamily:
     """The possible settings of a family of models.
 
     A simulated scanner uses the first rate and the first step.
@@ -86,15 +86,19 @@ def any_of(conditions: list[Any]) -> Any:
     return result
 
 
-COARSE = Kind((15,), (1,), -45, 271)
-TIM5 = Kind((15,), (0.3333,), -45, 811)
-TIM7 = Kind((15,), (0.3333,), -45, 811)
-LMS1 = Kind((50, 25), (0.5, 0.25), -45, 541, echoes=2)
-LMS5 = Kind((50, 25, 35, 75, 100), (0.5, 0.1667, 0.25, 0.3333, 0.6667, 1), -5, 381, echoes=5)
-MRS1 = Kind((50,), (0.25,), -47.5, 1101, echoes=3, layers=(0, -2.5, 2.5, -5))  # 8020494, 3.5.10
+COARSE = ScannerFamily((15,), (1,), -45, 271)
+TIM5 = ScannerFamily((15,), (0.3333,), -45, 811)
+TIM7 = ScannerFamily((15,), (0.3333,), -45, 811)
+LMS1 = ScannerFamily((50, 25), (0.5, 0.25), -45, 541, echoes=2)
+LMS5 = ScannerFamily(
+    (50, 25, 35, 75, 100), (0.5, 0.1667, 0.25, 0.3333, 0.6667, 1), -5, 381, echoes=5
+)
+MRS1 = ScannerFamily(
+    (50,), (0.25,), -47.5, 1101, echoes=3, layers=(0, -2.5, 2.5, -5)
+)  # 8020494, 3.5.10
 
-#: Id -> model, kind, range limits in m, status.
-MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
+#: Id -> model, family, range limits in m, status.
+MODELS: dict[str, tuple[str, ScannerFamily, tuple[float, float], str]] = {
     "sick-tim551": ("TiM551", COARSE, (0.05, 10), "vectors"),
     "sick-tim561": ("TiM561", TIM5, (0.05, 10), "manual"),
     "sick-tim571": ("TiM571", TIM5, (0.05, 25), "manual"),
@@ -108,12 +112,18 @@ MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
 }
 
 
-def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
+def sweep(i: int, family: ScannerFamily, echoes: int = 1) -> dict[str, Any]:
     """Return the values of simulated telegram i with this number of echoes."""
-    rate = kind.rates[0]
-    step = kind.steps[0]
+    rate = family.rates[0]
+    step = family.steps[0]
     channels = [f"{name}{number}" for number in range(1, echoes + 1) for name in ("dist", "rssi")]
-    values = {"start": kind.start, "step": step, "count": kind.beams, "scale": 1.0, "offset": 0.0}
+    values = {
+        "start": family.start,
+        "step": step,
+        "count": family.beams,
+        "scale": 1.0,
+        "offset": 0.0,
+    }
     return {
         **{f"{channel}.{name}": value for channel in channels for name, value in values.items()},
         **dict.fromkeys((*ABSENT_PARTS, "encoder_count", "inputs", "outputs", "status"), 0),
@@ -123,27 +133,27 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
         "scan_counter": i % 65_536,
         "time": i / rate * 1e6 % 2**32,
         "sent": (i + 1) / rate * 1e6 % 2**32,
-        "layer": kind.layers[i % len(kind.layers)],
+        "layer": family.layers[i % len(family.layers)],
         "scan_rate": rate,
-        "beam_rate": 360 / step * rate / len(kind.layers),
+        "beam_rate": 360 / step * rate / len(family.layers),
         "channels": len(channels),
     }
 
 
-def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
+def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
     """Return the frames of scans, of commands and of replies.
 
     Scans can be received in CoLa A and in CoLa B; those in `cola` come first. Commands and replies
-    are only in `cola`. There are frames for scans with one echo, and with `kind.echoes` echoes.
+    are only in `cola`. There are frames for scans with one echo, and with `family.echoes` echoes.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
-    if kind.echoes > 1:
+    if family.echoes > 1:
         names = {"A": "echoes_text", "B": "echoes"}
-        simulation = Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
+        simulation = Simulation(partial(sweep, family=family, echoes=family.echoes))
         frames |= {
             names[form]: dataclasses.replace(
-                make_scan_frame(form, kind.echoes), simulation=simulation
+                make_scan_frame(form, family.echoes), simulation=simulation
             )
             for form in forms
         }
@@ -161,19 +171,19 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
     Raises:
         UsageError: if the scanner has fewer echoes.
     """
-    kind = MODELS[sensor.id][1]
-    if echoes not in range(kind.echoes + 1):
+    family = MODELS[sensor.id][1]
+    if echoes not in range(family.echoes + 1):
         raise UsageError(
-            f"{sensor.id}: echoes must be a number from 1 to {kind.echoes}, not {echoes!r}"
+            f"{sensor.id}: echoes must be a number from 1 to {family.echoes}, not {echoes!r}"
         )
-    frames = make_frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
+    frames = make_frames(dataclasses.replace(family, echoes=echoes or family.echoes), cola)
     return dataclasses.replace(
         sensor, frames=frames, commands=make_commands("text" if cola == "A" else "scan")
     )
 
 
-def describe_difference(own: Kind, other: Kind) -> str | Relative:
-    """Return how to recognize a scanner of another kind."""
+def describe_difference(own: ScannerFamily, other: ScannerFamily) -> str | Relative:
+    """Return how to recognize a scanner of another family."""
     if own == other:
         return (
             "the scans are identical; the reply to get_identity and the label on the housing"
@@ -187,16 +197,16 @@ def describe_difference(own: Kind, other: Kind) -> str | Relative:
 
 def make_scanner(name: str) -> Sensor:
     """Return the sensor of one row of `MODELS`."""
-    model, kind, limits, status = MODELS[name]
+    model, family, limits, status = MODELS[name]
     return Sensor(
         name,
         vendor="SICK",
         model=model,
-        frames=make_frames(kind, "B"),
+        frames=make_frames(family, "B"),
         points=None,
         scan=OnChange("telegram_counter")
-        if len(kind.layers) == 1
-        else OnFlag("layer", kind.layers[0]),
+        if len(family.layers) == 1
+        else OnFlag("layer", family.layers[0]),
         clock=Clock("time", wraps_at=CLOCK_WRAP_S, epoch="boot"),
         sequence=PacketCounter("telegram_counter"),
         links={"data": Tcp(2112)},
@@ -204,16 +214,16 @@ def make_scanner(name: str) -> Sensor:
         on_open=("start",),
         on_close=("stop",),
         simulation=Simulation(
-            partial(sweep, kind=kind),
+            partial(sweep, family=family),
             answers={
                 **SIMULATED_ANSWERS,
-                "get_scan": (("scan", {**sweep(0, kind), "kind": REPLY_KIND}),),
+                "get_scan": (("scan", {**sweep(0, family), "kind": REPLY_KIND}),),
             },
         ),
         configure=configure,
         range_limits=limits,
         relatives={
-            other: describe_difference(kind, row[1])
+            other: describe_difference(family, row[1])
             for other, row in MODELS.items()
             if other != name
         },
