@@ -152,7 +152,7 @@ def make_rplidar(
     *,
     link: Link,
     motor: Mapping[str, Command],
-    unit: units.Unit,
+    unit: units.SimulatedUnit,
     range_limits: tuple[float, float],
     turn: tuple[float, float] | None = None,
     status: str,

@@ -52,7 +52,7 @@ class Mode:
 
 
 @dataclass(frozen=True)
-class Unit:
+class SimulatedUnit:
     """Values of a simulated unit.
 
     Attributes:
@@ -112,7 +112,7 @@ class Unit:
         return (DESCRIPTORS[self.modes[number].kind if number else EXPRESS],)
 
 
-A1 = Unit(
+A1 = SimulatedUnit(
     0x18,
     (
         Mode("Standard", 508, 12, NODE),
@@ -121,7 +121,7 @@ A1 = Unit(
         Mode("Sensitivity", 127, 12, ULTRA),
     ),
 )
-A2 = Unit(
+A2 = SimulatedUnit(
     0x28,
     (
         Mode("Standard", 500, 12, NODE),
@@ -130,7 +130,7 @@ A2 = Unit(
         Mode("Sensitivity", 125, 12, ULTRA),
     ),
 )
-A3 = Unit(
+A3 = SimulatedUnit(
     0x31,
     (
         Mode("Standard", 250, 16, NODE),
@@ -139,8 +139,8 @@ A3 = Unit(
         Mode("Sensitivity", 63, 25, ULTRA),
     ),
 )
-S1 = Unit(0x61, (Mode("Standard", 217, 40, NODE), Mode("Express", 109, 40, EXPRESS)))
-S2 = Unit(0x71, (Mode("Standard", 125, 30, NODE), Mode("DenseBoost", 31, 30, DENSE)))
-S3 = Unit(0x81, (Mode("Standard", 125, 40, NODE), Mode("DenseBoost", 31, 40, DENSE)))
-T1 = Unit(0x91, (Mode("Standard", 125, 40, NODE), Mode("Sensitivity", 31, 40, ULTRA)))
-C1 = Unit(0x41, (Mode("Standard", 200, 12, NODE), Mode("DenseBoost", 200, 12, DENSE)))
+S1 = SimulatedUnit(0x61, (Mode("Standard", 217, 40, NODE), Mode("Express", 109, 40, EXPRESS)))
+S2 = SimulatedUnit(0x71, (Mode("Standard", 125, 30, NODE), Mode("DenseBoost", 31, 30, DENSE)))
+S3 = SimulatedUnit(0x81, (Mode("Standard", 125, 40, NODE), Mode("DenseBoost", 31, 40, DENSE)))
+T1 = SimulatedUnit(0x91, (Mode("Standard", 125, 40, NODE), Mode("Sensitivity", 31, 40, ULTRA)))
+C1 = SimulatedUnit(0x41, (Mode("Standard", 200, 12, NODE), Mode("DenseBoost", 200, 12, DENSE)))
