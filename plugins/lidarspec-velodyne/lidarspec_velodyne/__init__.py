@@ -187,7 +187,7 @@ def make_vls128_firings(returns: int) -> Firings:
         period=20 * GROUP_PERIOD_S,
         focal_distance=0.05863,
         product=VLS128_PRODUCT,
-        sharing=4,
+        blocks_per_azimuth=4,
         returns=returns,
         start=-7e-6,  # the packet's time is about that of the fourth group
     )

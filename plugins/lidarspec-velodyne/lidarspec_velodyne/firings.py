@@ -49,7 +49,7 @@ class Firings:
             distance.
         product: the value of the product byte for this model.
         offset: degrees to the left of the azimuth for each slot, in the shape of `elevation`.
-        sharing: with single return, the number of blocks with the same azimuth.
+        blocks_per_azimuth: with single return, the number of blocks with the same azimuth.
         returns: the number of returns of each firing; 0 if the packets contain this number.
         start: seconds from the time of the packet to its first firing.
     """
@@ -60,7 +60,7 @@ class Firings:
     focal_distance: float
     product: int
     offset: NDArray[np.float64] | float = 0.0
-    sharing: int = 1
+    blocks_per_azimuth: int = 1
     returns: int = 0
     start: float = 0.0
 
@@ -97,7 +97,10 @@ def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Pol
         azimuth=-np.deg2rad(clockwise),
         elevation=np.deg2rad(model.elevation),
         intensity=f.blocks.channels.intensity,
-        time=np.where(dual, block // (2 * model.sharing), block // model.sharing) * model.period
+        time=np.where(
+            dual, block // (2 * model.blocks_per_azimuth), block // model.blocks_per_azimuth
+        )
+        * model.period
         + (model.delay + model.start),
         ring=model.ring,
         return_index=np.where(dual, block % 2, 0),
@@ -108,7 +111,11 @@ def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Pol
 def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> Any:
     """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
-    ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
+    ahead = np.where(
+        dual,
+        following(azimuth, 2 * model.blocks_per_azimuth),
+        following(azimuth, model.blocks_per_azimuth),
+    )
     repeat = last_block == "previous"
     return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * model.period, repeat=repeat)
 
@@ -131,7 +138,7 @@ def pace(f: Fields, model: Firings) -> Any:
 
     With dual return, a packet has half as many shots as with single return.
     """
-    shots = BLOCKS // model.sharing
+    shots = BLOCKS // model.blocks_per_azimuth
     return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period
 
 
@@ -141,10 +148,12 @@ def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
     `flags` are the flags of the blocks, if the model has them.
     """
     dual = model.returns == 2
-    sharing = model.sharing * (2 if dual else 1)
-    shots = model.blocks // sharing
+    blocks_per_azimuth = model.blocks_per_azimuth * (2 if dual else 1)
+    shots = model.blocks // blocks_per_azimuth
     azimuth = (
-        np.round((i * shots + np.arange(model.blocks) // sharing) * model.period * 10 * 360, 2)
+        np.round(
+            (i * shots + np.arange(model.blocks) // blocks_per_azimuth) * model.period * 10 * 360, 2
+        )
         % 360
     )
     values = {

@@ -72,30 +72,30 @@ SIMULATED_SPEED_HZ = 10
 
 
 @dataclass(frozen=True)
-class Unit:
+class UnitCalibration:
     """The calibration of one HDL-64E, and the firing times of its model series.
 
     Attributes:
         period: seconds from shot to shot.
-        firing: microseconds from the start of one group of four lasers to the start of the next
-            group.
-        within: delay of each of the four lasers within a group, in microseconds.
+        group_period: microseconds from the first firing of a group of four lasers to that of the
+            next group.
+        delays_in_group: the delay of each of the four lasers of a group, in microseconds.
         vertical: elevation of the 64 lasers in degrees.
         offset: direction of each laser, in degrees to the left of the azimuth.
         height: offset of each beam upwards, perpendicular to the beam, in metres.
         distance: metres to add to the measured distance.
-        aside: offset of each beam to the left, perpendicular to the beam, in metres.
+        left_offset: offset of each beam to the left, perpendicular to the beam, in metres.
         nominal: whether these are the values of the example unit.
     """
 
     period: float
-    firing: float
-    within: tuple[float, ...]
+    group_period: float
+    delays_in_group: tuple[float, ...]
     vertical: tuple[float, ...]
     offset: tuple[float, ...]
     height: tuple[float, ...]
     distance: tuple[float, ...]
-    aside: tuple[float, ...] = (0.026, -0.026) * SLOTS
+    left_offset: tuple[float, ...] = (0.026, -0.026) * SLOTS
     nominal: bool = True
 
     def arrange_by_block(self, values: Any) -> Any:
@@ -106,14 +106,14 @@ class Unit:
     def delay(self) -> Any:
         """Seconds from the beginning of a shot to the firing of each slot, (slots,)."""
         slot = np.arange(SLOTS)
-        return (slot // 4 * self.firing + np.take(self.within, slot % 4)) * 1e-6
+        return (slot // 4 * self.group_period + np.take(self.delays_in_group, slot % 4)) * 1e-6
 
 
 # fmt: off
-S2 = Unit(
+S2 = UnitCalibration(
     period=48e-6,
-    firing=6.0,
-    within=(0.0, 1.26, 2.46, 3.66),
+    group_period=6.0,
+    delays_in_group=(0.0, 1.26, 2.46, 3.66),
     vertical=(
         -8.769, -8.356, 2.486, 2.977, -7.782, -7.264, -10.861, -10.363, -6.861, -6.26, -9.818, -9.34, -2.593, -2.055, -5.669, -5.193,
         -1.587, -1.154, -4.705, -4.169, -0.569, -0.218, -3.714, -3.189, 3.502, 4.004, 0.508, 0.977, 4.493, 4.97, 1.445, 1.972, -22.727,
@@ -140,10 +140,10 @@ S2 = Unit(
         1.445, 1.386, 1.464, 1.372, 1.464, 1.307, 1.438, 1.359, 1.448, 1.433,
     ),
 )
-S3 = Unit(
+S3 = UnitCalibration(
     period=57.6e-6,
-    firing=7.2,
-    within=(0.0, 1.3, 2.5, 3.7),
+    group_period=7.2,
+    delays_in_group=(0.0, 1.3, 2.5, 3.7),
     vertical=(
         -6.29, -5.89, 1.15, 1.52, -5.61, -5.29, -7.63, -7.26, -4.96, -4.57, -7, -6.64, -2.22, -1.84, -4.26, -3.84, -1.55, -1.18, -3.58,
         -3.2, -0.88, -0.52, -2.91, -2.53, 1.86, 2.19, -0.15, 0.23, 2.51, 2.81, 0.48, 0.89, -21.77, -21.28, -10.67, -9.99, -20.91,
@@ -197,7 +197,7 @@ def is_dual(f: Fields) -> Any:
     return f.blocks[0].azimuth == f.blocks[2].azimuth
 
 
-def points(f: Fields, unit: Unit) -> Polar:
+def points(f: Fields, unit: UnitCalibration) -> Polar:
     """Return the points of a packet; each laser has its own origin."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
@@ -209,7 +209,7 @@ def points(f: Fields, unit: Unit) -> Polar:
     )
     elevation = np.deg2rad(unit.arrange_by_block(unit.vertical))
     height = unit.arrange_by_block(unit.height)
-    aside = unit.arrange_by_block(unit.aside)
+    left_offset = unit.arrange_by_block(unit.left_offset)
     back = -height * np.sin(elevation)
     cos = np.cos(clockwise)
     sin = np.sin(clockwise)
@@ -222,12 +222,16 @@ def points(f: Fields, unit: Unit) -> Polar:
         time=np.where(is_dual_return, block // 4, block // 2) * unit.period + unit.delay,
         ring=unit.arrange_by_block(np.argsort(np.argsort(unit.vertical))),
         return_index=np.where(is_dual_return, block // 2 % 2, 0),
-        origin=(back * cos + aside * sin, aside * cos - back * sin, height * np.cos(elevation)),
+        origin=(
+            back * cos + left_offset * sin,
+            left_offset * cos - back * sin,
+            height * np.cos(elevation),
+        ),
         nominal=unit.nominal,
     )
 
 
-def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sensor:
+def configure(unit: UnitCalibration, sensor: Sensor, /, *, calibration: str | Path) -> Sensor:
     """Return the sensor with the corrections of one unit.
 
     Args:
@@ -260,14 +264,14 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
     offset, vertical, *metres = (
         tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
     )
-    distance, height, aside = (tuple(value / 100 for value in column) for column in metres)
+    distance, height, left_offset = (tuple(value / 100 for value in column) for column in metres)
     corrected = replace(
         unit,
         vertical=vertical,
         offset=offset,
         distance=distance,
         height=height,
-        aside=aside,
+        left_offset=left_offset,
         nominal=False,
     )
     return replace(sensor, points=partial(points, unit=corrected))
@@ -281,7 +285,7 @@ def _parse_number(laser: ElementTree.Element, name: str) -> float:
     return value
 
 
-def pace(f: Fields, unit: Unit) -> Any:
+def pace(f: Fields, unit: UnitCalibration) -> Any:
     """Return the seconds from a packet to the next.
 
     A packet has six shots, or three with dual return.
@@ -289,7 +293,7 @@ def pace(f: Fields, unit: Unit) -> Any:
     return np.where(is_dual(f), 3, 6) * unit.period
 
 
-def sweep(i: int, unit: Unit) -> dict[str, Any]:
+def sweep(i: int, unit: UnitCalibration) -> dict[str, Any]:
     """Return the values of simulated packet i, with single return."""
     shot = i * (BLOCKS // 2) + np.arange(BLOCKS) // 2
     azimuth = np.round(shot * unit.period * SIMULATED_SPEED_HZ * 360, 2) % 360
@@ -304,7 +308,7 @@ def sweep(i: int, unit: Unit) -> dict[str, Any]:
 FRAMES = {"data": Frame(DATA, data=True, plausible=plausible)}
 
 
-def make_sensor(series: str, unit: Unit, other: str) -> Sensor:
+def make_sensor(series: str, unit: UnitCalibration, other: str) -> Sensor:
     """Return the sensor of a series.
 
     `other` is the other series, "s2" or "s3".
