@@ -52,7 +52,7 @@ from lidarspec.spec import (
 )
 from lidarspec_ydlidar.models import MODELS, Model
 from lidarspec_ydlidar.requests import ANSWERS, COMMANDS, REQUEST, SCAN_START
-from lidarspec_ydlidar.samples import Form
+from lidarspec_ydlidar.samples import SampleFormat
 
 SAMPLES_PER_PACKET = 40  # number of samples of a full packet (protocol, LSN)
 SIMULATED_SPEED_HZ = 6.0  # within the limits of all models
@@ -89,9 +89,9 @@ def plausible(f: Fields) -> Any:
 
 
 @cache
-def make_data_frame(form: Form) -> Frame:
+def make_data_frame(sample_format: SampleFormat) -> Frame:
     """Return the frame of a packet with samples of this format."""
-    frequency = Scaled(BitsInteger(7), 0.1, "Hz", form.slowest)
+    frequency = Scaled(BitsInteger(7), 0.1, "Hz", sample_format.slowest)
     struct = Struct(
         "header" / Const(b"\xaa\x55"),
         "ct"
@@ -108,31 +108,41 @@ def make_data_frame(form: Form) -> Frame:
         "fsa" / make_angle() * "angle of the first sample",
         "lsa" / make_angle() * "angle of the last sample",
         "cs" / Int16ul,
-        "samples" / Array(this.lsn, form.struct),
+        "samples" / Array(this.lsn, sample_format.struct),
     )
-    checked_struct = Checksummed(struct, field="cs", algorithm=WordXor(head=8, groups=form.groups))
-    return Frame(checked_struct, data=True, max_length=10 + form.size * 255, plausible=plausible)
+    checked_struct = Checksummed(
+        struct, field="cs", algorithm=WordXor(head=8, groups=sample_format.groups)
+    )
+    return Frame(
+        checked_struct, data=True, max_length=10 + sample_format.size * 255, plausible=plausible
+    )
 
 
 @cache
-def make_points_function(form: Form) -> Callable[[Fields], Points]:
+def make_points_function(sample_format: SampleFormat) -> Callable[[Fields], Points]:
     """Return the `points` function of packets with samples of this format."""
-    return partial(points, form=form)
+    return partial(points, sample_format=sample_format)
 
 
-def points(f: Fields, form: Form) -> Polar:
+def points(f: Fields, sample_format: SampleFormat) -> Polar:
     """Return points at equal angular steps from FSA to LSA.
 
     On models that measure by triangulation, angles are corrected by an amount that depends on the
     distance ("angle analysis").
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
-    clockwise = raw if form.correction is None else raw + form.correction(f.samples.distance)
-    rate_hz = last(f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > form.slowest))
+    clockwise = (
+        raw
+        if sample_format.correction is None
+        else raw + sample_format.correction(f.samples.distance)
+    )
+    rate_hz = last(
+        f.ct.frequency, where=(f.ct.start == 1) & (f.ct.frequency > sample_format.slowest)
+    )
     return Polar(
         range=f.samples.distance,
         azimuth=-np.deg2rad(clockwise),
-        intensity=f.samples.intensity if form.has_intensity else None,
+        intensity=f.samples.intensity if sample_format.has_intensity else None,
         time=np.nan_to_num((raw - f.fsa.angle) / (rate_hz * 360)),
     )
 
@@ -149,7 +159,7 @@ def sweep(i: int, model: Model) -> dict[str, float]:
     return {
         "ct.frequency": SIMULATED_SPEED_HZ
         if packet == 0
-        else model.form.slowest + GOOD_STATE_HZ * model.has_state,
+        else model.sample_format.slowest + GOOD_STATE_HZ * model.has_state,
         "ct.start": int(packet == 0),
         "lsn": count,
         "fsa.angle": first * 360 / steps,
@@ -176,7 +186,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
     if other.has_state and not own.has_state:
         return Relative(
             "packets that do not begin a revolution have bits set in CT",
-            partial(contains_state, slowest=own.form.slowest),
+            partial(contains_state, slowest=own.sample_format.slowest),
         )
     if own.number and other.number:
         return "info.model"
@@ -192,17 +202,18 @@ def relatives(name: str) -> dict[str, str | Relative]:
     models = {
         make_id(other): describe_difference(own_model, model)
         for other, model in MODELS.items()
-        if other != name and model.form.size == own_model.form.size
+        if other != name and model.sample_format.size == own_model.sample_format.size
     }
     return models | dict.fromkeys(
-        CSPC_MODELS.get(own_model.form.size, ()), "info, which a CSPC sends when it is started"
+        CSPC_MODELS.get(own_model.sample_format.size, ()),
+        "info, which a CSPC sends when it is started",
     )
 
 
 def make_lidar(name: str) -> Sensor:
     """Return the description of a model."""
     model = MODELS[name]
-    has_requests = not model.one_channel
+    has_requests = not model.is_send_only
     source = "YDLIDAR SDK: communication protocol, data set of models"
     if model.status == "capture":
         source += "; packets of a unit"
@@ -211,11 +222,11 @@ def make_lidar(name: str) -> Sensor:
         vendor="YDLIDAR",
         model=name,
         frames=(
-            {**ANSWERS, "data": make_data_frame(model.form), "request": REQUEST}
+            {**ANSWERS, "data": make_data_frame(model.sample_format), "request": REQUEST}
             if has_requests
-            else {"scan_start": SCAN_START, "data": make_data_frame(model.form)}
+            else {"scan_start": SCAN_START, "data": make_data_frame(model.sample_format)}
         ),
-        points=make_points_function(model.form),
+        points=make_points_function(model.sample_format),
         scan=OnFlag("ct.start"),
         links={"data": Serial(model.baud)},
         commands=COMMANDS if has_requests else {},

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidarspec_ydlidar import samples
-from lidarspec_ydlidar.samples import Form
+from lidarspec_ydlidar.samples import SampleFormat
 
 
 @dataclass(frozen=True)
@@ -17,25 +17,25 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        form: the format of its samples.
+        sample_format: the format of its samples.
         baud: the baud rate.
         rate: samples per second.
         range_limits: the shortest and the longest range, metres.
         turn: the lowest and the highest number of scans per second.
         number: the model number in the device information; 0 if it is not documented.
-        one_channel: whether the model only sends and cannot receive.
+        is_send_only: whether the model only sends and cannot receive.
         has_state: whether packets other than zero packets contain the state of the device, in the
             bits of the scan frequency.
         status: how the model was verified, as in `Sensor`.
     """
 
-    form: Form
+    sample_format: SampleFormat
     baud: int
     rate: float
     range_limits: tuple[float, float]
     turn: tuple[float, float]
     number: int = 0
-    one_channel: bool = False
+    is_send_only: bool = False
     has_state: bool = False
     status: str = "manual"
 
@@ -43,10 +43,10 @@ class Model:
 MODELS = {
     "F4": Model(samples.TRIANGLE, 115_200, 4000, (0.12, 12), (5, 12), 1),
     "X2": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), is_send_only=True, status="vectors"
     ),
     "X3": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), is_send_only=True, status="vectors"
     ),
     "X4": Model(samples.TRIANGLE, 128_000, 5000, (0.12, 10), (5, 12), 6, status="vectors"),
     "X4 Pro": Model(
@@ -55,11 +55,11 @@ MODELS = {
         5000,
         (0.12, 10),
         (5, 12),
-        one_channel=True,
+        is_send_only=True,
         has_state=True,
     ),
     "S2": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), is_send_only=True, status="vectors"
     ),
     "S4": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 8), (5, 12), 4, status="vectors"),
     "S4B": Model(samples.TRIANGLE_8, 153_600, 4000, (0.1, 8), (5, 12), 11),
@@ -74,8 +74,8 @@ MODELS = {
     "G5": Model(samples.TRIANGLE, 230_400, 9000, (0.1, 16), (5, 12), 20),
     "G6": Model(samples.HALF, 512_000, 18_000, (0.1, 25), (5, 12), 13),
     "G7": Model(samples.HALF, 512_000, 18_000, (0.1, 25), (5, 12), 21),
-    "TX8": Model(samples.TOF, 115_200, 4000, (0.1, 8), (4, 8), one_channel=True),
-    "TX20": Model(samples.TOF, 115_200, 4000, (0.1, 20), (4, 8), one_channel=True),
+    "TX8": Model(samples.TOF, 115_200, 4000, (0.1, 8), (4, 8), is_send_only=True),
+    "TX20": Model(samples.TOF, 115_200, 4000, (0.1, 20), (4, 8), is_send_only=True),
     "TG15": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 100, status="vectors"),
     "TG30": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 101),
     "TG50": Model(samples.TOF, 512_000, 20_000, (0.05, 50), (3, 15.7), 102),

@@ -19,7 +19,7 @@ NO_RETURN_NOTE = "0: no return"
 
 
 @dataclass(frozen=True, eq=False)
-class Form:
+class SampleFormat:
     """One format of samples.
 
     Attributes:
@@ -64,21 +64,21 @@ def make_packed_sample(*lower_fields: Construct) -> Construct:
 REFLECTION = "flags" / Enum(BitsInteger(2), plain=0, mirror_or_glass=2, sunlight=3)
 SAMPLE_8 = make_packed_sample(REFLECTION, "intensity" / BitsInteger(8))
 
-TRIANGLE = Form(make_plain_distance(0.00025), correction=camera_angle)
-TRIANGLE_FLAGGED = Form(
+TRIANGLE = SampleFormat(make_plain_distance(0.00025), correction=camera_angle)
+TRIANGLE_FLAGGED = SampleFormat(
     make_packed_sample(
         "flags" / BitsInteger(2) * "other values than 0: interference from another lidar"
     ),
     correction=camera_angle,
 )
-TRIANGLE_8 = Form(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
-TRIANGLE_10 = Form(
+TRIANGLE_8 = SampleFormat(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
+TRIANGLE_10 = SampleFormat(
     make_packed_sample("intensity" / BitsInteger(10)), 3, (1, 2), camera_angle, has_intensity=True
 )
-HALF = Form(make_plain_distance(0.0005), correction=camera_angle)
-TOF = Form(make_plain_distance(0.001), slowest=3.0)
-TOF_8 = Form(SAMPLE_8, 3, (1, 2), has_intensity=True)
-TOF_16 = Form(
+HALF = SampleFormat(make_plain_distance(0.0005), correction=camera_angle)
+TOF = SampleFormat(make_plain_distance(0.001), slowest=3.0)
+TOF_8 = SampleFormat(SAMPLE_8, 3, (1, 2), has_intensity=True)
+TOF_16 = SampleFormat(
     Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NO_RETURN_NOTE),
     4,
     has_intensity=True,
