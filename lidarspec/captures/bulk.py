@@ -145,8 +145,9 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
     mask[:start] = 0xFF
     # If the packet has headers, they give the length of the payload, so the original length of the
     # packet may vary.
-    uncut = pattern.uncut if headers.size else ()
-    mask[[*pattern.free, *uncut, *(head + offset for offset in headers.variable_offsets)]] = 0
+    original = pattern.original_offsets if headers.size else ()
+    variable = [head + offset for offset in headers.variable_offsets]
+    mask[[*pattern.time_offsets, *original, *variable]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
     return RecordKind(
         len(record),

@@ -159,16 +159,16 @@ class RecordLayout(NamedTuple):
 
     Attributes:
         head: number of bytes before the packet.
-        free: offsets of the bytes of the time, which differ between records.
-        uncut: offsets of the bytes of the packet's length on the network.
+        time_offsets: offsets of the bytes of the time, which differ between records.
+        original_offsets: offsets of the bytes of the packet's length on the network.
         times: the encoding of the time.
         trailer: NumPy type of the word at the end that repeats the length, with the byte order;
             None if there is none.
     """
 
     head: int
-    free: tuple[int, ...]
-    uncut: tuple[int, ...]
+    time_offsets: tuple[int, ...]
+    original_offsets: tuple[int, ...]
     times: TimeEncoding
     trailer: str | None
 
@@ -306,7 +306,7 @@ class PcapRecords:
         """Return whether the length of a record is wrong.
 
         The length is wrong if another record begins within the packet, but neither a record nor
-        the end of the input follows it.
+        the end of the input follows the packet.
         """
         size = self._head.size + captured
         within = max(captured, min(original, MAX_PACKET_BYTES) + 1)
