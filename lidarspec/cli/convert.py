@@ -436,7 +436,7 @@ def _select_frames(
             selected = dict[str, Packets]()
             for frame, packets in arrived.items():
                 times = clocks[frame].read(packets)
-                which = np.flatnonzero(slices[frame].holds(times))
+                which = np.flatnonzero(slices[frame].select_times(times))
                 which = which[: int(min(limit - number, len(which)))]
                 number += len(which)
                 if len(which):

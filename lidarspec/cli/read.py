@@ -180,7 +180,7 @@ def _iter_packets(
     for batch in device.packets(frame, wait=LOOK_S):
         patience.check()
         times = clock.read(batch)
-        packets = batch.with_times(times).take(wanted.holds(times))
+        packets = batch.with_times(times).take(wanted.select_times(times))
         number += len(packets)
         fields = {
             path: info for path, info in packets.table.schema.fields.items() if info.const is None

@@ -2,8 +2,8 @@
 
 The sector is found in the first revolutions of a stream. Packets are released at once until the
 angle leaps. The following packets are held until the leap recurs one revolution later, or until
-packets of all angles have arrived. The first scans are therefore cut in the same way as all others.
-No packets are held after a whole revolution without a leap, or after a sector was found.
+packets of all angles have arrived, so that the first scans are cut in the sector as well. No
+packets are held after a whole revolution without a leap, or after a sector was found.
 """
 
 from __future__ import annotations

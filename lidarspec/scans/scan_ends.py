@@ -109,7 +109,7 @@ class EndFinder:
         return _make_ends(starts[rows])
 
     def _find_wraps(self, rule: OnWrap, packets: Packets, points: EvaluatedPoints) -> list[ScanEnd]:
-        """Return the ends at which a column or a field passes an angle."""
+        """Return the scan ends at which a column or a field passes an angle."""
         rows: Indices | None = None
         if rule.name in COLUMNS:
             values = np.asarray(LazyColumns(points.source).read(rule.name), np.float64)

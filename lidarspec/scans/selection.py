@@ -160,11 +160,11 @@ class TimeSlice:
         self.first: int | None = None
         self.last: int | None = None
 
-    def holds(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each of the next times is selected, (n,), and update the state.
+    def select_times(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether each of the next times is selected, (n,); update the attributes.
 
         Args:
-            at: the times, (n,) ns.
+            at: the next times of the stream, (n,) ns.
         """
         if len(at):
             if self.first is None:
@@ -282,7 +282,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
         if chunk.at is None:
             raise UsageError(f"{name} has no arrival times, which --slice requires")
         is_first = wanted.first is None
-        if wanted.holds(np.array([chunk.at]))[0]:
+        if wanted.select_times(np.array([chunk.at]))[0]:
             any_came = True
             yield chunk
         elif is_first and wanted.time_until_start > MIN_SKIP_S * 1e9:
@@ -365,7 +365,7 @@ class ScanSelector:
         if selection.is_timed or selection.time != "sensor":
             stamp_ns = self._find_time(scan)
         if selection.is_timed:
-            is_in_slice = bool(self.slice.holds(np.array([stamp_ns]))[0])
+            is_in_slice = bool(self.slice.select_times(np.array([stamp_ns]))[0])
             is_selected = is_selected and is_in_slice
             self.ended = self.ended or self.slice.ended
             if not number:

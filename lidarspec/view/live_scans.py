@@ -219,7 +219,7 @@ class LiveScans:
         """Return the packets with selected times."""
         if not self._select.is_timed:
             return packets
-        is_selected = self._times.holds(self._clock.read(packets))
+        is_selected = self._times.select_times(self._clock.read(packets))
         if is_selected.all():
             return packets
         return packets.take(is_selected)
