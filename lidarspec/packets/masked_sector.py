@@ -103,7 +103,7 @@ def forward_step(step: float, direction: int) -> float:
 class AngleReader:
     """Reads the angle at which each packet begins.
 
-    The field of the angle is known from the sensor's rule that divides packets into scans.
+    The sensor's rule for scans names the field of the angle.
 
     Args:
         sensor: the sensor that sends the packets.
@@ -246,7 +246,7 @@ class GapLoss(Protocol):
 
 
 class MaskedGaps:
-    """Distinguishes gaps at the masked sector of one stream from losses.
+    """Finds out which gaps in one stream are at the masked sector, and are not losses.
 
     The packets may be in any order. A gap counts as a loss until it recurs one revolution later.
 
