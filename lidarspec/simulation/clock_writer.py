@@ -1,9 +1,9 @@
 """Write the time and the status of a clock into simulated frames.
 
-A clock is a field, a sum of fields, or a function of fields. The fields that a function depends on
-are found by increasing each field by one, twice. If the time increases by the same step both times,
-the field is linear, for example the microseconds or the hour. If both steps are 28 to 31 days, the
-field is the month. If they are 365 or 366 days, it is the year.
+A clock is a field, a sum of fields, or a function of fields. To find the fields that a function
+depends on, each field is increased by one, and again by one. If the time increases by the same step
+both times, the field is linear, for example the microseconds or the hour. If both steps are 28 to
+31 days, the field is the month. If both are 365 or 366 days, it is the year.
 
 To write a time, the date is written into the fields of the date. The time of day is distributed
 over the linear fields, from the coarsest to the finest. If the clock is a single field, a time
@@ -136,10 +136,9 @@ class ClockWriter:
 
     @property
     def can_follow_dates(self) -> bool:
-        """Whether the reading at a date is defined.
+        """Whether a date determines the reading of the clock.
 
-        It is defined if the clock never wraps, or if a day is a multiple of the time after which it
-        wraps.
+        This is the case if the clock never wraps, or wraps after a day or a whole fraction of it.
         """
         return not self.period_ns or DAY_NS % self.period_ns == 0
 
@@ -399,7 +398,7 @@ class FrameClock:
     def _write_dates(self, table: CompiledTable, readings: Times) -> None:
         """Write dates into fields that do not belong to the clock.
 
-        Frames without a date, after a restart, keep their values.
+        Frames after a restart have no date, and keep their values.
 
         Args:
             table: the frames.
@@ -497,12 +496,13 @@ class StatusWriter:
             )
 
     def write(self, table: CompiledTable, states: NDArray[np.int64], follows: str) -> None:
-        """Write the status of frames.
+        """Write the status of the clock into frames.
 
         Args:
             table: the frames.
             states: LOCKED, LOST or RESTARTED for each frame, (n,).
-            follows: the time scale that the clock follows. It selects one of several locked states.
+            follows: the time scale that the clock follows, by which one of several locked states is
+                chosen.
         """
         raw = np.array(self.choose(follows))[states]
         for path, column in zip(self._paths, raw.T, strict=True):

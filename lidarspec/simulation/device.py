@@ -490,7 +490,7 @@ class SimulatedDevice:
             self._plug = now + int(self.faults.unplug * SECOND)
         else:
             self._plug = None
-        is_started = not self._waits_for_a_command()
+        is_started = not self._waits_for_command()
         if is_started or self.sensor.has_points:
             self._begin_periodic(0.0)
         if is_started and self.sensor.has_points:
@@ -505,7 +505,7 @@ class SimulatedDevice:
             faults = replace(faults, follows=find_followed_scale(self.sensor))
         return ClockTimeline(faults, now + self.utc_offset_ns)
 
-    def _waits_for_a_command(self) -> bool:
+    def _waits_for_command(self) -> bool:
         """Return whether the device sends no data until a start command is received.
 
         Only start commands in `on_open` are considered, because programs send no other start

@@ -119,7 +119,7 @@ class Beams:
         origin: as in `Polar`.
         counts: number of points of each packet, (n,).
         intensity: path of the field with the intensity; "" if the points have no intensity.
-        places: x, y and z of Cartesian points, (3, n, ...); None for polar points.
+        positions: x, y and z of Cartesian points, (3, n, ...); None for polar points.
     """
 
     range: Floats
@@ -129,7 +129,7 @@ class Beams:
     origin: tuple[Floats, Floats, Floats]
     counts: NDArray[np.intp]
     intensity: str
-    places: Floats | None = None
+    positions: Floats | None = None
 
     def unit(self) -> Floats:
         """Return x, y and z of the unit vectors of the beams, (3, n, ...)."""
@@ -228,11 +228,11 @@ class Measurement:
             name: _add_leading_axes(np.asarray(array, np.float64), depth)
             for name, array in zip(parts, arrays, strict=True)
         }
-        places = None
+        positions = None
         if isinstance(result, Cartesian):
-            places = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
+            positions = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
             full |= dict(
-                zip(("range", "azimuth", "elevation"), find_direction(*places), strict=True)
+                zip(("range", "azimuth", "elevation"), find_direction(*positions), strict=True)
             )
         origin = [full.get(name, np.zeros((1,) * depth)) for name in ("ox", "oy", "oz")]
         if isinstance(result.intensity, Column):
@@ -247,7 +247,7 @@ class Measurement:
             origin=(origin[0], origin[1], origin[2]),
             counts=_count_points(shape, axes, batch),
             intensity=intensity,
-            places=places,
+            positions=positions,
         )
 
     def _measure(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
@@ -471,7 +471,8 @@ class PointPlacement(Measurement):
             paths = [target.path for target in self._targets if target.inner == inner]
             infos = [table.schema.fields[path] for path in paths]
             zero, *ones = (
-                _select_inner(places, inner) for places in self._probe_coordinates(table, paths)
+                _select_inner(positions, inner)
+                for positions in self._probe_coordinates(table, paths)
             )
             slopes = np.stack([(probed - zero) / PROBE_VALUE for probed in ones])
             raw = [
@@ -507,7 +508,7 @@ class PointPlacement(Measurement):
         beams = [self.beams(table), *(self._probe(table, [path], PROBE_VALUE)[0] for path in paths)]
         for path, raw in before.items():
             write_raw(table, path, raw)
-        return [each.places for each in beams if each.places is not None]
+        return [each.positions for each in beams if each.positions is not None]
 
     def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
         """Return the fields that the coordinates depend on linearly.
@@ -524,15 +525,15 @@ class PointPlacement(Measurement):
                 or len(info.axes) < table.schema.depth()
             ):
                 continue
-            places = [
-                beams.places
+            positions = [
+                beams.positions
                 for beams in self._probe(
                     table, [path], PROBE_VALUE, 2 * PROBE_VALUE, 3 * PROBE_VALUE
                 )
-                if beams.places is not None
+                if beams.positions is not None
             ]
-            for inner in self._list_inner_indices(table, places[0][0]):
-                once, twice, thrice = (_select_inner(place, inner) for place in places)
+            for inner in self._list_inner_indices(table, positions[0][0]):
+                once, twice, thrice = (_select_inner(position, inner) for position in positions)
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
                     targets.append(RangeField(path, inner, None))
         if not targets:
@@ -1051,7 +1052,7 @@ def find_periodic_rates(sensor: Sensor) -> dict[str, float]:
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
-    """Yield (time in seconds, type, number) of each periodic frame, without end."""
+    """Yield (time in seconds, type, number) of the frames of a type, without end."""
     return ((number / rate, name, number) for number in itertools.count())
 
 
