@@ -107,7 +107,7 @@ class _Counts:
 @click.argument("sources", metavar="IN...", nargs=-1)
 @click.argument("target", metavar="OUT")
 @sensor_option
-@count_option("scans; with -f frames, with --imu samples")
+@count_option("scans (-f: frames, --imu: samples)")
 @selection_options(
     "times", "scans", "every", "ranges", "returns", "columns", "time", "beams", "frame_id"
 )

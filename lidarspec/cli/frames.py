@@ -109,11 +109,16 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
     "-f",
     "--frame",
     metavar="NAME",
-    help="Frame type of the bytes; show only frames of this type.",
+    help="Explain only frames of this type.",
 )
 @count_option("frames")
 @click.option("--bad", is_flag=True, help="Show only damaged frames and bytes outside frames.")
-@click.option("--at", type=OFFSET, metavar="OFFSET", help="Explain only the byte at this offset.")
+@click.option(
+    "--at",
+    type=OFFSET,
+    metavar="OFFSET",
+    help="Explain only the frame that contains this offset.",
+)
 @click.option(
     "--bytes",
     "stretch",
@@ -148,9 +153,9 @@ def explain(
 ) -> None:
     """Explain every byte of each frame: offset, hex, field, value, unit, meaning.
 
-    For a damaged frame, the damage is described: a flipped bit, a lost or inserted byte, or the
-    offset at which the frame is truncated. With --bad, the exit code is 1 if a frame is damaged or
-    bytes are outside frames. An OFFSET is 940 or 0x3ac, as printed. In a capture, it is an offset
+    The damage of a frame is described: a flipped bit, a lost or inserted byte, or the offset at
+    which the frame is truncated. With --bad, the exit code is 1 if a frame is damaged or bytes are
+    outside frames. An OFFSET is decimal or hexadecimal: 940 or 0x3ac. In a capture, it is an offset
     in the joined payloads. --slice selects by arrival time; offsets are then relative to the
     beginning of the slice.
     """
@@ -224,7 +229,7 @@ class FrameSelection:
         frame: show only this frame type.
         count: maximum number of frames to show; with `bad`, maximum number of damaged frames.
         bad: show only damaged frames and bytes outside frames.
-        at: show only the byte at this offset.
+        at: show only the frame, or the bytes, at this offset.
         stretch: show only the bytes in this range of offsets, "FROM:TO".
 
     Attributes:

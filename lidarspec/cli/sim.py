@@ -112,7 +112,7 @@ PLACES = (
     metavar="N",
     default=0,
     show_default=True,
-    help="Delay datagrams so that up to N later datagrams overtake them.",
+    help="Send some datagrams late, after up to N later datagrams.",
 )
 @click.option(
     "--unplug",
