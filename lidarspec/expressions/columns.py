@@ -271,7 +271,7 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return, for each value of the column, the row of a table at this index.
+        """Return a row of a table for each value, which is the index of the row.
 
         The k numbers of a row are on an additional axis: the axis of the array in the frame that
         has k elements.

@@ -46,7 +46,7 @@ class _PartialMessage:
     """An incomplete message.
 
     Attributes:
-        count: the number of fragments of the message, or its size in bytes.
+        count: the declared number of fragments, or the declared size of the message in bytes.
         place: the offset in the input of the fragment that arrived first.
         at: the arrival time of this fragment, ns.
         parts: the payloads of the fragments by index.

@@ -1,12 +1,14 @@
 """Find the frame type of each datagram, which is one whole frame or invalid.
 
-As in a stream, the first active type in order that matches is used, and a type with `after` may be
-inactive. A frame must be as long as its datagram. Datagrams of one size and type are checked as the
-rows of an array (`lidarspec.framing.regular_rows`). Otherwise the datagrams are checked type by
-type, each type with the datagrams that no type before it has accepted. A datagram for which a
-plugin raises an error is checked alone, so that the other datagrams are not lost.
+As in a stream, the types are tried in the order of declaration, and the first type that matches is
+used. A type with `after` is tried only while it is active. A frame must be as long as its datagram.
 
-The fragments of a message are joined before its frame type is found
+Datagrams of one size and type are checked as the rows of an array
+(`lidarspec.framing.regular_rows`). Otherwise, the datagrams are checked type by type, and each type
+is tried only for datagrams that no earlier type has accepted. If a plugin raises an error for a
+datagram, this datagram is checked alone, so that the other datagrams are not lost.
+
+If a message is sent in fragments, they are joined before the type is found
 (`lidarspec.framing.datagram_assembly`).
 """
 
@@ -223,7 +225,7 @@ class _DatagramBatch:
         return frames
 
     def _check_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
-        """Return one datagram as a frame.
+        """Check one datagram, and return it as a frame.
 
         If it is invalid, counts the reason and returns None.
         """

@@ -420,12 +420,15 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count skipped bytes; return their number at each place, without fillers, (n,).
+        """Count the bytes of skipped ranges.
 
         Args:
             buffer: the bytes.
-            sizes: the number of bytes that were skipped at each place.
-            stops: the offset after the skipped bytes at each place.
+            sizes: the size of each skipped range in bytes.
+            stops: the offset after each skipped range.
+
+        Returns:
+            The number of bytes in each skipped range that are not fillers, (n,).
         """
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():

@@ -109,9 +109,14 @@ class Codec:
             self._conditions = self._conditions or StructConditions(
                 self.frame.plausible, self.schema, layout
             )
-            met = self._conditions.make_struct_conditions(layout)
-            checks = self._conditions.make_checks(layout)
+            struct_checks = self._conditions.make_struct_conditions(layout)
+            plausibility_checks = self._conditions.make_checks(layout)
             checker = layout.notes[CandidateChecker] = CandidateChecker(
-                self.frame, self.schema, layout, self._checked_constants, met, checks
+                self.frame,
+                self.schema,
+                layout,
+                self._checked_constants,
+                struct_checks,
+                plausibility_checks,
             )
         return checker

@@ -307,13 +307,17 @@ def _check_incomplete(
     layout: Layout,
     sizes: NDArray[np.intp],
 ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Return the status of incomplete candidates, and the number of bytes needed to decide.
+    """Return the status of incomplete candidates, and how many bytes each requires.
 
     The status is `SHORT`, unless a constant or a length is already wrong.
 
     Args:
         layout: the layout of the candidates.
         sizes: the size of each candidate when it is complete, in bytes.
+
+    Returns:
+        The status of each candidate, and the number of its bytes that are required to decide about
+        it.
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()

@@ -69,11 +69,12 @@ class CandidateChecker:
 
     Args:
         prefix: the constants that the candidates were already checked for.
-        met: the conditions of the struct on the values of its fields.
-        checks: the conditions of the plausibility function; None if the function has to be called.
+        struct_checks: the conditions of the struct on the values of its fields.
+        plausibility_checks: the conditions of the plausibility function; None if the function has
+            to be called.
 
     Attributes:
-        checks: the conditions in the arguments `met` and `checks`.
+        checks: `struct_checks` and `plausibility_checks`.
         is_complete: whether `checks` contains all conditions, so that the plausibility function
             need not be called.
     """
@@ -84,16 +85,16 @@ class CandidateChecker:
         schema: Schema,
         layout: Layout,
         prefix: Mapping[int, tuple[int, int]],
-        met: list[Check],
-        checks: list[Check] | None,
+        struct_checks: list[Check],
+        plausibility_checks: list[Check] | None,
     ) -> None:
         self._frame = frame
         self._schema = schema
         self._layout = layout
-        self._struct_conditions = met
-        self._checks = checks
-        self.checks = [*met, *(checks or ())]
-        self.is_complete = checks is not None or frame.plausible is None
+        self._struct_checks = struct_checks
+        self._plausibility_checks = plausibility_checks
+        self.checks = [*struct_checks, *(plausibility_checks or ())]
+        self.is_complete = plausibility_checks is not None or frame.plausible is None
         self._constants = merge_constants(
             sort_constants(
                 {
@@ -122,9 +123,9 @@ class CandidateChecker:
             _check_valid(status, rows, functools.partial(check_seal, seal, errors, sums))
         if np.count_nonzero(status) == len(status):
             return status
-        self._check(status, rows, self._struct_conditions)
-        if self._checks is not None:
-            self._check(status, rows, self._checks)
+        self._check(status, rows, self._struct_checks)
+        if self._plausibility_checks is not None:
+            self._check(status, rows, self._plausibility_checks)
         elif self._frame.plausible is not None:
             _check_valid(status, rows, lambda some: self._call_plausible(some, errors))
         return status

@@ -2,12 +2,16 @@
 
 If random bytes look like a header, they can contain any length. A noisy stream can therefore have
 candidates of hundreds of layouts, with one or two candidates each. Checking the candidates of a
-layout takes a few dozen NumPy calls, for one candidate as for a thousand. Most of these layouts
-differ only in the length of an array at their end: they have the same constants, checksums over the
-same bytes up to the same distance from the end, and tests of the same fields. `LayoutFamilies`
-finds such layouts. Their candidates become the rows of one array, and bytes after the end of a
-candidate are ignored: for a checksum, they are replaced by zeros, which do not change a checksum in
-`ZERO_EXTENDED`. A test ignores elements after the end.
+layout takes a few dozen NumPy calls, for one candidate as for a thousand.
+
+Most of these layouts differ only in the length of an array at their end. They have the same
+constants and tests of the same fields. Their checksums cover the bytes from the same offset to the
+same distance from the end. `LayoutFamilies` finds such layouts, and their candidates become the
+rows of one array, which are as long as the longest candidate.
+
+Before a checksum is computed, the bytes after the covered bytes move to the end of the row, and
+the gap is filled with zeros. This does not change the result of the algorithms in `ZERO_EXTENDED`.
+A test ignores array elements after the end of a candidate.
 
 The results are the same as those of `plausibility.CandidateChecker`. That class also does all tests
 that are not a lookup of one or two bytes.

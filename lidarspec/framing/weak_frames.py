@@ -89,8 +89,8 @@ class WeakRuns:
     def _jumps(self) -> list[Indices]:
         """The rows that are 1, 2, 4, 8 ... frames further in a run, each (n,).
 
-        After the end of a run, the row is the last row of the run. In the last array, all runs have
-        ended.
+        If the run ends earlier, this is its last row. In the last array, all rows are the last of
+        their run.
         """
         count = len(self.frames)
         rows = np.arange(count)
