@@ -76,8 +76,8 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 
     Args:
         values: the values.
-        few: up to this number of distinct values, each value is searched for, which is faster than
-            sorting the values.
+        few: if there are at most this many distinct values, each of them is searched for, because
+            this is faster than sorting.
     """
     values_found = list[int]()
     left = values

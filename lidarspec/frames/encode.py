@@ -622,9 +622,9 @@ def _find_count(
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part, given its values.
 
-    The kind has to have all given fields, and no constant that contradicts them. If several kinds
-    fit, the kind with the fewest fields that are not given is returned. If no kind fits, the first
-    of all kinds is returned.
+    The kind has to have all given fields, and its constants have to agree with their values. If
+    several kinds fit, the kind with the fewest fields that are not given is returned. If no kind
+    fits, the first of all kinds is returned.
     """
     possible = list[tuple[int, Kind]]()
     for kind in node.kinds:

@@ -54,7 +54,7 @@ class Table(Protocol):
         """Return the length of an array in each frame, (n,)."""
 
     def length(self, axis: str) -> int:
-        """Return the maximum length of an array."""
+        """Return the maximum length of an array in the frames."""
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -174,7 +174,7 @@ class CompiledTable:
         return counts
 
     def length(self, axis: str) -> int:
-        """Return the maximum length of an array."""
+        """Return the maximum length of an array in the frames."""
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
@@ -563,7 +563,7 @@ class ParsedTable:
         return np.array([max(frame_lengths, default=0) for frame_lengths in lengths], np.intp)
 
     def length(self, axis: str) -> int:
-        """Return the maximum length of an array."""
+        """Return the maximum length of an array in the frames."""
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared

@@ -613,10 +613,11 @@ Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class _ValueClasses:
-    """Maps all values of a header field with the same result to one representative.
+    """Maps each value of a header field to a representative with the same result.
 
-    Random bytes in place of a header can contain billions of different lengths or keys. Values with
-    the same result share one branch of the tree, so that the tree stays small.
+    The result is a layout or a refusal. Random bytes in place of a header can contain billions of
+    different lengths or keys. The tree stays small, because it has a branch only for each
+    representative.
 
     If `keys` is not empty, all values that are not in it are mapped to `other`. Otherwise, values
     are limited to the interval from `low` to `high`.
@@ -900,8 +901,7 @@ class HeaderTree:
         Args:
             number: the number of candidates.
             read: a function that reads the field of a node for some candidates.
-            places: the candidates, whose bytes are used for single headers; None to use only
-                `read`.
+            places: the candidates with their bytes; None if only `read` can read the bytes.
         """
         self._limit_cache()
         groups: list[Group] = []
