@@ -227,7 +227,7 @@ def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return how to recognize the other models that send these packets, by id.
+    """Return, by id, how to recognize the other models that send these packets.
 
     Their packets have another status. `own` is the id of this model.
     """
