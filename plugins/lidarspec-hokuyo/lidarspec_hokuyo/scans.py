@@ -87,7 +87,7 @@ def make_decimal(name: str, places: int, most: int = 9999) -> Any:
     Args:
         name: the name of the field.
         places: the number of digits.
-        most: the largest number, which limits the first digit if there are four digits.
+        most: the largest number. It limits the first digit of a number with four digits.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
