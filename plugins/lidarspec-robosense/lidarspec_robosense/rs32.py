@@ -155,10 +155,10 @@ def is_plausible(f: Fields, lidar_type: int) -> Any:
 
 
 def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
-    """Return whether azimuths, type and version are those of a Bpearl.
+    """Return whether a packet can be from a Bpearl.
 
-    Azimuths have to be below 360 degrees, and the type must not be the type of another model. `v4`
-    is whether the version has to be 4.
+    Azimuths have to be below 360 degrees. If `v4` is true, the bytes of version 4 are required.
+    Otherwise they are not allowed, and the type must not be that of an RS-LiDAR-16 or -32.
     """
     is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (

@@ -32,7 +32,7 @@ Channels = Mapping[tuple[int, int], tuple[int, int]]
 
 
 def patch(data: bytes, offset: int, new: bytes | str) -> bytes:
-    """Return the packet with other bytes from an offset on."""
+    """Return the packet with `new` in place of its bytes from `offset` on."""
     new = bytes.fromhex(new) if isinstance(new, str) else new
     return data[:offset] + new + data[offset + len(new) :]
 
