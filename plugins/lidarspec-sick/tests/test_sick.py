@@ -22,7 +22,7 @@ MRS1104, MULTISCAN = ls.sensor("sick-mrs1104"), ls.sensor("sick-multiscan136")
 def telegrams() -> list[bytes]:
     """Return the datagrams of the multiScan capture.
 
-    In the file, the length of a datagram is before the datagram.
+    The file contains each datagram after its length.
     """
     data, found, start = (
         capture("sick/multiscan_compact_test01_udp_scandata.telegrams.bin").read_bytes(),
