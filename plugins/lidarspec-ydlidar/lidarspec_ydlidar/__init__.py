@@ -194,7 +194,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
-    """Return how to recognize the other models with the same sample size, by id.
+    """Return, by id, how to recognize the other models with the same sample size.
 
     They include models of CSPC, which send the same packet.
     """
