@@ -18,7 +18,7 @@ from lidarspec.errors import UnknownName, UsageError
 from lidarspec.notebook_display import make_display_method
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.column_sources import ColumnSource, JoinedColumns, LazyColumns, SourcePart
-from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, whole_columns
+from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, slice_grid
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type
 
 #: The names of the columns that a cloud can have, in the order of the columns in files.
@@ -197,7 +197,7 @@ class PointCloud:
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
             shape = find_organised_shape(
                 len(picked["x"]),
-                whole_columns(find_grid(self), which.indices(len(self))[0], len(picked["x"])),
+                slice_grid(find_grid(self), which.indices(len(self))[0], len(picked["x"])),
             )
         return PointCloud(**{**picked, "shape": shape})
 
@@ -265,7 +265,7 @@ class PointCloud:
         )
 
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
-        """Return the points at `indices`, which are those of whole columns of points.
+        """Return the points at `indices`, which select whole columns.
 
         An index of -1 gives an invalid point.
         """

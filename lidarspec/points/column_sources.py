@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.conventions import ExtraType, Grid, Grids, whole_columns
+from lidarspec.points.conventions import ExtraType, Grid, Grids, slice_grid
 
 
 class ColumnSource:
@@ -55,7 +55,7 @@ class ColumnSource:
         """Return how the points from `start` to `stop` are organised."""
         if self.grids:
             return self.grids.grid_between(start, stop)
-        return whole_columns(self.grid, start, stop - start)
+        return slice_grid(self.grid, start, stop - start)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the times of the points at some indices, in seconds since `base`."""

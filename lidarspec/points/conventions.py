@@ -212,18 +212,18 @@ class Grids(NamedTuple):
         has_points = np.diff(self.ends[packets], prepend=begin) > 0
         found = {self.grids[which] for which in np.unique(self.which[packets][has_points]).tolist()}
         if len(found) == 1:
-            return whole_columns(found.pop(), start - begin, stop - start)
+            return slice_grid(found.pop(), start - begin, stop - start)
         return Grid()
 
 
-def whole_columns(grid: Grid, first: int, number: int) -> Grid:
+def slice_grid(grid: Grid, first: int, number: int) -> Grid:
     """Return how a slice of organised points is organised.
 
     The slice is not organised unless it consists of whole columns.
 
     Args:
         grid: how all points are organised.
-        first: the number of points between the start of a column and the slice.
+        first: the index of the first point of the slice, in the cloud or in its packet.
         number: the number of points of the slice.
     """
     if grid.rows and first % grid.column_size == 0 and number % grid.column_size == 0:

@@ -89,7 +89,7 @@ class ColumnMaker(Protocol):
 
 
 class Plan:
-    """The plan of the points of frames of one layout.
+    """A plan that computes the points of frames with one layout.
 
     Attributes:
         function: the `points` function.

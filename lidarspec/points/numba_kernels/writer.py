@@ -456,7 +456,7 @@ class KernelWriter:
         )
 
     def _strides(self, leaf: Leaf) -> tuple[str, ...]:
-        """Return the strides of a field's arrays as texts: numbers or arguments."""
+        """Return the strides of a field's arrays, each as a number or an argument."""
         strides = [self.format_number(stride) for stride in leaf.strides]
         if leaf.strides and len(leaf.info.axes) == max(
             len(other.info.axes) for other in self.layout.leaves.values()

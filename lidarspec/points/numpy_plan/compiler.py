@@ -257,7 +257,7 @@ class Compiler:
     def _make_table(
         self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str
     ) -> NDArray[Any]:
-        """Return the value of an expression for each value of the field window."""
+        """Return the value of an expression for each value of `field_window`."""
         name = (
             kind,
             field_window.offset - leaf.offset,
