@@ -99,11 +99,11 @@ def _format_objects(path: str, values: NDArray[Any]) -> Columns:
 
 
 def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
-    """Write frames to a file in the format of its suffix, and return their number.
+    """Write frames to a file in the format of its suffix; return the number of frames.
 
     Args:
-        path: the file. For one frame type, its suffix is .csv, .csv.gz, .parquet, .arrow or
-            .feather. An .mcap file can contain several types.
+        path: the file. The suffixes .csv, .csv.gz, .parquet, .arrow and .feather require frames of
+            one type. An .mcap file can contain several types.
         batches: the frames.
 
     Raises:
