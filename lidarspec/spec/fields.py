@@ -79,7 +79,7 @@ def factor(unit: str, target: str) -> Fraction | None:
 
 
 def is_unit(unit: str) -> bool:
-    """Return whether a unit can be converted to others."""
+    """Return whether a unit can be converted to other units."""
     return any(unit in table for table in _FACTORS.values())
 
 
@@ -184,8 +184,8 @@ class Scaled(layer.DescribedField):
 class SizeOf(layer.SizeField):
     """The size of another part of the frame, in bytes.
 
-    `build` computes the size and ignores a given value. A parsed frame is invalid if the part has
-    another size.
+    `build` computes the size and ignores a given value. A parsed frame is invalid if the field
+    differs from the size of the part.
 
     Args:
         subcon: a field that parses to an integer, such as Int16ub.
@@ -299,8 +299,8 @@ class Checksummed(layer.SealedStruct):
     def _measured(self) -> Construct:
         """The struct, which adds the offsets of its members to the parsed value.
 
-        The engine has replaced the struct of a frame by such a struct. A struct that is used
-        without a frame is replaced here.
+        In a frame, the engine has already prepared the struct. A struct that is used without a
+        frame is prepared here.
         """
         if isinstance(layer.unwrap(self.subcon), layer.MeasuredStruct):
             return self.subcon
@@ -415,7 +415,7 @@ class Parts(layer.Partition):
         within: the total size of all parts in bytes.
 
     Raises:
-        SpecError: unless exactly one of `count`, `size` with `following`, and `within` is given, or
+        SpecError: if not exactly one of `count`, `size` with `following`, and `within` is given; or
             if a part is not a struct.
     """
 

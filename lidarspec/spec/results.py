@@ -200,7 +200,7 @@ class Imu:
         time: seconds after the time of the packet.
 
     Raises:
-        SpecError: for another number of columns.
+        SpecError: if a quantity does not have three columns.
     """
 
     angular_velocity: tuple[Array, Array, Array]

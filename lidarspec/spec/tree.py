@@ -511,7 +511,7 @@ MAX_FORMULA_BITS = 62
 
 
 def width(formula: Formula) -> int:
-    """Return the maximum number of bits of the values of a formula, without the sign.
+    """Return the number of bits that a value of a formula can need, without the sign.
 
     Raises:
         ValueError: if a part of the formula is `Untraced`.

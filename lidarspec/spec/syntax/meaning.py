@@ -1298,7 +1298,8 @@ def _is_variable_integer(con: BytesInteger) -> bool:
 def _probe_block(con: Construct, size: int) -> list[BitField] | None:
     """Return the bit fields of a block.
 
-    Returns None if the fields of the block depend on values, or if values are not plain integers.
+    Returns None if values in the block determine which fields follow, or if a field is not a plain
+    integer.
     """
     if _has_fixed_fields(con):
         return probe(lambda block: dict(iter_leaves(con.parse(block, _verify=False))), size)

@@ -490,7 +490,8 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
 class SizeField(Subconstruct):  # type: ignore[misc]
     """A number that declares the size of a part.
 
-    `build` sets it to the size of the part. A parsed frame with another number is invalid.
+    `build` sets it to the size of the part. A parsed frame is invalid if the number differs from
+    this size.
 
     Attributes:
         of: the names that lead from the struct with this field to the part. The name "_" leads to

@@ -376,8 +376,8 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
     """Return the members that replace a FocusedSeq.
 
-    They are its value and a field for each other part. The FocusedSeq is returned unchanged if one
-    of its parts cannot be such a field.
+    They are its value and a field for each other part. If this is not possible, the FocusedSeq is
+    returned unchanged.
     """
     focus = inner.parsebuildfrom
     parts = {part.name: _strip_name(part) for part in inner.subcons}
