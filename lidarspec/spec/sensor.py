@@ -306,7 +306,7 @@ class SensorDescription:
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     """Return a copy of a sensor with only these frame types.
 
-    The copy has no commands, no state, no `info` fields, and no other references to missing frame
+    The copy has no commands, no state and no `info` fields, and does not refer to missing frame
     types.
     """
     clock = sensor.clock

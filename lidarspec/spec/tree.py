@@ -69,7 +69,7 @@ class Adapter:
     """Functions that convert between the raw values of a field and decoded values.
 
     They represent construct's ExprAdapter, or a text. A parsed frame has the decoded values.
-    Columns have decoded values as well, unless `dtype` is uint8.
+    Columns have the raw bytes if `dtype` is uint8, else the decoded values.
 
     Attributes:
         decode: a function that decodes an integer, or the bytes of the field.
