@@ -34,13 +34,13 @@ from lidarspec.exports import (
 from lidarspec.exports.c_fields import (
     CEntry,
     CLayout,
-    arguments,
-    comment,
     find_accesses,
-    identifier,
-    parameters,
+    format_arguments,
+    format_comment,
+    format_parameters,
+    format_word,
+    make_identifier,
     quote_bytes,
-    word,
 )
 from lidarspec.frames.wire_table import SizeFormula
 from lidarspec.spec import (
@@ -102,7 +102,7 @@ class _ChecksumBody:
     result: str
 
 
-def checksum(algorithm: Checksum, name: str) -> str:
+def write_checksum(algorithm: Checksum, name: str) -> str:
     """Return the C function that computes a checksum.
 
     Raises:
@@ -280,7 +280,7 @@ def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -
     for name, (entry, seal) in seals.items():
         yield _format_checksum(layout, entry, seal, name, algorithms[seal.algorithm])
     checksum_checks = [
-        _format_check(entry, f"!{name}({arguments(entry.depth)})")
+        _format_check(entry, f"!{name}({format_arguments(entry.depth)})")
         for name, (entry, _) in seals.items()
     ]
     yield _IS_FRAME.format(
@@ -335,8 +335,8 @@ def _format_checksum(
             )
     return _CHECKSUM.format(
         name=name.removesuffix("_ok"),
-        parameters=parameters(entry.depth),
-        arguments=arguments(entry.depth),
+        parameters=format_parameters(entry.depth),
+        arguments=format_arguments(entry.depth),
         spans=", ".join(
             f"{{{start}, {end}}}" for start, end in _iter_covered_spans(layout, entry, seal, held)
         ),
@@ -382,7 +382,7 @@ def _format_stored_checksum(held: list[CEntry], order: str) -> str:
         node = access.node
         if isinstance(node, Blob):
             assert isinstance(node.size, int)
-            value = word(access.start, node.size, order)
+            value = format_word(access.start, node.size, order)
             width = 8 * node.size
         else:
             value = access.expression
@@ -448,8 +448,8 @@ def _format_check(entry: CEntry, wrong: str) -> str:
     Args:
         wrong: the C condition that is true if the value is invalid.
     """
-    where = " && ".join(filter(None, (entry.where, wrong)))
-    names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
+    where = " && ".join(filter(None, (entry.full_condition, wrong)))
+    names = [(c_fields.name_index(level), count) for level, count in enumerate(entry.loops)]
     loops = "".join(
         f"for (size_t {name} = 0; {name} < (size_t)({count}); ++{name}) " for name, count in names
     )
@@ -499,7 +499,7 @@ def header(sensor: Sensor) -> str:
         ExportError: if the content of a frame depends on Python code, or if C cannot compute its
             layout.
     """
-    prefix = identifier(make_prefix(sensor))
+    prefix = make_identifier(make_prefix(sensor))
     title, source = (
         text.replace("*/", "* /").replace("/*", "/ *")
         for text in (f"{sensor.vendor} {sensor.model}", sensor.source)
@@ -525,9 +525,9 @@ def header(sensor: Sensor) -> str:
     return "\n".join(
         [
             head,
-            *([comment(left_out)] if left_out else []),
+            *([format_comment(left_out)] if left_out else []),
             helpers,
-            *(checksum(algorithm, name) for algorithm, name in names.items()),
+            *(write_checksum(algorithm, name) for algorithm, name in names.items()),
             *frames,
             _TAIL,
         ]
@@ -550,15 +550,15 @@ def _iter_definitions(
     for ending in _RESERVED_ENDINGS:
         name("", ending)
     layout = CLayout(message, name)
-    yield comment(
+    yield format_comment(
         f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'}"
         " the sensor ----"
     )
     yield (
-        f"#define {prefix.upper()}_{identifier(message.name).upper()}"
+        f"#define {prefix.upper()}_{make_identifier(message.name).upper()}"
         f"_MAX_LENGTH {message.frame.max_length}"
     )
-    yield from (text for text in c_fields.fields(layout) if text)
+    yield from (text for text in c_fields.iter_functions(layout) if text)
     yield ""
     yield from _iter_frame_functions(layout, algorithms)
 
@@ -567,7 +567,7 @@ def _make_name(
     taken: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str
 ) -> str:
     """Return a unique C name for a path of a frame type, and add it to `taken`."""
-    name = "_".join(identifier(part) for part in (prefix, frame, path, ending) if part)
+    name = "_".join(make_identifier(part) for part in (prefix, frame, path, ending) if part)
     while taken.setdefault(name, (frame, path, ending)) != (frame, path, ending):
         name += "_"
     return name

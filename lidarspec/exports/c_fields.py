@@ -5,9 +5,9 @@ node as a C expression, its size, the conditions under which it is present, and 
 arrays around it. If an expression needs a length or count from the header, it calls the C function
 that reads this number, so that expressions stay short.
 
-`fields` makes the C functions from the entries: accessors of fields, counts of arrays, tests for
-optional fields, and conversions to the field's unit and the SI unit. If several alternatives
-contain a field, its accessor uses the first alternative that is present.
+`iter_functions` makes the C functions from the entries: accessors of fields, counts of arrays,
+tests for optional fields, and conversions to the field's unit and the SI unit. If several
+alternatives contain a field, its accessor uses the first alternative that is present.
 """
 
 from __future__ import annotations
@@ -35,27 +35,29 @@ _OPERATIONS = {
 _INDICES = "ijklmnoq"
 
 
-def index(depth: int) -> str:
+def name_index(depth: int) -> str:
     """Return the name of the index of the array at this depth."""
     return _INDICES[depth]
 
 
-def parameters(depth: int) -> str:
+def format_parameters(depth: int) -> str:
     """Return the parameters of a C function for an entry inside `depth` arrays."""
-    return ", ".join(["const uint8_t *p", *(f"size_t {index(level)}" for level in range(depth))])
+    return ", ".join(
+        ["const uint8_t *p", *(f"size_t {name_index(level)}" for level in range(depth))]
+    )
 
 
-def arguments(depth: int) -> str:
-    """Return the arguments that match `parameters(depth)`."""
-    return ", ".join(["p", *map(index, range(depth))])
+def format_arguments(depth: int) -> str:
+    """Return the arguments that match `format_parameters(depth)`."""
+    return ", ".join(["p", *map(name_index, range(depth))])
 
 
-def identifier(text: str) -> str:
+def make_identifier(text: str) -> str:
     """Return a text as a part of a C name."""
     return re.sub(r"\W", "_", text.replace("[]", "_inner"), flags=re.ASCII)
 
 
-def number_type(fields: Sequence[tree.FieldInfo]) -> str:
+def choose_number_type(fields: Sequence[tree.FieldInfo]) -> str:
     """Return a C type that can represent the values of all these fields."""
     if any(info.kind == "float" for info in fields):
         if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields):
@@ -71,7 +73,7 @@ def number_type(fields: Sequence[tree.FieldInfo]) -> str:
     return f"{'int' if signed else 'uint'}{width}_t"
 
 
-def comment(*texts: str) -> str:
+def format_comment(*texts: str) -> str:
     """Return a comment of one line; "" if the texts are empty."""
     text = (
         "; ".join(" ".join(part.split()) for part in texts if part)
@@ -83,7 +85,7 @@ def comment(*texts: str) -> str:
     return ""
 
 
-def quote(text: str) -> str:
+def quote_text(text: str) -> str:
     """Return a text as a C string, in UTF-8."""
     data = text.encode()
     plain = all(32 <= byte < 127 and byte not in b'"\\?' for byte in data)
@@ -135,7 +137,7 @@ class CEntry:
     part: tree.Part | None = None
 
     @property
-    def where(self) -> str:
+    def full_condition(self) -> str:
         """All conditions, joined to one C expression; "" if there is no condition."""
         return " && ".join(condition.text for condition in self.conditions)
 
@@ -170,7 +172,7 @@ class CEntry:
         if node.size == 1:
             raw = f"p[{self.start}]"
         else:
-            raw = word(self.start, node.size, node.order)
+            raw = format_word(self.start, node.size, node.order)
         if node.kind == "float":
             return f"{FLOAT_FUNCTIONS[node.size]}({raw})"
         if node.kind == "int":
@@ -193,9 +195,10 @@ class CEntry:
         the function with `indices`.
         """
         inside = [
-            f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
+            f"{name_index(self.depth + level)} == {number}"
+            for level, number in enumerate(self.indices)
         ]
-        return " && ".join(filter(None, (self.where, *inside)))
+        return " && ".join(filter(None, (self.full_condition, *inside)))
 
 
 def format_size_arguments(node: tree.Node, depth: int) -> str:
@@ -205,7 +208,7 @@ def format_size_arguments(node: tree.Node, depth: int) -> str:
     """
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
-        return arguments(depth)
+        return format_arguments(depth)
     return ", ".join(["p", *["0"] * depth])
 
 
@@ -252,11 +255,12 @@ class CLayout:
         """
         if tree.width(value) > tree.MAX_FORMULA_BITS:
             raise ExportError("the value of a formula may exceed 64 bits")
-        return tree.write(
-            value,
-            lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
-            _OPERATIONS,
-        )
+
+        def format_field(ref: tree.Ref) -> str:
+            arguments = format_arguments(len(ref.info.axes))
+            return f"(int64_t){self.name(ref.path, '')}({arguments})"
+
+        return tree.write(value, format_field, _OPERATIONS)
 
     def length(self, value: tree.Formula) -> str:
         """Return a number of elements or bytes as a C expression."""
@@ -346,7 +350,7 @@ class CLayout:
                 path = entry.path
             self.entries.append(replace(entry, path=path, size=self.compute_size(entry)))
         if isinstance(node, tree.Repeat):
-            step = self._find_element_size(entry, node).times(f"(int64_t){index(entry.depth)}")
+            step = self._find_element_size(entry, node).times(f"(int64_t){name_index(entry.depth)}")
             loops = (*entry.loops, str(self.count(node, entry.depth)))
             self._visit(
                 replace(
@@ -429,7 +433,7 @@ SI: dict[str, tuple[str, float, float]] = {
 FLOAT_FUNCTIONS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
-def word(start: SizeFormula, size: int, order: str) -> str:
+def format_word(start: SizeFormula, size: int, order: str) -> str:
     """Return the C expression of an unsigned integer of several bytes."""
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
@@ -461,7 +465,7 @@ def find_accesses(layout: CLayout, path: str) -> list[CEntry]:
     ]
 
 
-def fields(layout: CLayout) -> Iterator[str]:
+def iter_functions(layout: CLayout) -> Iterator[str]:
     """Yield the C functions of all fields, in wire order.
 
     If several alternatives contain a field, its functions come with those of the last alternative.
@@ -542,7 +546,7 @@ def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
         for entry in layout.entries
         if entry.path == axis and isinstance(entry.node, tree.Repeat)
     ]
-    ways = [(entry.where, layout.length(count)) for entry, count in arrays]
+    ways = [(entry.full_condition, layout.length(count)) for entry, count in arrays]
     yield _format_function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
 
@@ -553,14 +557,14 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
     first = ways[0]
     depth = first.depth + len(first.indices)
     yield from (
-        f"#define {name.upper()}_{identifier(label).upper()} {value}"
+        f"#define {name.upper()}_{make_identifier(label).upper()} {value}"
         for value, label in first.info.labels.items()
     )
-    yield comment(format_unit(first.info), describe_field(first.info))
+    yield format_comment(format_unit(first.info), describe_field(first.info))
     if isinstance(first.node, tree.Blob):
         kind = ""
         sizes = [
-            (access.where, layout.length(access.node.size))
+            (access.full_condition, layout.length(access.node.size))
             for access in ways
             if isinstance(access.node, tree.Blob)
         ]
@@ -569,10 +573,10 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
             "const uint8_t *",
             name,
             depth,
-            [(access.where, f"p + ({access.start})") for access in ways],
+            [(access.full_condition, f"p + ({access.start})") for access in ways],
         )
     else:
-        kind = number_type([access.info for access in ways])
+        kind = choose_number_type([access.info for access in ways])
         yield _format_function(
             kind,
             name,
@@ -580,7 +584,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
             [(access.condition, f"({kind}){_parenthesize(access.expression)}") for access in ways],
         )
     if any(access.conditions for access in ways):
-        places = dict.fromkeys(access.where or "1" for access in ways)
+        places = dict.fromkeys(access.full_condition or "1" for access in ways)
         yield _format_function(
             "int",
             layout.name(path, "present"),
@@ -595,7 +599,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
 
 def _write_names(labels: Mapping[int, str], name: str) -> str:
     """Return the C function that returns the name of a number; NULL without a name."""
-    cases = [f"    case {code}: return {quote(label)};" for code, label in labels.items()]
+    cases = [f"    case {code}: return {quote_text(label)};" for code, label in labels.items()]
     head = f"static inline const char *{name}(long long code)"
     return "\n".join([head, "{", "    switch (code) {", *cases, "    }", "    return NULL;", "}"])
 
@@ -613,7 +617,7 @@ def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str
     used = " ".join(condition + " " + value for condition, value in ways)
     lines = [
         f"    (void){argument};"
-        for argument in arguments(depth).split(", ")
+        for argument in format_arguments(depth).split(", ")
         if not re.search(rf"\b{argument}\b", used)
     ]
     lines += [
@@ -621,7 +625,8 @@ def _format_function(kind: str, name: str, depth: int, ways: list[tuple[str, str
         for condition, value in ways
     ]
     lines += ["    return 0;"] * bool(ways[-1][0])
-    head = f"static inline {kind}{'' if kind.endswith('*') else ' '}{name}({parameters(depth)})"
+    space = "" if kind.endswith("*") else " "
+    head = f"static inline {kind}{space}{name}({format_parameters(depth)})"
     if len(lines) == 1:
         return f"{head} {{ {lines[0].strip()} }}"
     return "\n".join([head, "{", *lines, "}"])
@@ -652,7 +657,7 @@ def _format_conversion(name: str, kind: str, scale: float, offset: float) -> str
 
 def _unit_name(unit: str) -> str:
     return (
-        identifier(
+        make_identifier(
             unit.replace("/", "_per_").replace("%", "percent").replace("^", "").replace("**", "")
         )
         or "value"

@@ -62,18 +62,18 @@ class BoxGroup:
     Attributes:
         label: the number of repetitions, or the condition under which the group exists.
         items: the boxes and groups in the group.
-        optional: whether some frames do not contain the group.
+        is_optional: whether some frames do not contain the group.
     """
 
     label: str
     items: tuple[Item, ...]
-    optional: bool = False
+    is_optional: bool = False
 
 
 Item = DiagramBox | BoxGroup
 
 
-def byte_order(message: ExportedFrame) -> str:
+def find_byte_order(message: ExportedFrame) -> str:
     """Return the byte order of all numbers of a frame type.
 
     Returns "" if the byte orders differ, or if all numbers have a single byte.
@@ -94,11 +94,12 @@ class _ItemBuilder:
 
     Attributes:
         seals: for each field that stores a checksum, by path, the node with the algorithm.
-        mixed: whether the frame has both byte orders. If so, each number shows its byte order.
+        has_both_orders: whether the frame has numbers in both byte orders. Each number then shows
+            its byte order.
     """
 
     seals: Mapping[str, tree.Sealed]
-    mixed: bool
+    has_both_orders: bool
 
     def visit(self, node: tree.Node, start: SizeFormula, depth: int) -> tuple[Item, ...]:
         """Return the items of a node that begins at `start`.
@@ -127,7 +128,7 @@ class _ItemBuilder:
                 if len(kinds) == 1:
                     items = kinds[0][1]
                 else:
-                    items = tuple(BoxGroup(name, items, optional=True) for name, items in kinds)
+                    items = tuple(BoxGroup(name, items, is_optional=True) for name, items in kinds)
                 return (BoxGroup(f"{node.name}: {describe_end(node)}", items),)
             case tree.When() | tree.Select():
                 parts = (
@@ -135,7 +136,7 @@ class _ItemBuilder:
                     for label, branch in list_branches(node)
                 )
                 return tuple(
-                    BoxGroup(label, items, optional=True) for label, items in parts if items
+                    BoxGroup(label, items, is_optional=True) for label, items in parts if items
                 )
         return ()
 
@@ -159,7 +160,7 @@ class _ItemBuilder:
         is_long = node.size > 1
         short = {"uint": "u", "int": "s", "float": "float "}[
             node.kind
-        ] + f"{width}{f' {node.order[0]}e' * (self.mixed and is_long)}"
+        ] + f"{width}{f' {node.order[0]}e' * (self.has_both_orders and is_long)}"
         detail = " ".join(filter(None, (short, format_unit(node.info))))
         if node.info.const is not None:
             if isinstance(node.info.const, int):
@@ -299,13 +300,16 @@ def svg(sensor: Sensor) -> str:
     sheet = _Sheet()
     for message in list_frames(sensor, on_wire=False):
         size = frame_size(message.frame)
-        order = byte_order(message)
+        order = find_byte_order(message)
         detail = f"{size} byte{'s' * (size != '1')}" + (
             f", integers {order}-endian" if order else ""
         )
         sheet.draw_title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
         sheet.draw_items(
-            _ItemBuilder(message.seals, mixed=not order).visit(message.root, SizeFormula(), 0), 0
+            _ItemBuilder(message.seals, has_both_orders=not order).visit(
+                message.root, SizeFormula(), 0
+            ),
+            0,
         )
         sheet.close()
     return sheet.make_document(f"{sensor.id}: packet diagrams")
@@ -415,7 +419,7 @@ class _Sheet:
             + BRACKET_WIDTH_PX * _find_nesting_depth(group)
         )
         path = f"M{x} {top + 2:g}h6v{self.top - top - 4:g}h-6"
-        dashes = ' stroke-dasharray="4 3"' if group.optional else ""
+        dashes = ' stroke-dasharray="4 3"' if group.is_optional else ""
         self.parts.append(
             f'<path d="{path}" fill="none" stroke="{LINE_COLOUR}" stroke-width="1.4"{dashes}/>'
         )

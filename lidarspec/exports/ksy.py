@@ -166,7 +166,7 @@ INTEGER_SIZES = (1, 2, 4, 8)
 FLOAT_SIZES = (4, 8)
 
 
-def block_type(
+def make_block_type(
     block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
 ) -> tuple[list[Attribute], dict[str, Attribute]]:
     """Return the attributes and the instances of the Kaitai type of a bit block.
@@ -200,7 +200,7 @@ def block_type(
             } | doc(part.info)
             seq.append({"id": f"{name}_bits"} | kind)
         else:
-            seq.append({"id": name} | kind | _valid(part) | doc(part.info))
+            seq.append({"id": name} | kind | _make_valid(part) | doc(part.info))
     return seq, instances
 
 
@@ -220,7 +220,9 @@ def inline_block(
     name = identifier(block.name)
     ordered = _find_bit_order(block)
     if ordered is not None and not part.bits.signed and part.bits.width <= MAX_BITS:
-        return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _valid(part), {}
+        return {"id": name, "type": f"b{part.bits.width}{ordered[1]}", **more} | _make_valid(
+            part
+        ), {}
     if "repeat" in more:
         return None
     return {"id": f"{name}_raw", "size": block.size, **more}, {
@@ -255,7 +257,7 @@ def _list_allowed_values(info: tree.FieldInfo) -> Attribute:
     return {}
 
 
-def _valid(part: tree.Part) -> Attribute:
+def _make_valid(part: tree.Part) -> Attribute:
     if part.info.const is None:
         if part.bits.width > 1:
             return _list_allowed_values(part.info)
@@ -354,7 +356,7 @@ def ksy(sensor: Sensor) -> str:
 
 def _frame(sensor: Sensor, message: ExportedFrame) -> Attribute:
     try:
-        return _KaitaiWriter(message.seals).struct(message.root, ())
+        return _KaitaiWriter(message.seals).make_struct_type(message.root, ())
     except ExportError as refused:
         raise ExportError(f"{sensor.id} {message.name}: {refused}") from None
 
@@ -368,7 +370,7 @@ class _KaitaiType:
     enums: dict[str, Attribute] = field(default_factory=dict)
     types: dict[str, Attribute] = field(default_factory=dict)
 
-    def done(self, path: str) -> Attribute:
+    def finish(self, path: str) -> Attribute:
         """Return the finished type.
 
         Raises:
@@ -406,12 +408,12 @@ class _KaitaiWriter:
 
     seals: Mapping[str, tree.Sealed]
 
-    def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
+    def make_struct_type(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """Return the Kaitai type of a struct inside the types of `scope`."""
         kaitai = _KaitaiType()
         for member in node.struct.members:
             self._add_member(kaitai, member, (*scope, node.struct.path))
-        return kaitai.done(node.struct.path)
+        return kaitai.finish(node.struct.path)
 
     def _add_member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add a member to a type; `more` contains further keys of the attribute."""
@@ -452,11 +454,11 @@ class _KaitaiWriter:
                     kaitai, node.name, format_integer(node.key, scope), cases, scope, **more
                 )
             case tree.Repeat():
-                self._repeat(kaitai, node, scope, **more)
+                self._add_repeat(kaitai, node, scope, **more)
             case tree.PartSequence():
                 self._add_parts(kaitai, node, scope, **more)
             case tree.Block() if (plain := inline_block(node, more)) is not None:
-                kaitai.seq.append(plain[0] | self._doc(node.info))
+                kaitai.seq.append(plain[0] | self._make_doc(node.info))
                 kaitai.instances |= plain[1]
                 self._add_physical(kaitai, node.info, more)
             case tree.Number() | tree.Blob():
@@ -479,11 +481,13 @@ class _KaitaiWriter:
                 [{"id": "value", "type": "part", "repeat": "eos"}],
                 types={"part": self._make_type(kind.element, (*scope, None))},
             )
-            kaitai.types[name] = inner.done(node.axis)
-            kaitai.seq.append({"id": name, "type": name, "size": _size(node.within, scope), **more})
+            kaitai.types[name] = inner.finish(node.axis)
+            kaitai.seq.append(
+                {"id": name, "type": name, "size": _format_size(node.within, scope), **more}
+            )
             return
         if node.count is not None:
-            more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
+            more |= {"repeat": "expr", "repeat-expr": _format_size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
             ends = _format_of_last_part(kind.following, scope)
             if "if" in more:
@@ -510,26 +514,28 @@ class _KaitaiWriter:
         A node that is neither a struct nor a bit block is the member `value` of the type.
         """
         if isinstance(node, tree.Struct | tree.Sealed):
-            return self.struct(node, scope)
+            return self.make_struct_type(node, scope)
         kaitai = _KaitaiType()
         if isinstance(node, tree.Block):
-            kaitai.seq, kaitai.instances = block_type(node, self._doc)
+            kaitai.seq, kaitai.instances = make_block_type(node, self._make_doc)
             for part in node.parts:
                 if not part.indices:
                     self._add_physical(kaitai, part.info, {}, name="_".join(part.names) or "value")
-            return kaitai.done(node.info.path)
+            return kaitai.finish(node.info.path)
         self._add_member(kaitai, _name_value(node), (*scope, None))
-        return kaitai.done(node.name)
+        return kaitai.finish(node.name)
 
-    def _repeat(self, kaitai: _KaitaiType, node: tree.Repeat, scope: Scope, **more: Any) -> None:
-        more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
+    def _add_repeat(
+        self, kaitai: _KaitaiType, node: tree.Repeat, scope: Scope, **more: Any
+    ) -> None:
+        more |= {"repeat": "expr", "repeat-expr": _format_size(node.count, scope)}
         element = as_block(node.element)
         if isinstance(element, tree.Number | tree.Blob):
             kaitai.seq.append(
                 self._make_plain(element, scope) | {"id": identifier(node.name)} | more
             )
         elif isinstance(element, tree.Block) and (plain := inline_block(element, more)) is not None:
-            kaitai.seq.append(plain[0] | self._doc(element.info))
+            kaitai.seq.append(plain[0] | self._make_doc(element.info))
         else:
             self._add_typed(kaitai, node.name, element, scope, **more)
 
@@ -569,8 +575,8 @@ class _KaitaiWriter:
             elif node.const is not None:
                 kind = {"contents": [HexNumber(byte) for byte in node.const]}
             else:
-                kind = {"size": _size(node.size, scope)}
-            return head | kind | self._doc(node.info)
+                kind = {"size": _format_size(node.size, scope)}
+            return head | kind | self._make_doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOAT_SIZES:
             raise ExportError(
@@ -585,9 +591,9 @@ class _KaitaiWriter:
             const = _list_allowed_values(node.info)
         else:
             const = {"valid": node.info.const}
-        return head | {"type": f"{letter}{node.size}{order}"} | const | self._doc(node.info)
+        return head | {"type": f"{letter}{node.size}{order}"} | const | self._make_doc(node.info)
 
-    def _doc(self, info: tree.FieldInfo) -> Attribute:
+    def _make_doc(self, info: tree.FieldInfo) -> Attribute:
         seal = self.seals.get(info.path)
         if seal is None:
             sealed = ""
@@ -638,7 +644,7 @@ def _make_enum(labels: Mapping[int, str]) -> Attribute:
     return members
 
 
-def _size(formula: tree.Formula, scope: Scope) -> int | str:
+def _format_size(formula: tree.Formula, scope: Scope) -> int | str:
     if isinstance(formula, int):
         return formula
     return format_integer(formula, scope)

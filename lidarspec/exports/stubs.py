@@ -138,7 +138,7 @@ class _StubClasses:
                 this name.
         """
         if isinstance(node, list):
-            kind = _number_type(node[0]) if len(node) == 1 else "Any"
+            kind = _find_number_type(node[0]) if len(node) == 1 else "Any"
             infos = node
         else:
             kind = self._type(owner, name, node)
@@ -162,12 +162,12 @@ class _StubClasses:
     def _type(self, owner: str, name: str, node: Node) -> str:
         match node:
             case Number():
-                return _number_type(node.info)
+                return _find_number_type(node.info)
             case Blob():
-                return _bytes_type(node.info)
+                return _find_bytes_type(node.info)
             case Block() if not node.parts[0].names:
                 if len(node.parts) == 1:
-                    return _number_type(node.parts[0].info)
+                    return _find_number_type(node.parts[0].info)
                 return "list[int]"
             case Struct() | Sealed() | Block():
                 return self.add(node, owner + to_class_name(name), f"`{name}` of `{owner}`.")
@@ -191,7 +191,7 @@ class _StubClasses:
                 return "None"
 
 
-def _number_type(info: FieldInfo) -> str:
+def _find_number_type(info: FieldInfo) -> str:
     if info.kind == "float":
         return "float"
     if info.labels:
@@ -199,7 +199,7 @@ def _number_type(info: FieldInfo) -> str:
     return "int"
 
 
-def _bytes_type(info: FieldInfo) -> str:
+def _find_bytes_type(info: FieldInfo) -> str:
     """Return the type of the parsed value of bytes; a function may decode the bytes."""
     if info.adapter is None:
         return "bytes"
@@ -263,7 +263,7 @@ def _write_build(message: ExportedFrame) -> str:
 
 def _write_command(sensor: Sensor, name: str) -> str:
     args = "".join(
-        f", {argument}: {_argument_type(sensor, name, argument)}"
+        f", {argument}: {_find_argument_type(sensor, name, argument)}"
         for argument in sensor.commands[name].args
     )
     return (
@@ -272,7 +272,7 @@ def _write_command(sensor: Sensor, name: str) -> str:
     )
 
 
-def _argument_type(sensor: Sensor, command: str, argument: str) -> str:
+def _find_argument_type(sensor: Sensor, command: str, argument: str) -> str:
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(find_argument_slot(sensor, command, argument).info, kind)
