@@ -90,7 +90,7 @@ class Explanation:
     @property
     def is_filler(self) -> bool:
         """Whether the bytes are only fillers that the sensor sends between frames."""
-        return not self.frame and all(row.right for row in self.rows)
+        return not self.frame and all(row.matches_spec for row in self.rows)
 
     def path_of(self, number: int, part: int = 0) -> str | None:
         """Return the path of the row that contains a point; None if there is no such row.

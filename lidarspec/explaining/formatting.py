@@ -189,7 +189,7 @@ class ExplainedRow:
         path: the path of the field or element; "" for bytes that are not in a field.
         values: the fields in these bytes.
         remarks: remarks on constants, checksums and missing bytes.
-        right: whether the bytes match the spec.
+        matches_spec: whether the bytes match the spec.
         points: the points in this element.
         numbers: for each point, the index of its part in the frame, and its index in the part.
     """
@@ -199,7 +199,7 @@ class ExplainedRow:
     path: str
     values: tuple[FieldValue, ...] = ()
     remarks: tuple[str, ...] = ()
-    right: bool = True
+    matches_spec: bool = True
     points: tuple[ExplainedPoint, ...] = ()
     numbers: tuple[tuple[int, int], ...] = ()
 
@@ -216,7 +216,7 @@ class ExplainedRow:
         """
         alone = len(self.values) == 1 and not self.values[0].bits
         values = [] if drawn else self._format_values(alone=alone)
-        verdict = "good" if self.right else "bad"
+        verdict = "good" if self.matches_spec else "bad"
         docs = self.values[0].docs if alone and self.is_in_first_element else ""
         points = list(dict.fromkeys(str(point) for point in self.points))
         parts = [(", ", text, "") for text in values] + [
@@ -276,7 +276,7 @@ class ExplainedRow:
             "hex": self.data.hex(" "),
             "path": self.path,
             "meaning": self.meaning,
-            "right": self.right,
+            "right": self.matches_spec,
         }
         points = [
             {name: to_json_number(value) for name, value in point._asdict().items()}

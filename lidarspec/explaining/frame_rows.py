@@ -99,12 +99,14 @@ class FrameRows:
         the bytes before and after its struct have rows as well.
         """
         if self._first:
-            yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), right=True)
+            yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), matches_spec=True)
         rows = itertools.groupby(self._fields, lambda field: self._find_row_path(field.block))
         for path, group in rows:
             yield self._make_row(path, list(group))
         if self._is_whole_text and self._end < len(self._data):
-            yield ExplainedRow(self._end, self._data[self._end :], "(end)", (), (), right=True)
+            yield ExplainedRow(
+                self._end, self._data[self._end :], "(end)", (), (), matches_spec=True
+            )
 
     def values(self) -> dict[str, FieldValue]:
         """Return all values by path."""
@@ -117,12 +119,14 @@ class FrameRows:
         """
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
-            yield ExplainedRow(self.after, left, fault.path, (), (fault.reason,), right=False)
+            yield ExplainedRow(
+                self.after, left, fault.path, (), (fault.reason,), matches_spec=False
+            )
         elif fault is not None and self._has_form and not left:
-            yield ExplainedRow(self.after, left, "(end)", (), (fault.reason,), right=False)
+            yield ExplainedRow(self.after, left, "(end)", (), (fault.reason,), matches_spec=False)
         elif left:
             yield ExplainedRow(
-                self.after, left, "", (), ("after the end of the frame",), right=False
+                self.after, left, "", (), ("after the end of the frame",), matches_spec=False
             )
 
     def _find_row_path(self, path: str) -> str:
@@ -146,20 +150,20 @@ class FrameRows:
         end = group[-1].end
         values: list[FieldValue] = []
         remarks: list[str] = []
-        right = True
+        matches_spec = True
         for field in group:
             info = self._find_info(field)
             values.append(_make_value(field, info))
             wrong = self._find_fault(field, info)
             if wrong:
                 remarks.append(wrong)
-                right = False
+                matches_spec = False
             if field.path in self._verdicts:
                 text, is_right = self._verdicts[field.path]
                 remarks.append(text)
-                right = right and is_right
+                matches_spec = matches_spec and is_right
         return ExplainedRow(
-            start, self._data[start:end], path, tuple(values), tuple(remarks), right
+            start, self._data[start:end], path, tuple(values), tuple(remarks), matches_spec
         )
 
     def _find_info(self, field: WireField) -> FieldInfo:

@@ -43,13 +43,13 @@ class InputPiece:
         data: the bytes.
         frame: the frame type. It is "" for bytes that are not in a frame, and `NEAREST` for a short
             input that is probably one damaged frame.
-        datagram: for bytes that are not in a frame, whether they are from a datagram.
+        is_datagram: for bytes that are not in a frame, whether they are from a datagram.
     """
 
     offset: int
     data: bytes
     frame: str
-    datagram: bool = False
+    is_datagram: bool = False
 
     @property
     def is_valid(self) -> bool:
@@ -194,7 +194,7 @@ def _explain_skipped(sensor: Sensor, piece: InputPiece) -> tuple[InputPiece, Exp
         sensor.id,
         "",
         piece.data,
-        (ExplainedRow(0, piece.data, "", (), (remark,), right=is_filler),),
+        (ExplainedRow(0, piece.data, "", (), (remark,), matches_spec=is_filler),),
     )
 
 
@@ -203,14 +203,14 @@ def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
     data = piece.data
     end = 0
     starts = find_likely_starts(sensor, data)
-    if piece.datagram:
+    if piece.is_datagram:
         starts = [start for start in starts if start == 0]
     for start in [*starts, len(data)]:
         if start > end and (name := _find_headless_type(sensor, data[end:start])):
             yield piece.part(end, start, name)
             end = start
         if end <= start < len(data) and (name := _find_nearest_type(sensor, data[start:])):
-            if piece.datagram:
+            if piece.is_datagram:
                 end = len(data)
             else:
                 end = _find_end(sensor, data, start, name, [*starts, len(data)])

@@ -125,7 +125,7 @@ class Listing:
         parts = [
             row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)
         ] or [b""]
-        role = "hex" if row.right else "bad"
+        role = "hex" if row.matches_spec else "bad"
         yield self._make_line(
             row.offset,
             TextSpan(parts[0].hex(" "), role),

@@ -101,7 +101,7 @@ def explanation(value: Explanation) -> str:
         indent = "&nbsp;" * 2 * len(list_parents(row.path))
         name = escape(row.path.rpartition(".")[2])
         meaning = escape(printable(row.meaning))
-        if row.right:
+        if row.matches_spec:
             tint = f"hsl({number * HUE_STEP_DEG % 360} 70% 50% / .25)"
         else:
             tint = "hsl(0 90% 50% / .55)"
@@ -112,7 +112,7 @@ def explanation(value: Explanation) -> str:
             code = f'<code style="background:{tint};padding:1px 3px;color:inherit">{data}</code>'
         else:
             code = ""
-        meaning = meaning if row.right else f"<b>{meaning}</b>"
+        meaning = meaning if row.matches_spec else f"<b>{meaning}</b>"
         rows.append(
             [
                 f"<code>{row.offset:04x}</code>",

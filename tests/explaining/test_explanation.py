@@ -81,7 +81,7 @@ def test_every_byte_is_named_once(name: str) -> None:
         found = explain_example(name, frame)
         assert bytes_of_rows(found) == found.data
         assert found.fault is None
-        assert all(row.right and row.path for row in found.rows)
+        assert all(row.matches_spec and row.path for row in found.rows)
         json.dumps(found.to_dict(), allow_nan=False)
 
 
@@ -99,7 +99,7 @@ def test_a_truncated_frame_is_explained_as_far_as_it_goes(name: str) -> None:
             found = explain(data[:end], sensor, frame)
             assert bytes_of_rows(found) == data[:end]
             assert found.fault is not None
-            assert not found.rows[-1].right
+            assert not found.rows[-1].matches_spec
             for row, same in zip(found.rows[:-2], whole.rows, strict=False):
                 assert (row.offset, row.data, row.path, row.values) == (
                     same.offset,
@@ -223,14 +223,14 @@ def test_text_is_as_the_conventions_say() -> None:
 def test_a_wrong_checksum_shows_the_computed_one_and_gives_no_points() -> None:
     found = explain(EXAMPLE[:-1] + b"\x51", ls.sensor("ldrobot-stl27l"))
     assert found.rows[-1].meaning == "0x51 wrong, expected 0x50 (CRC-8 poly 0x4d over 46 bytes)"
-    assert [row.right for row in found.rows] == [True] * (len(found.rows) - 1) + [False]
+    assert [row.matches_spec for row in found.rows] == [True] * (len(found.rows) - 1) + [False]
     assert not any(row.points for row in found.rows)
 
 
 def test_a_wrong_constant_is_reported() -> None:
     found = explain(b"\x54\x2d" + EXAMPLE[2:], ls.sensor("ldrobot-stl27l"))
     assert found.rows[0].remarks == ("wrong: 54 2d, expected 54 2c",)
-    assert not found.rows[0].right
+    assert not found.rows[0].matches_spec
 
 
 def test_trailing_bytes_are_reported_and_points_remain() -> None:
@@ -259,7 +259,7 @@ def test_checksums_of_every_kind_are_judged() -> None:
     assert row.remarks == (
         "0x0000 means no checksum (CRC-16 poly 0x1021 init 0xffff over 55 bytes)",
     )
-    assert row.right
+    assert row.matches_spec
 
 
 def test_bit_fields_show_their_bits() -> None:

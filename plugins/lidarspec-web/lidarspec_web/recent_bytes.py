@@ -44,7 +44,7 @@ class DamagedBytes:
         size: number of bytes.
         at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
         data: the bytes; if there are too many, only the first.
-        datagram: whether the bytes are one whole datagram.
+        is_datagram: whether the bytes are one whole datagram.
     """
 
     number: int
@@ -52,7 +52,7 @@ class DamagedBytes:
     size: int
     at: int
     data: bytes
-    datagram: bool
+    is_datagram: bool
 
     def verdict(self, sensor: Sensor) -> str:
         """Return the fault of the bytes in one sentence."""
@@ -243,7 +243,7 @@ class RecentBytes:
         damage, and the rows of the bytes between these frames.
         """
         parts = list(
-            explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.datagram))
+            explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.is_datagram))
         )
         frames = [explanation for _, explanation in parts if explanation.frame]
         rows = []
