@@ -34,7 +34,7 @@ ANNOUNCED_INTERVAL = 40
 def streams(subject: SensorUnderTest, length: int) -> dict[str, list[bytes]]:
     """Return streams of at least `length` bytes by kind, as lists of frames and fragments."""
     sensor = subject.sensor
-    source = subject.source("hostile 0")
+    source = subject.make_random("hostile 0")
     makers = _makers(subject)
     made = {
         name: _of_length(length, functools.partial(make, source)) for name, make in makers.items()
@@ -142,7 +142,7 @@ def _of_random_header(subject: SensorUnderTest, name: str, seed: int) -> bytes:
             return random_frame(
                 subject.sensor,
                 name,
-                subject.source(f"header {seed} of {name}"),
+                subject.make_random(f"header {seed} of {name}"),
                 subject.drawers(name),
             )
     return b""

@@ -13,7 +13,12 @@ from lidarspec import Packets, PointCloud, Sensor, SpecError
 from lidarspec.framing.decoder import Decoder, decode_all, is_stream
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.stream import PacketStream
-from lidarspec.testing.cloud_assertions import ULPS, assert_same_places, assert_well_formed, same
+from lidarspec.testing.cloud_assertions import (
+    ULPS,
+    are_equal,
+    assert_same_places,
+    assert_well_formed,
+)
 from tests.by_construct import by_construct
 
 
@@ -41,20 +46,22 @@ def assert_same_packets(one: Packets, other: Packets, *, by_reason: bool = True)
     """
     assert one.raw.dtype == other.raw.dtype
     for path in one.table.schema.fields:
-        assert same(one.table.raw(path), other.table.raw(path)), f"raw {path} differs"
+        assert are_equal(one.table.raw(path), other.table.raw(path)), f"raw {path} differs"
         if one.table.schema.columns[path].kind != "other":
-            assert same(one[path], other[path]), f"{path} differs"
+            assert are_equal(one[path], other[path]), f"{path} differs"
     # a text is an array of bytes in the frame, but not in the columns
     arrays = {axis for info in one.table.schema.columns.values() for axis in info.axes}
     for array in arrays.intersection(one.table.schema.arrays):
-        assert same(_lengths(one, array), _lengths(other, array)), f"the lengths of {array} differ"
+        assert are_equal(_lengths(one, array), _lengths(other, array)), (
+            f"the lengths of {array} differ"
+        )
     for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
-        assert same(getattr(one, name), getattr(other, name)), f"{name} differs"
+        assert are_equal(getattr(one, name), getattr(other, name)), f"{name} differs"
     assert list_counters(one.stats, by_reason=by_reason) == list_counters(
         other.stats, by_reason=by_reason
     )
     for axis, node in one.table.schema.separate_parts.items():
-        assert same(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
+        assert are_equal(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
         for kind in node.kinds:
             parts = f"{axis}.{kind.name}".rstrip(".")
             assert_same_packets(one.parts(parts), other.parts(parts), by_reason=by_reason)

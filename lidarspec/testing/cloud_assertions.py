@@ -49,7 +49,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
         ulps: tolerance of coordinates and angles in units in the last place.
     """
     assert cloud.columns.keys() == other.columns.keys()
-    assert same(cloud.valid, other.valid)
+    assert are_equal(cloud.valid, other.valid)
     reach = _find_extents(cloud)
     range_tolerance = ulps * np.spacing(np.minimum(reach, np.abs(cloud.range)))
     tolerances: dict[str, tuple[Any, float]] = {
@@ -66,7 +66,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
             tolerance, full_circle = tolerances[name]
             assert _is_close(first, second, tolerance, full_circle), f"{name} differs"
         else:
-            assert same(first, second), f"{name} differs"
+            assert are_equal(first, second), f"{name} differs"
     assert cloud.time.shape == other.time.shape
     assert np.allclose(cloud.time, other.time, rtol=1e-12, atol=TIME_TOLERANCE_S, equal_nan=True)
     assert abs(cloud.stamp_ns - other.stamp_ns) <= STAMP_TOLERANCE_NS
@@ -101,7 +101,7 @@ def _is_close(
         return bool(((apart <= tolerance) | (first == second) | both_nan).all())
 
 
-def same(first: NDArray[Any], second: NDArray[Any]) -> bool:
+def are_equal(first: NDArray[Any], second: NDArray[Any]) -> bool:
     """Return whether two arrays are equal in shape, type and value; NaN equals NaN."""
     return (
         first.dtype == second.dtype

@@ -326,7 +326,7 @@ def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     engine = get_codec(frame)
     if not isinstance(engine, CompiledCodec) or engine.schema.has_measured_sizes:
         return
-    source = subject.source(f"lengths of {name}")
+    source = subject.make_random(f"lengths of {name}")
     for path in make_random_header(engine, source)[1]:
         info = engine.schema.fields[path]
         for shift in range(info.bits if info.const is None else 0):

@@ -108,7 +108,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
                 _raise_changed_bytes(subject, name, data, built, "LS302")
             again = sensor.parse(built, frame=name)
             require(
-                same(parsed, again),
+                are_equal(parsed, again),
                 "LS302",
                 "parsing the built frame gives a different value",
                 name,
@@ -141,7 +141,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
 
 def _changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
     """Yield copies of examples with one changed byte each."""
-    source = subject.source(f"raw {name}")
+    source = subject.make_random(f"raw {name}")
     changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGED_VALUES), MAX_CHANGED_BYTES)
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CHANGED_BYTES
@@ -160,7 +160,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
         iter_leaves(parsed), iter_leaves(again), strict=False
     ):
         is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
-        if path == other and is_number and not same(before, after):
+        if path == other and is_number and not are_equal(before, after):
             raise ViolationError(
                 "LS303" if is_cut(before, after) else "LS302",
                 f"{before!r} becomes {after!r}",
@@ -243,19 +243,21 @@ def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     )
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(
-        any(same(subject.sensor.parse(data), values) for values in read),
+        any(are_equal(subject.sensor.parse(data), values) for values in read),
         "LS306",
         "if no type is given, the example is parsed as another type",
         name,
     )
 
 
-def same(first: Any, second: Any) -> bool:
+def are_equal(first: Any, second: Any) -> bool:
     """Return whether two parsed frames are equal; NaNs are compared bit by bit."""
     if isinstance(first, dict) and isinstance(second, dict):
-        return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
+        return first.keys() == second.keys() and all(
+            are_equal(first[key], second[key]) for key in first
+        )
     if isinstance(first, list) and isinstance(second, list):
-        return len(first) == len(second) and all(map(same, first, second))
+        return len(first) == len(second) and all(map(are_equal, first, second))
     return bool(first == second) or (
         first != first
         and second != second
@@ -426,7 +428,7 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CUT_BYTES
     )
-    for end in material.pick_offsets(len(data), subject.source("cut"), offset_count):
+    for end in material.pick_offsets(len(data), subject.make_random("cut"), offset_count):
         try:
             subject.sensor.parse(data[:end], frame=name)
         except WireError as error:
@@ -452,7 +454,7 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str
     The frame is parsed with and without verification.
     """
     sensor = subject.sensor
-    source = subject.source(f"mutations {name}")
+    source = subject.make_random(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY_FRAME_TYPES else (name,)
     for seed in subject.seeds(name, share=4):
         data = material.mutate(subject.example(name, seed=seed % 8), source)
@@ -473,7 +475,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
     engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
-    source = subject.source(f"flipped bits of {name}")
+    source = subject.make_random(f"flipped bits of {name}")
     tried = passed = 0
     sealed = False
     for seed in range(

@@ -233,7 +233,7 @@ class SensorUnderTest:
         """Return the fields of a frame type, by path."""
         return get_codec(self.sensor.frames[frame]).schema.all_fields
 
-    def source(self, purpose: str = "") -> random.Random:
+    def make_random(self, purpose: str = "") -> random.Random:
         """Return a random generator for a purpose; it gives the same numbers in every run."""
         return random.Random(f"{self.sensor.id} {purpose}")
 

@@ -47,11 +47,11 @@ from lidarspec.spec.syntax import check_bound
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing.value_ranges import (
     LayoutRanges,
+    find_headers,
+    find_ranges,
+    find_valid_frames,
+    find_value_ranges,
     is_often_valid,
-    known_frames,
-    known_headers,
-    ranges_of,
-    ranges_of_values,
 )
 
 __all__ = ["commands", "frames", "scans", "streams", "values"]
@@ -353,10 +353,10 @@ def _to_plain(parsed: Any) -> Any:
 @st.composite
 def _compiled_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
     """Draw a frame of a compiled type: first its header fields, then all other fields."""
-    ranges = ranges_of(sensor, frame, draw(_headers(sensor, frame, fields)))
+    ranges = find_ranges(sensor, frame, draw(_headers(sensor, frame, fields)))
     if ranges is None:
         # No plausible frame has this header.
-        ranges = ranges_of(sensor, frame, draw(st.sampled_from(known_headers(sensor, frame))))
+        ranges = find_ranges(sensor, frame, draw(st.sampled_from(find_headers(sensor, frame))))
         assert ranges is not None
     drawn = {
         leaf.info.path: _draw_leaf(draw, leaf, _element_values(leaf.info, ranges, fields))
@@ -389,7 +389,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
         except (TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             # The last drawn value is invalid: with the values before it, there was a next field.
             if not header.get(asked):
-                return draw(st.sampled_from(known_headers(sensor, frame)))
+                return draw(st.sampled_from(find_headers(sensor, frame)))
             header[asked] = int(header[asked] / 2)
         else:
             return tuple(header.items())
@@ -534,14 +534,14 @@ def _mostly_low(low: int, high: int) -> SearchStrategy[int]:
 @st.composite
 def _plain_frames(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> bytes:
     """Draw a frame value by value, if its type has parts or is not compiled."""
-    source = _DrawnNumbers(draw, ranges_of_values(sensor, frame))
+    source = _DrawnNumbers(draw, find_value_ranges(sensor, frame))
     drawn = {path: functools.partial(_draw_own, strategy) for path, strategy in fields.items()}
     try:
         return draw_frame(sensor, frame, source, drawn, tries=TRIES)
     except SpecError:
         if fields or is_often_valid(sensor, frame):
             reject()
-        examples = known_frames(sensor, frame)
+        examples = find_valid_frames(sensor, frame)
         if not examples:
             reject()
         return draw(st.sampled_from(examples))

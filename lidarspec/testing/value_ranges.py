@@ -288,7 +288,7 @@ SINGLE_WALKS = 10
 
 
 @functools.lru_cache(maxsize=4096)
-def ranges_of(
+def find_ranges(
     sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
 ) -> LayoutRanges | None:
     """Return the ranges of frames with this header; None if no valid frame is found.
@@ -317,7 +317,7 @@ def ranges_of(
 
 
 @functools.lru_cache(maxsize=1024)
-def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]]:
+def find_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]]:
     """Return the distinct headers of a few random frames, in order of frame length.
 
     Raises:
@@ -363,7 +363,7 @@ def _are_valid(
 
 
 @functools.lru_cache(maxsize=1024)
-def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
+def find_valid_frames(sensor: Sensor, frame: str) -> list[bytes]:
     """Return a few valid frames of a type that is not compiled, the shortest first.
 
     Returns an empty list if none is found.
@@ -390,7 +390,7 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)
-def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
+def find_value_ranges(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
     """Return the lowest and highest raw value of integer fields of a frame.
 
     The frame type need not be compiled. The values are found by changing one valid frame. Two kinds
@@ -399,7 +399,7 @@ def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]
     """
     if sensor.frames[frame].plausible is None:
         return {}
-    examples = known_frames(sensor, frame)
+    examples = find_valid_frames(sensor, frame)
     if not examples:
         return {}
     engine = get_codec(sensor.frames[frame])

@@ -180,7 +180,7 @@ def the_status_is_proven(subject: SensorUnderTest) -> None:
 
 def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:
     """Check that each data field has a value other than 0 in some vector."""
-    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    vectors = [vector for vector in read_valid_entries(subject).values() if vector["frame"] == name]
     if not vectors:
         return
     pinned: dict[str, bool] = {}
@@ -208,7 +208,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
 
 def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     """Check that vectors have points in two quadrants, within the declared range."""
-    vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
+    vectors = [vector for vector in read_valid_entries(subject).values() if vector["frame"] == name]
     placed = [
         point
         for vector in vectors
@@ -267,7 +267,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     try:
         frames = [
             parse_hex(vector["hex"])
-            for vector in entries(subject).values()
+            for vector in read_valid_entries(subject).values()
             if vector["frame"] == name
         ]
     except ViolationError:  # reported by `vectors_hold`
@@ -388,7 +388,7 @@ def _find_checksum_field(
     )
 
 
-def entries(subject: SensorUnderTest) -> dict[str, Any]:
+def read_valid_entries(subject: SensorUnderTest) -> dict[str, Any]:
     """Return the valid vectors of the sensor by their keys.
 
     Raises:
@@ -503,7 +503,9 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: s
                 "LS707", error.reason, f"{entry_key} {name}.{error.path}"
             ) from error
         same = [
-            parse_hex(entry["hex"]) for entry in entries(subject).values() if entry["frame"] == name
+            parse_hex(entry["hex"])
+            for entry in read_valid_entries(subject).values()
+            if entry["frame"] == name
         ]
         fitting = [
             _describe_match(match, len(data))

@@ -36,7 +36,7 @@ def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVER
     There is one undamaged conversation, and `count` conversations with damaged frames.
     """
     subject = SensorUnderTest(sensor)
-    source = subject.source("agree")
+    source = subject.make_random("agree")
     frames = subject.conversation(rounds=1)
     assert_backends_agree(sensor, material.make_input(sensor, frames))
     for _ in range(count):
@@ -59,7 +59,7 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
         if frame.max_length > material.MAX_SHORT_BYTES or not is_compiled(frame):
             continue
         fields = get_codec(frame).schema.fields
-        source = subject.source(f"edges {name}")
+        source = subject.make_random(f"edges {name}")
         edged = []
         for seed in range(count):
             parsed = sensor.parse(subject.example(name, seed=seed), frame=name)

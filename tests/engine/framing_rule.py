@@ -45,7 +45,7 @@ def any_split_gives_the_same(subject: SensorUnderTest, length: int = LENGTH) -> 
     Streams of `streams.LENGTH` are split at every byte, shorter ones at random places.
     """
     sensor = subject.sensor
-    source = subject.source("splits")
+    source = subject.make_random("splits")
     data = material.mutate(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
     data = data[: max(length // 2, 2 * _longest_frame(sensor))]
     offsets = material.pick_offsets(len(data), source)
@@ -94,7 +94,7 @@ def _part(subject: SensorUnderTest, length: int, purpose: str) -> bytes:
     A whole round is too long if a sensor has many frame types.
     """
     data = clean(subject, length=length)
-    start = subject.source(purpose).randrange(max(len(data) - length, 1))
+    start = subject.make_random(purpose).randrange(max(len(data) - length, 1))
     return data[start : start + length]
 
 
@@ -125,7 +125,7 @@ def a_header_may_start_at_every_byte(subject: SensorUnderTest, length: int = LEN
 
 def noise_is_cut_by_the_rule(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check constant lines, and noise made of headers, against the oracle."""
-    source = subject.source("noise")
+    source = subject.make_random("noise")
     whole = subject.stream(rounds=1)[:length]
     idle_bytes = length // 5
     for byte in (b"\x00", b"\xff"):
@@ -157,7 +157,7 @@ def announcements_may_change_with_every_frame(
     Announcements and frames come in any order. Some frames are truncated or damaged.
     """
     sensor = subject.sensor
-    source = subject.source("changes")
+    source = subject.make_random("changes")
     announcing = sorted({frame.after for frame in sensor.incoming.values() if frame.after})
     if not announcing:
         return

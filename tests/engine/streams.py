@@ -154,7 +154,7 @@ def longest_example(subject: SensorUnderTest, name: str, headers: int = MANY_HEA
         subject.example(name, seed=seed) for seed in range(8 if headers < MANY_HEADERS else 20)
     ]
     engine = get_codec(subject.sensor.frames[name])
-    source = subject.source(f"longest {name}")
+    source = subject.make_random(f"longest {name}")
     is_drawn = isinstance(engine, CompiledCodec) and engine.size is None
     if is_drawn and (headers >= MANY_HEADERS or not engine.schema.parts):
         with contextlib.suppress(SpecError):

@@ -28,7 +28,7 @@ SEEDS = 2
 def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> None:
     sensor = load_sensor(name)
     subject = SensorUnderTest(sensor)
-    source = subject.source(f"hostile frames {times}")
+    source = subject.make_random(f"hostile frames {times}")
     examples = [
         (frame, subject.example(frame, seed=seed))
         for frame in sensor.frames
@@ -45,7 +45,7 @@ def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> 
 def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
     sensor = load_sensor(name)
     subject = SensorUnderTest(sensor)
-    source = subject.source("hostile streams")
+    source = subject.make_random("hostile streams")
     frames = subject.conversation(rounds=1)
     mutated = [
         (frame, material.mutate(data, source))

@@ -75,7 +75,10 @@ def splits(share: float) -> Figure:
     tried = differing = 0
     for sensor in streams().values():
         subject = SensorUnderTest(sensor)
-        data, source = clean(subject, length=max(int(1000 * share), 300)), subject.source("soak")
+        data, source = (
+            clean(subject, length=max(int(1000 * share), 300)),
+            subject.make_random("soak"),
+        )
         books = Books(sensor).feed(data)
         whole, stats = books.finish(), books.decoder.stats
         cuts = [[data[:spot], data[spot:]] for spot in range(0, len(data), 1 if share == 1 else 7)]
