@@ -11,9 +11,10 @@ in v1.1. In the angle example, the corrections 10.9442 and 11.8653 degrees shoul
 11.8674 (at 1000 and 8000 mm), and 71.1718 should be 71.171875.
 
 Known gaps of the manual: The figure with the order of the checksum is missing; the grouping in this
-module fits every captured packet. There is no baud rate, no rule for packets that cross 360 degrees
-or have one sample (the formula divides by LSN - 1), and no command for the announced switch between
-5.5 and 7 Hz. A COIN-D4 sends the fillers FE and FF, and FA FA once, which no manual mentions.
+module fits every captured packet. The baud rate is missing, and so is the command for the announced
+switch between 5.5 and 7 Hz. There is no rule for packets that cross 360 degrees or have one sample
+(the formula divides by LSN - 1). A COIN-D4 sends the fillers FE and FF, and FA FA once, which no
+manual mentions.
 
 Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
 captures: 10 revolutions a second, 400 points per revolution, and an unexplained frame every three
