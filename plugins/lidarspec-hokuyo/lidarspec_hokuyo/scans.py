@@ -3,8 +3,8 @@
 ME and GE request a distance and an intensity of three characters each. ND, NE, HD and HE request
 the same for each echo of a step, with "&" between echoes. Several steps can be merged to a cluster,
 for which the scanner sends one distance, the shortest. It is assumed that a last cluster with fewer
-steps is sent as well, that the direction of a cluster is the direction of its middle, and that a
-step has at most three echoes, as in Hokuyo's urg_library.
+steps is sent as well, and that the direction of a cluster is the direction of its middle. A step is
+assumed to have at most three echoes, as in Hokuyo's urg_library.
 
 Source: SCIP 2.0, C-42-03320B, sections 5 (steps), 6 (characters), 8.1 (MD and MS, time, errors) and
 8.2 (GD and GS); UTM-30LX-EW, C-42-03886 (intensities and echoes).
