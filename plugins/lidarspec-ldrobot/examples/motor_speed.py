@@ -4,8 +4,8 @@
     python motor_speed.py /dev/ttyUSB0 --hertz 6 --pwm /sys/class/pwm/pwmchip0/pwm0
 
 Connect the output to pin 2 of the sensor (PWM, at most 3.3 V), and the grounds. The duty cycle sets
-the speed, and each unit has another speed at the same duty cycle, so this program compares the
-speed in the packets with the wanted speed and corrects the duty cycle (manual, section 2).
+the speed, but units differ in their speed at the same duty cycle (manual, section 2). This program
+therefore compares the speed in the packets with the wanted speed, and corrects the duty cycle.
 
 `--pin` uses gpiozero. Its pin factory has to reach 20 kHz. pigpio reaches it with `pigpiod -s 1`,
 but only in coarse steps. `--pwm` uses the PWM hardware through Linux, in fine steps. Export the

@@ -13,8 +13,8 @@ baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's. No captured
 or an STL-26 was available. The STL-50 is left out, because its protocol is not public.
 
 Known errors of the manual: The CRC table lacks entries 175 to 186; this module generates the table.
-In the decoded example, point 2 is printed as 200 mm, but 0x00dc is 220, and point 12 is printed as
-B0 00 EA, but the dump, whose CRC is valid, has C0 00 E5. There is no rule for frames that cross 360
+In the decoded example, point 2 is printed as 200 mm, but 0x00dc is 220. Point 12 is printed as B0
+00 EA, but the dump, whose CRC is valid, has C0 00 E5. There is no rule for frames that cross 360
 degrees.
 """
 
