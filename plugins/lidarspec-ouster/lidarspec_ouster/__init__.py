@@ -1,10 +1,10 @@
 """Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP.
 
-The layout of packets and the directions of beams are read from the metadata of the unit, which are
-in a file (`configure(metadata=path)`), or are requested from the sensor's web server when the
-sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`). The
-angles are then those of an ideal sensor, evenly spread over the field of view, and are marked as
-nominal.
+The layout of packets and the directions of beams are read from the metadata of the unit. The
+metadata are in a file (`configure(metadata=path)`), or are requested from the sensor's web server
+when the sensor is opened. Without metadata, the user can pass a layout (`rows`, `turn`, `profile`).
+The angles are then those of an ideal sensor, evenly spread over the field of view, and are marked
+as nominal.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
 (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
