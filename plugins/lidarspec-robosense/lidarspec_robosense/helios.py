@@ -18,9 +18,9 @@ step further, and blocks are about 100 us apart, which requires 55.56 us. The fi
 lasers are from rs_driver, 1.73 us apart; nebula has other times, up to 48 us.
 
 The published capture with the name of the 16P is of a Helios-5515: its packets have type 6, and its
-DIFOP has 32 different angles with single return. If the capture is decoded as a 16P, as it was
-published, the points in the second half of each block get the directions of wrong lasers, and the
-times in a packet extend over twice the duration of the packet.
+DIFOP has 32 different angles with single return. The capture was published with a decoding as a
+16P. In this decoding, the points in the second half of each block have the directions of wrong
+lasers, and the times in a packet extend over twice its duration.
 """
 
 from __future__ import annotations

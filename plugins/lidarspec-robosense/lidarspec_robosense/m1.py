@@ -13,11 +13,12 @@ for mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept
 `firmware` selects a formula. The 750 000 points per second in the guide do not agree with 630
 packets in a frame, which result in 787 500 points.
 
-From byte 28 on, DIFOP has one of three layouts: that of rs_driver since December 2023 (`difop`),
-that of earlier editions of the driver, which contains the field of view (`difop_fov`), and that of
-the M1P user guide (`difop_guide`). Packets do not identify their layout. A packet is therefore read
-with the first of these layouts in which the return mode, the synchronisation mode and status, and
-the microseconds have possible values. If no layout fits, the packet is `difop_other`.
+From byte 28 on, DIFOP has one of three layouts. `difop` is the layout of rs_driver since December
+2023. `difop_fov` is the layout of earlier editions of the driver, and contains the field of view.
+`difop_guide` is the layout of the M1P user guide. Packets do not identify their layout. A packet is
+therefore read with the first of these layouts in which the return mode, the synchronisation mode
+and status, and the microseconds have possible values. If no layout fits, the packet is
+`difop_other`.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ example unit of each model). This module reads the date of a packet as UTC, but 
 as the local time of the computer. In rs_driver's test of the RS-LiDAR-16, a comment mentions steps
 of 0.001 degrees for angles, but the result has steps of 0.0001 degrees.
 
-As in rs_driver, it is assumed that the type in byte 30 is 2 only in packets of an RS-LiDAR-32, and
-1 only in packets of an RS-LiDAR-16, and that bytes 31 and 32 identify a Bpearl of version 4. A
-Bpearl of version 4 is assumed to have the nominal angles of other Bpearls.
+As in rs_driver, it is assumed that the type in byte 30 is 1 only in packets of an RS-LiDAR-16, and
+2 only in packets of an RS-LiDAR-32. It is also assumed that bytes 31 and 32 identify a Bpearl of
+version 4. A Bpearl of version 4 is assumed to have the nominal angles of other Bpearls.
 """
 
 from __future__ import annotations

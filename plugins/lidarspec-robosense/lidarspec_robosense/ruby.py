@@ -16,10 +16,10 @@ send the time in seconds and nanoseconds. According to the manual, with dual ret
 of a pair is the last return, and the second value is the strongest return.
 
 No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
-which is the field of view in the data sheets for 128 and 80 lasers, with the lowest laser first.
-Clouds are marked as nominal until the first DIFOP packet arrives. It is also assumed that no
-RS-Ruby has 5, the series number of the Ruby Plus. The range limits are from rs_driver, and are the
-same for all models.
+with the lowest laser first. 40 degrees is the field of view in the data sheets for 128 and 80
+lasers. Clouds are marked as nominal until the first DIFOP packet arrives. It is also assumed that
+no RS-Ruby has 5, the series number of the Ruby Plus. The range limits are from rs_driver, and are
+the same for all models.
 """
 
 from __future__ import annotations

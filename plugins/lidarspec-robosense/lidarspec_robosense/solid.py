@@ -7,10 +7,10 @@ decoder_RSMX.hpp, decoder_RSE1.hpp: packets, packets per frame, limits); E1 user
 In the manual of the E1, packets are counted from 0, and the return modes 9 to 11 mean dual return;
 in rs_driver, the mode 0 means dual return. The CRCs at the end of packets are not verified, because
 the bytes that they cover are not public; the CRC of the E1 is called AUTOSAR E2E profile 4. It is
-assumed that the other models count packets from 1, as the M1 does, and that frames with dual return
-have twice as many packets, except for the MX, whose points have two radii. The IMU of the E1 is
-assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads both in the same
-way. In the manual, the bytes of the IMU are reserved.
+assumed that the other models count packets from 1, as the M1 does. It is also assumed that frames
+with dual return have twice as many packets, except for the MX, whose points have two radii. The IMU
+of the E1 is assumed to measure in g and rad/s like the IMU of the Airy, because rs_driver reads
+both in the same way. In the manual, the bytes of the IMU are reserved.
 """
 
 from __future__ import annotations
