@@ -247,8 +247,8 @@ def ultra_points(f: Fields) -> Polar:
 def ultra_dense_points(f: Fields) -> Polar:
     """Return 64 points per capsule.
 
-    The scale of a point determines how its bits are divided: the low 10 to 13 bits are the
-    distance, in steps of 2 to 5 mm, and the 8 to 5 bits above them are the quality.
+    The low 10 to 13 bits of a point are the distance, in steps of 2 to 5 mm. The 8 to 5 bits above
+    them are the quality. The scale of the point determines how many bits the distance has.
     """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)

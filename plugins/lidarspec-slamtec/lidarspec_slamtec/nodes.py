@@ -1,7 +1,7 @@
 """Points with their own angle: nodes of five bytes, and HQ capsules of 96 nodes.
 
 An HQ capsule has a CRC-32, but a node has no checksum. A node is valid if S and its inverse differ,
-the check bit is 1 and the angle is below 360 degrees, which is true for 17.6 % of all random
+the check bit is 1 and the angle is below 360 degrees. This is true for 17.6 % of all random
 sequences of five bytes. Nodes are therefore accepted only in runs of `CONFIRM` nodes without a gap.
 The table shows how many nodes were accepted that were not sent, if runs of 1, 6, 8 or 10 nodes are
 required. 10 is the selected value:
