@@ -51,7 +51,7 @@ class Firings:
         offset: degrees to the left of the azimuth for each slot, in the shape of `elevation`.
         blocks_per_azimuth: with single return, the number of blocks with the same azimuth.
         returns: the number of returns of each firing; 0 if the packets contain this number.
-        start: seconds from the time of the packet to its first firing.
+        start: seconds from the time of the packet to the first firing in it.
     """
 
     elevation: NDArray[np.float64]
