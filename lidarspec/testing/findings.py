@@ -70,7 +70,7 @@ LS210 the field cannot hold the range limit | the scale or the limit is wrong | 
 LS211 the declaration is incomplete | lidarspec cannot open, decode or detect the sensor | declare vendor, model, a data frame and a data link
 LS212 the checksum is not verified | damaged frames are accepted
       | use Checksummed (`lidarspec crc` finds the algorithm), or "crc" / Int16ul * "not checked: ..."
-LS213 a column is used with if, and, or, or not | a column has one truth value for each packet
+LS213 a column is used with `if`, `and`, `or` or `not` | a column has one truth value for each packet
       | use & | ~ and np.where: (f.a < 1) & (f.b < 2)
 LS214 columns have different shapes | a point needs one value of each
       | give one value for each point or packet; name the axis of an array with along(...)
@@ -141,7 +141,7 @@ LS713 a vector exceeds the range limits | its byte order, its scale or the limit
 LS801 an exception is ignored without a message | errors are neither reported nor counted | remove the try
 LS802 the wall clock is used | it jumps, and two runs differ | use the sensor's clock
 LS803 a partial write is ignored | the rest of a command is never sent | use sendall
-LS804 an expression with `this` is used with if, and, or, or not | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
+LS804 an expression with `this` is used with `if`, `and`, `or` or `not` | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
 LS805 hasattr(this, ...) is used | it is always true | test a header field
 """
 RULES = {
