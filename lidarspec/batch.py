@@ -469,7 +469,7 @@ def _exit_with_parent() -> None:
 
 
 @contextlib.contextmanager
-def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
+def _open_executor(jobs: int, scheduler: str) -> Iterator[Executor]:
     """Yield an executor: this process, other processes, or a Dask cluster.
 
     Raises:
@@ -564,7 +564,7 @@ def convert(
             todo = [piece for piece in todo if not finished[piece.source]]
         for piece in todo:
             manifest.clear(piece)
-        with _without_partial_files(folder, to), _executor(jobs, scheduler) as executor:
+        with _without_partial_files(folder, to), _open_executor(jobs, scheduler) as executor:
             for record, is_old in _iter_results(
                 executor, todo, (lambda _: None) if force else manifest.find_finished
             ):
@@ -692,7 +692,9 @@ def read(
     )
     results = dask.compute(*(dask.delayed(_cut_into_pieces)(piece) for piece in todo))
     cut = [piece for pieces in results for piece in pieces if piece.count != 0 or not piece.number]
-    return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])
+    return frames.from_map(
+        _read_partition, cut, meta=_read_partition(replace(cut[0], count=1)).iloc[:0]
+    )
 
 
 def _cut_into_pieces(piece: FilePiece) -> list[FilePiece]:
@@ -707,7 +709,7 @@ def _cut_into_pieces(piece: FilePiece) -> list[FilePiece]:
     return pieces
 
 
-def _partition(piece: FilePiece) -> Any:
+def _read_partition(piece: FilePiece) -> Any:
     """Return the points of a piece as a pandas dataframe."""
     with piece.open_scans() as scans:
         tables = iter_tables(piece.iter_numbered(scans), every_point=piece.every_point)

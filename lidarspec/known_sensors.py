@@ -141,14 +141,18 @@ def find_known_sensor(name: str) -> KnownSensor | None:
     Args:
         name: an id or alias, in upper or lower case, with or without hyphens.
     """
-    letters = _letters(name)
+    letters = _keep_letters(name)
     return next(
-        (row for row in known_sensors() if any(_letters(known) == letters for known in row.names)),
+        (
+            row
+            for row in known_sensors()
+            if any(_keep_letters(known) == letters for known in row.names)
+        ),
         None,
     )
 
 
-def _letters(name: str) -> str:
+def _keep_letters(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
 
 

@@ -446,7 +446,7 @@ class Registry:
             None,
         )
 
-    def _loaded_sensors(self) -> dict[str, Sensor]:
+    def _list_loaded_sensors(self) -> dict[str, Sensor]:
         """Return the loaded sensors by id, without ids that belong to another plugin."""
         return {
             name: sensor
@@ -481,7 +481,7 @@ class Registry:
         Sensors are omitted if several distributions claim their id and none owns it.
         """
         self._load_all()
-        return {name: self.sensor(name) for name in sorted(self._loaded_sensors())}
+        return {name: self.sensor(name) for name in sorted(self._list_loaded_sensors())}
 
     @property
     def failures(self) -> list[Plugin]:
@@ -512,7 +512,7 @@ class Registry:
                 if (entry.distribution, entry.name) not in names:
                     self._load(entry)
         rows = {row.id: row for row in described if self._has_name(row.distribution, row.id)}
-        for name, sensor in self._loaded_sensors().items():
+        for name, sensor in self._list_loaded_sensors().items():
             home = self._find_owner(name)
             if name not in rows and home is not None:
                 rows[name] = make_row(sensor, home[0], self._version(home[0]))
@@ -548,7 +548,8 @@ class Registry:
         if plugin_sensor is None:
             self._load_all()
             name = next(
-                (known for known in self._claims if _letters(known) == _letters(name)), name
+                (known for known in self._claims if _keep_letters(known) == _keep_letters(name)),
+                name,
             )
             plugin_sensor = self._find(name)
         if plugin_sensor is not None and plugin_sensor.id != name:
@@ -558,10 +559,10 @@ class Registry:
             if plugin_sensor is None or plugin_sensor.id != own.id:
                 plugin_sensor = None
         if plugin_sensor is None:
-            loaded = self._loaded_sensors()
+            loaded = self._list_loaded_sensors()
             aliases = {alias: other.id for other in loaded.values() for alias in other.aliases}
             raise self._load_error(name) or unknown_sensor_error(
-                name, loaded, aliases, self._failed_modules()
+                name, loaded, aliases, self._list_failed_modules()
             )
         if name not in self._ready:
             # another thread may have stored it first
@@ -576,7 +577,7 @@ class Registry:
                 return suggest(error, "lidarspec plugins")
         return None
 
-    def _failed_modules(self) -> dict[str, str]:
+    def _list_failed_modules(self) -> dict[str, str]:
         """Return the modules with hooks that failed to load: distribution -> error.
 
         It is not known which sensors such a module would have added.
@@ -795,7 +796,7 @@ def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) 
         return failed
 
 
-def _letters(name: str) -> str:
+def _keep_letters(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
 
 
@@ -1014,7 +1015,7 @@ def sensor(name: str | Path | Sensor) -> Sensor:
         return name
     text = str(name)
     if is_file_name(text):
-        return _from_file(text)
+        return _load_file(text)
     return registry().sensor(text)
 
 
@@ -1031,7 +1032,7 @@ def split_file_and_id(text: str) -> tuple[Path, str]:
     return Path(f"{path}.py" if colon else text), wanted
 
 
-def _from_file(text: str) -> Sensor:
+def _load_file(text: str) -> Sensor:
     file, wanted = split_file_and_id(text)
     module = import_file(file)
     local = Registry()

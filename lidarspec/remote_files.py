@@ -50,7 +50,7 @@ def find_file_system(url: str) -> Any:
     """
     fsspec = import_library("fsspec", "fsspec")
     scheme = url.partition("://")[0]
-    with _failures(url):
+    with _convert_failures(url):
         try:
             return fsspec.core.url_to_fs(url)[0]
         except ImportError as error:
@@ -69,7 +69,7 @@ def open_stored(path: str) -> BinaryIO:
         with system_errors(path):
             return open(path, "rb")
     system = find_file_system(path)
-    with _failures(path):
+    with _convert_failures(path):
         file: BinaryIO = system.open(path, "rb")
         if isinstance(file, io.BytesIO):
             # This is a copy, because all readers of one BytesIO would share its offset.
@@ -91,7 +91,7 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
         fixed = fixed.rpartition("/")[0]
     if is_remote(pattern):
         system = find_file_system(pattern)
-        with _failures(pattern):
+        with _convert_failures(pattern):
             paths = [system.unstrip_protocol(path) for path in system.glob(pattern)]
     else:
         paths = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)]
@@ -121,7 +121,7 @@ def files_in(folder: str) -> set[str]:
             for name in (*folders, *files)
         }
     system = find_file_system(folder)
-    with _failures(folder):
+    with _convert_failures(folder):
         if system.exists(folder):
             return {normalise_path(system.unstrip_protocol(path)) for path in system.find(folder)}
         return set()
@@ -150,7 +150,7 @@ def read_stamp(path: str) -> dict[str, Any]:
             status = os.stat(path)
         return {"size": status.st_size, "modified": str(status.st_mtime_ns)}
     system = find_file_system(path)
-    with _failures(path):
+    with _convert_failures(path):
         info = system.info(path)
     tag = next(
         (
@@ -178,7 +178,7 @@ def upload(local: Path, url: str) -> None:
         SourceError: if that fails.
     """
     system = find_file_system(url)
-    with _failures(url):
+    with _convert_failures(url):
         if local.is_dir():
             system.put(str(local), url, recursive=True)
             return
@@ -195,7 +195,7 @@ def remove(path: str | Path) -> None:
     """
     if is_remote(path):
         system = find_file_system(str(path))
-        with _failures(str(path)):
+        with _convert_failures(str(path)):
             system.rm(str(path), recursive=True)
         return
     with system_errors(path):
@@ -206,7 +206,7 @@ def remove(path: str | Path) -> None:
 
 
 @contextlib.contextmanager
-def _failures(url: str) -> Iterator[None]:
+def _convert_failures(url: str) -> Iterator[None]:
     """Convert all exceptions of a store to `SourceError`."""
     try:
         yield

@@ -111,11 +111,11 @@ def _complete_word(
     return [CompletionItem(incomplete, type="file")]
 
 
-def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return registry().names()
 
 
-def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Return devices, ports, simulated sensors, and the files that match.
 
     The result is empty if only files match, so that the shell completes file names.
@@ -151,21 +151,21 @@ def _find_sensor(ctx: click.Context) -> Sensor | None:
     return find_declared_sensor(source)
 
 
-def _frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
     sensor = _find_sensor(ctx)
     if sensor:
         return sensor.frames
     return ()
 
 
-def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
     sensor = _find_sensor(ctx)
     if sensor:
         return sensor.commands
     return ()
 
 
-def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Return the fields of a frame or the arguments of a command, followed by "="."""
     sensor = _find_sensor(ctx)
     frame = ctx.params.get("frame") or ""
@@ -187,7 +187,7 @@ def _format_path(path: str, info: FieldInfo) -> str:
     return ".".join(steps) + ("[*]" if last in info.axes and info.kind != "bytes" else "")
 
 
-def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Return the columns that every sensor has.
 
     The other columns of a sensor are known only when its data is read.
@@ -195,13 +195,13 @@ def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ("range", "intensity")
 
 
-def _formats(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_formats(ctx: click.Context, incomplete: str) -> Iterable[str]:
     from lidarspec.formats import formats  # imports NumPy
 
     return [suffix.removeprefix(".") for suffix in formats()]
 
 
-def _files(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_files(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
 
@@ -212,24 +212,31 @@ def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
 
-def _sensors_and_distributions(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_sensors_and_distributions(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
 
 
 #: The functions for parameters that do not accept files.
-WITHOUT_FILES = (_frames, _commands, _assignments, _verbs, _columns, _formats)
+WITHOUT_FILES = (
+    _complete_frames,
+    _complete_commands,
+    _complete_assignments,
+    _verbs,
+    _complete_columns,
+    _complete_formats,
+)
 #: name of a parameter -> function that returns its possible values.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
-    "sensor_id": _sensors,
-    "source": _sources,
-    "sources": _sources,
-    "frame": _frames,
-    "command": _commands,
-    "assignments": _assignments,
-    "name": _sensors_and_distributions,
+    "sensor_id": _complete_sensors,
+    "source": _complete_sources,
+    "sources": _complete_sources,
+    "frame": _complete_frames,
+    "command": _complete_commands,
+    "assignments": _complete_assignments,
+    "name": _complete_sensors_and_distributions,
     "verb": _verbs,
-    "ramp": _columns,
-    "suffix": _formats,
+    "ramp": _complete_columns,
+    "suffix": _complete_formats,
     **dict.fromkeys(
         (
             "file",
@@ -247,6 +254,6 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
             "to",
             "folder",
         ),
-        _files,
+        _complete_files,
     ),
 }

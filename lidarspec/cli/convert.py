@@ -299,7 +299,7 @@ def _write_imu(
             if count is not None and number >= count:
                 break
     if not number:
-        raise _no_data_error(device, target, "IMU samples")
+        raise _make_no_data_error(device, target, "IMU samples")
     samples = join_samples(batches)[:count]
     write_imu(target, samples)
     note(f"{target}: {len(samples)} IMU samples from {device.sensor.id}; {device.stats}")
@@ -400,7 +400,7 @@ def _write_frames(
     batches = _select_frames(device, types, selection, count)
     first = next(batches, None)
     if first is None:
-        raise _no_data_error(device, target, " or ".join(frames))
+        raise _make_no_data_error(device, target, " or ".join(frames))
     written = write_frames(target, itertools.chain([first], batches))
     noun = "rows" if any("." in name for name in frames) else "frames"
     note(f"{target}: {written} {noun} from {sensor.id}; {device.stats}")
@@ -528,7 +528,7 @@ def _write_points(
     ):
         first = next(scans, None)
         if first is None:
-            raise _no_data_error(device, target)
+            raise _make_no_data_error(device, target)
         counted = counts.count(
             itertools.chain([first], scans), progress, every_point=every_point or organized
         )
@@ -615,7 +615,7 @@ def _detect_sensor(source: str, target: str) -> Sensor:
         raise error if sample is None else nearest_fault_error(sample) from None
 
 
-def _no_data_error(device: Device, target: str, content: str = "") -> Exception:
+def _make_no_data_error(device: Device, target: str, content: str = "") -> Exception:
     """Return the error that explains why a file contains no data of the sensor.
 
     The reason is that the file is empty or damaged, or that it has only other types of frames, data

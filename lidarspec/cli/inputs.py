@@ -97,7 +97,7 @@ def open_input(
             from lidarspec.device.named_devices import find_device
 
             if (device := find_device(text)) is None:
-                raise _no_bytes_error(words, error) from None
+                raise _make_no_bytes_error(words, error) from None
             reading = open_input([device.source], times)
     with reading as sample:
         yield sample
@@ -181,7 +181,7 @@ def read(words: Sequence[str]) -> SampleBytes:
         )
 
 
-def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
+def _make_no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
     """Return the error for arguments that are neither files nor hexadecimal digits."""
     from lidarspec.transports.open_url import live_address
 

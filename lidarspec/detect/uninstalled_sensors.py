@@ -139,7 +139,7 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
         listed = f"{', '.join(ids)} and {more} more"
     else:
         listed = " or ".join(ids)
-    distributions = _distributions(sensors)
+    distributions = _list_distributions(sensors)
     verb = "are" if len(distributions) > 1 else "is"
     return f"this looks like data of {listed}; {' and '.join(distributions)} {verb} not installed"
 
@@ -155,8 +155,8 @@ def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
 
 def install_commands(sensors: Sequence[KnownSensor]) -> str:
     """Return the command that installs the distributions of the sensors."""
-    return install_command(*_distributions(sensors))
+    return install_command(*_list_distributions(sensors))
 
 
-def _distributions(sensors: Sequence[KnownSensor]) -> list[str]:
+def _list_distributions(sensors: Sequence[KnownSensor]) -> list[str]:
     return sorted({row.distribution for row in sensors})

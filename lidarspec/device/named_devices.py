@@ -148,7 +148,7 @@ def find_device(source: str | Path) -> NamedDevice | None:
             raise errors[0]
         if by_name:
             paths = sorted({device.file for device in by_name.values()})
-            suggestion = _suggestion(word, by_name)
+            suggestion = _make_suggestion(word, by_name)
             raise UsageError(
                 f"{word!r} is neither a file nor a device of {', '.join(paths)}{suggestion}"
             )
@@ -300,11 +300,11 @@ def _check_keys(path: Path, place: str, keys: Iterable[str], allowed: Iterable[s
         if key not in allowed:
             raise UsageError(
                 f"{path}: {place + ': ' if place else ''}unknown {'key' if place else 'table'}"
-                f" {key!r}{_suggestion(key, allowed)}"
+                f" {key!r}{_make_suggestion(key, allowed)}"
             )
 
 
-def _suggestion(word: str, words: Iterable[str]) -> str:
+def _make_suggestion(word: str, words: Iterable[str]) -> str:
     return did_you_mean(word, words) or f" (known: {', '.join(words)})"
 
 

@@ -105,7 +105,8 @@ class Listing:
         )
         self._paths = min(
             max(
-                (len(name) for index in range(len(rows)) for name in self._names(index)), default=0
+                (len(name) for index in range(len(rows)) for name in self._iter_names(index)),
+                default=0,
             ),
             MAX_NAME_WIDTH,
         )
@@ -163,7 +164,7 @@ class Listing:
             *words,
         )
 
-    def _names(self, index: int) -> Iterator[str]:
+    def _iter_names(self, index: int) -> Iterator[str]:
         row = self._rows[index]
         around = list_parents(row.path)
         yield from (_indent_path(path, depth) for depth, path in enumerate([*around, row.path]))

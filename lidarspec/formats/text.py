@@ -60,7 +60,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
                 names = tuple(cloud.columns)
                 put(",".join([*names, "scan"]) + "\n")
             own = cloud.columns
-            columns = [_column(own.get(name), len(cloud)) for name in names]
+            columns = [_fill_column(own.get(name), len(cloud)) for name in names]
             cells = [
                 _TIME_FORMAT if name == "time" else _NUMBER_FORMATS.get(column.dtype.str[1:], "%d")
                 for name, column in zip(names, columns, strict=True)
@@ -108,7 +108,7 @@ def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArr
         put(template * (len(values) // len(columns)) % values)
 
 
-def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
+def _fill_column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
     if values is None:
         return np.full(length, np.nan, np.float32)
     return values

@@ -182,10 +182,10 @@ class CompiledTable:
         if axis == sequence:
             return int(self.counts(axis).max(initial=0))
         if sequence is not None:
-            return self._elements(sequence).table.length(axis[len(sequence) + 1 :])
+            return self._get_elements(sequence).table.length(axis[len(sequence) + 1 :])
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
 
-    def _elements(self, axis: str) -> _Elements:
+    def _get_elements(self, axis: str) -> _Elements:
         """Return the elements of an array that differ in size. The result is cached."""
         if axis not in self._arrays:
             table, owners = self.parts(axis)
@@ -201,7 +201,7 @@ class CompiledTable:
         if indices:
             return _take_element(self, self.raw(base), base, indices)[0]
         info = self.schema.columns[path]
-        elements = self._elements(axis)
+        elements = self._get_elements(axis)
         dtype = info.dtype or np.dtype(object)
         lengths = [self.length(each) for each in info.axes]
         column = np.full((len(self), *lengths), None if dtype.hasobject else 0, dtype)
@@ -218,7 +218,7 @@ class CompiledTable:
         base, indices = without_indices(path)
         if indices:
             return _has_element(self, base, indices)
-        elements = self._elements(axis)
+        elements = self._get_elements(axis)
         there = elements.table.present(path[len(axis) + 1 :])
         if there is None:
             there = np.ones(len(elements.table), np.bool_)
@@ -249,7 +249,7 @@ class CompiledTable:
             axis: the path of an array of elements that differ in size.
             path: the path of the same array, or of an array in its elements.
         """
-        elements = self._elements(axis)
+        elements = self._get_elements(axis)
         if path == axis:
             return elements.counts
         lengths = elements.table.counts(path[len(axis) + 1 :])
@@ -557,7 +557,7 @@ class ParsedTable:
         return column
 
     def counts(self, axis: str) -> NDArray[np.intp]:
-        lengths = self._lengths(axis)
+        lengths = self._find_lengths(axis)
         if any(len(frame_lengths) > 1 for frame_lengths in lengths):
             raise SpecError(VARYING_LENGTH, path=axis)
         return np.array([max(frame_lengths, default=0) for frame_lengths in lengths], np.intp)
@@ -568,10 +568,10 @@ class ParsedTable:
         if isinstance(declared, int):
             return declared
         return max(
-            (max(frame_lengths, default=0) for frame_lengths in self._lengths(axis)), default=0
+            (max(frame_lengths, default=0) for frame_lengths in self._find_lengths(axis)), default=0
         )
 
-    def _lengths(self, axis: str) -> list[set[int]]:
+    def _find_lengths(self, axis: str) -> list[set[int]]:
         brackets = axis.count("[]")
         names = axis.removesuffix("[]" * brackets).split(".")
         return [_collect_lengths(parsed, names, brackets) for parsed in self._parsed]

@@ -99,7 +99,7 @@ class Decoder:
         self.stats = Counters()
         self.observer: DecoderObserver | None = None
         keep_freed_memory()
-        self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
+        self.framing = _make_framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
         # Frames are read as if the frame that the answer comes after had been seen.
         answer = sensor.options.get("answer", "")
         self._mode = SearchState(
@@ -461,7 +461,7 @@ class Decoder:
 
 
 @lru_cache(maxsize=256)
-def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | None) -> Framing:
+def _make_framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | None) -> Framing:
     return Framing(
         {name: get_codec(frame) for name, frame in zip(names, frames, strict=True)},
         sums,

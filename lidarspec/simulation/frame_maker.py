@@ -120,18 +120,20 @@ class FrameMaker:
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
         if self._decoded or self.schema.endings:
-            frames = [self._with_texts(values) for values in frames]
+            frames = [self._encode_texts(values) for values in frames]
         counted = [self._with_counts(values) for values in frames] if self._counts else frames
         if self.schema.parts:
             filled = [self._with_parts(values) for values in counted]
         else:
             filled = [(values, {}) for values in counted]
         for index, (values, _) in enumerate(filled):
-            layout = self._layout(values)
+            layout = self._find_layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
         groups = [
             LayoutRows(
-                layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which])
+                layout,
+                np.array(which, np.intp),
+                self._make_rows(layout, [filled[i] for i in which]),
             )
             for layout, which in members.values()
         ]
@@ -162,7 +164,7 @@ class FrameMaker:
             frames.append(data)
         return frames
 
-    def _with_texts(self, values: Values) -> Values:
+    def _encode_texts(self, values: Values) -> Values:
         """Return values in which texts are encoded, and the sizes of texts are added."""
         result = dict(values)
         for path, info in self._decoded.items():
@@ -211,10 +213,10 @@ class FrameMaker:
         for axis, node in self.schema.parts.items():
             parts = [dict(part) for part in result.pop(axis, ())]
             kinds = [find_kind(node, part) for part in parts]
-            around = {ref.path: self._raw(result, ref.path) for ref in node.outer}
+            around = {ref.path: self._get_raw(result, ref.path) for ref in node.outer}
             makers = [self._get_maker(kind, around) for kind in kinds]
             sizes = [
-                maker._layout(maker._with_parts(maker._with_texts(part))[0]).size
+                maker._find_layout(maker._with_parts(maker._encode_texts(part))[0]).size
                 for maker, part in zip(makers, parts, strict=True)
             ]
             for kind, maker, part, after in zip(
@@ -253,14 +255,14 @@ class FrameMaker:
         if paths and paths[0] not in values:
             raw: dict[str, Any] = {}
             for path in paths[1:]:
-                set_nested(raw, path, self._raw(values, path))
+                set_nested(raw, path, self._get_raw(values, path))
             set_count(formula, raw, number, self.schema.fields, axis)
             values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
-    def _layout(self, values: Values) -> Layout:
+    def _find_layout(self, values: Values) -> Layout:
         """Return the layout of a frame whose header fields have these values."""
         while True:
-            header = {path: self._raw(values, path) for path in self._layout_fields}
+            header = {path: self._get_raw(values, path) for path in self._layout_fields}
             key = tuple(header.values())
             try:
                 if key not in self._layouts:
@@ -270,9 +272,9 @@ class FrameMaker:
                 self._layout_fields.append(unknown.leaf.info.path)
                 self._layouts.clear()
             except TooLongError as error:
-                raise self._too_long(values, str(error)) from None
+                raise self._make_too_long_error(values, str(error)) from None
 
-    def _too_long(self, values: Values, path: str) -> SpecError:
+    def _make_too_long_error(self, values: Values, path: str) -> SpecError:
         fields = self.schema.fields
         left_out = [
             path
@@ -289,7 +291,7 @@ class FrameMaker:
             )
         return SpecError(reason, path=path, sensor=self._sensor)
 
-    def _rows(
+    def _make_rows(
         self, layout: Layout, frames: Sequence[tuple[Values, Mapping[str, bytes]]]
     ) -> NDArray[np.uint8]:
         rows = np.zeros((len(frames), layout.size), np.uint8)
@@ -320,7 +322,7 @@ class FrameMaker:
         layout.seal(rows)
         return rows
 
-    def _raw(self, values: Values, path: str) -> int:
+    def _get_raw(self, values: Values, path: str) -> int:
         info = self.schema.fields.get(path)
         if info is None:
             return int(values[path])  # the size of a text, or the total size of parts

@@ -1281,7 +1281,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
     )
 
 
-def _raise_no_integer(sign: str) -> Any:
+def _refuse_fraction(sign: str) -> Any:
     raise UntraceableExpressionError(
         f"an expression with {sign!r}, whose result may not be an integer"
     )
@@ -1317,7 +1317,7 @@ for _name, _symbol in _SYMBOLS.items():
         )
 for _name, _symbol in {"pow": "**", "divmod": "divmod", "matmul": "@"}.items():
     for _full in (f"__{_name}__", f"__r{_name}__"):
-        setattr(Symbol, _full, lambda self, other, sign=_symbol: _raise_no_integer(sign))
+        setattr(Symbol, _full, lambda self, other, sign=_symbol: _refuse_fraction(sign))
 
 
 def _find_label_value(ref: Ref, label: str) -> int:

@@ -439,7 +439,9 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
                 name,
             )
         except Exception as error:
-            raise _undocumented_error(error, f"cut at byte {end} of {len(data)}", name) from error
+            raise _make_undocumented_error(
+                error, f"cut at byte {end} of {len(data)}", name
+            ) from error
         else:
             raise ViolationError(
                 "LS307",
@@ -464,7 +466,9 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str
             except WireError:
                 continue
             except Exception as error:
-                raise _undocumented_error(error, f"parsing {data.hex(' ')[:200]}", name) from error
+                raise _make_undocumented_error(
+                    error, f"parsing {data.hex(' ')[:200]}", name
+                ) from error
 
 
 def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
@@ -531,7 +535,7 @@ def _choose_flipped_offsets(layout: Layout, length: int, source: random.Random) 
     return sorted({*chosen, *source.sample(range(length), number - len(chosen))})
 
 
-def _undocumented_error(error: Exception, what: str, name: str) -> ViolationError:
+def _make_undocumented_error(error: Exception, what: str, name: str) -> ViolationError:
     code = "LS115" if isinstance(error, SpecError) else "LS308"
     return ViolationError(
         code,

@@ -298,7 +298,7 @@ def find_ranges(
         header: path and raw value of each field that the layout depends on.
     """
     values = dict(header)
-    layout = _layout(sensor, frame, values)
+    layout = _find_layout(sensor, frame, values)
     rows = np.zeros((1, layout.size), np.uint8)
     frame_coder(sensor.frames[frame]).make_encodable(rows, layout)
     for leaf in layout.leaves.values():
@@ -335,7 +335,7 @@ def _find_header(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, 
     values: dict[str, int] = {}
     while True:
         try:
-            _layout(sensor, frame, values)
+            _find_layout(sensor, frame, values)
         except UnknownSelectorError as unknown:
             leaf = unknown.leaf
             if isinstance(leaf, Leaf):
@@ -344,7 +344,7 @@ def _find_header(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, 
             return tuple(values.items())
 
 
-def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
+def _find_layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
     declared = sensor.frames[frame]
     return find_layout(declared.tree, header, declared.max_struct_bytes)
 

@@ -554,11 +554,11 @@ class PtyLine(OutletLine):
     def plug(self) -> None:
         """Create the pseudo-terminal, in raw mode."""
         if not has_terminals():
-            raise _missing_terminal_error("this system has no pseudo-terminals")
+            raise _make_missing_terminal_error("this system has no pseudo-terminals")
         try:
             self._master, slave = os.openpty()
         except OSError as error:
-            raise _missing_terminal_error(
+            raise _make_missing_terminal_error(
                 f"no pseudo-terminal is available: {system_reason(error)}"
             ) from None
         self.path = os.ttyname(slave)
@@ -811,7 +811,7 @@ def has_terminals() -> bool:
     return termios is not None
 
 
-def _missing_terminal_error(text: str) -> SourceError:
+def _make_missing_terminal_error(text: str) -> SourceError:
     return source_error(text, f"repeat with --to tcp://{LOCALHOST}:2111")
 
 

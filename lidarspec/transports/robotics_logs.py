@@ -117,7 +117,7 @@ class BagTransport(Transport):
         self._kind = log
         self.warnings: list[str] = []
         reader = getattr(import_library(log.module, "ros"), log.reader)
-        with self._failures(), ExitStack() as undo:
+        with self._convert_failures(), ExitStack() as undo:
             self._log = reader(Path(path))
             self._log.open()
             undo.callback(self._log.close)
@@ -130,7 +130,7 @@ class BagTransport(Transport):
             self._links = [
                 link
                 for link in with_packets
-                if sender in (None, link.topic, _namespace(link.topic))
+                if sender in (None, link.topic, _get_namespace(link.topic))
             ]
             self.datagrams = not any(self._is_stream(link) for link in self._links)
             self.foreign = sum(link.msgcount for link in with_packets) - sum(
@@ -151,11 +151,11 @@ class BagTransport(Transport):
             )
 
     def chunks(self) -> Iterator[Chunk]:
-        namespaces = {_namespace(link.topic) for link in self._links}
-        with self._failures():
+        namespaces = {_get_namespace(link.topic) for link in self._links}
+        with self._convert_failures():
             for link, log_time_ns, raw in self._log.messages(self._links) if self._links else ():
                 if len(namespaces) > 1:
-                    sender = (_namespace(link.topic), 0)
+                    sender = (_get_namespace(link.topic), 0)
                 else:
                     sender = None
                 message = self._deserialize(link, raw)
@@ -209,7 +209,7 @@ class BagTransport(Transport):
         return None
 
     @contextmanager
-    def _failures(self) -> Iterator[None]:
+    def _convert_failures(self) -> Iterator[None]:
         """Convert all exceptions to SourceError: a damaged file can cause any exception."""
         try:
             yield
@@ -233,7 +233,7 @@ def raw_chunk(message: Any) -> Chunk:
     return Chunk(data[padding:], STAMP.unpack_from(data)[0] if padding == STAMP.size else None)
 
 
-def _namespace(topic: str) -> str:
+def _get_namespace(topic: str) -> str:
     return topic.rpartition("/")[0] or "/"
 
 

@@ -302,12 +302,12 @@ class RateSeries:
             live.read(0.0)
             self._count_batch()
             self.scans += [
-                (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
+                (self._to_seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
                 for scan in live.scans
                 if scan.whole
             ]
 
-    def _seconds(self, at: int) -> float:
+    def _to_seconds(self, at: int) -> float:
         """Return a time in seconds since the first packet."""
         return (at - self._first) * 1e-9
 
@@ -325,7 +325,7 @@ class RateSeries:
         lost, wrong = (after[name] - self._before[name] for name in ("lost", "rejected"))
         self._before = after
         steps = np.maximum((times - self._first) * (1e-9 / self.width), 0).astype(np.intp)
-        self._last = max(self._last, self._seconds(int(times.max())))
+        self._last = max(self._last, self._to_seconds(int(times.max())))
         counted = np.bincount(steps, minlength=self.totals.shape[1]).astype(np.float64)
         grown = np.zeros((3, len(counted)))
         grown[:, : self.totals.shape[1]] = self.totals

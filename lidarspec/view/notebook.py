@@ -80,7 +80,7 @@ def packets(value: Packets) -> str:
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
     if len(value):
         moment = np.datetime64(int(value.time_ns[0]), "ns")
-        first = f"; first packet: {moment}, by the {_clock(value)} clock"
+        first = f"; first packet: {moment}, by the {_name_clock(value)} clock"
     else:
         first = ""
     return _make_table(
@@ -174,7 +174,7 @@ def _end_indices(count: int) -> NDArray[np.intp]:
     )
 
 
-def _clock(packets: Packets) -> str:
+def _name_clock(packets: Packets) -> str:
     if packets.sensor.clock is None:
         return "host's"
     return "sensor's"

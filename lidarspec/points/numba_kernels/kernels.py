@@ -106,7 +106,7 @@ class Kernel(ColumnMaker):
             return
         edges = [count * index // number for index in range(number + 1)]
         parts = [
-            _pool(number - 1).submit(run, first, last - first)
+            _get_pool(number - 1).submit(run, first, last - first)
             for first, last in pairwise(edges[1:])
         ]
         run(0, edges[1])
@@ -158,7 +158,7 @@ def count_threads() -> int:
 
 
 @functools.cache
-def _pool(number: int) -> Any:
+def _get_pool(number: int) -> Any:
     from concurrent.futures import ThreadPoolExecutor
 
     return ThreadPoolExecutor(number, "lidarspec")
