@@ -18,8 +18,8 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
-from lidarspec.spec.tree import to_exact
-from lidarspec.testing.findings import require
+from lidarspec.spec.tree import FieldInfo, to_exact
+from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.geometry import (
     ANGLE_CHANGE_STEPS,
     MAX_BACK_STEP_RAD,
@@ -31,6 +31,8 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 #: Indices of the packets of the `sweep` for the check of the clock. The last ones are so large that
 #: the clock wraps before them.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
+#: Number of packets of the `sweep` whose values are compared with the limits of their fields.
+FITTED_PACKETS = 500
 #: Number of packets for the check that times of points agree with the clock.
 TIMED_PACKETS = 64
 #: The points of n packets may cover at most n plus this number of times between two packets.
@@ -56,6 +58,52 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     wraps_at_s = float(clock.wraps_at)
     message = f"the clock reaches {most / 1e9:g} s in the sweep, but wraps_at is {wraps_at_s:g} s"
     require(most <= to_exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
+
+
+def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
+    """Check that angles and signed fields can represent the values of the sweep.
+
+    Other unsigned fields are not checked, because counters and clocks wrap.
+    """
+    sweep = subject.sensor.simulation_of(name).sweep
+    if sweep is None:
+        return
+    fields = get_codec(subject.sensor.frames[name]).schema.fields
+    checked = {path: info for path, info in fields.items() if _is_limited(info)}
+    for number in range(FITTED_PACKETS):
+        for path, value in sweep(number).items():
+            if path not in checked:
+                continue
+            info = checked[path]
+            beyond = _find_beyond_limits(info, value)
+            if beyond is not None:
+                low, high = sorted(info.physical(limit) for limit in info.limits)
+                raise ViolationError(
+                    "LS514",
+                    f"sweep({number}) returns {beyond:g} {info.unit}, but the field represents"
+                    f" {low:g} to {high:g} {info.unit}",
+                    f"{name}.{path}",
+                )
+
+
+def _is_limited(info: FieldInfo) -> bool:
+    """Return whether a field is an integer that does not wrap like a counter or a clock."""
+    if info.dtype is None or info.dtype.kind not in "iu":
+        return False
+    return info.dtype.kind == "i" or info.unit in FULL_TURNS
+
+
+def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
+    """Return the first physical value that a field cannot represent; None if there is none."""
+    physical = np.atleast_1d(np.asarray(value))
+    if physical.dtype.kind not in "iuf":
+        return None  # a name, or bytes
+    raw = info.raw(physical)
+    lowest, highest = info.limits
+    beyond = physical[(raw < lowest) | (raw > highest)]
+    if len(beyond):
+        return float(beyond[0])
+    return None
 
 
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:

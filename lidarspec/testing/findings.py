@@ -107,13 +107,16 @@ LS505 an angle of exactly the full circle is not folded | sensors send 360.00 de
       | use wrap(angle, 360.0), or reject it in `plausible`
 LS506 angles are not in the order of the rotation | scans are cut at wrong angles | use the manual's direction, and spread or wrap
 LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`
-LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail | return the raw angles and counters of packet i
+LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail
+      | return the physical values of packet i, by field path
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
 LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare PacketCounter(field, first=, last=)
 LS511 points turn the other way | left and right are exchanged, or vendor_axes differ from the manual
       | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds
+LS514 a field cannot represent a value of `sweep` | the simulated sensor sends another value
+      | return physical values in the unit of the field, within its limits
 LS601 parsing a command returns other values | the sensor receives another command | use paths of its frame in values and args
 LS602 an argument is not limited to its range | the sensor receives invalid requests
       | declare args={name: (path, lowest, highest)}

@@ -238,6 +238,7 @@ PROPERTIES = (
         lacks=_no_sweep,
         unless=(*FAILING_RULES, "LS509"),
     ),
+    Property(consistency.sweep_values_fit_their_fields, "data", "LS514", lacks=_no_sweep),
     Property(
         consistency.times_of_points_fit_the_clock,
         "data",

@@ -176,8 +176,11 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
             f"{address.text}: expected the id of a sensor, as in sim:ID; lidarspec sensors lists"
             " all ids"
         )
-    if sensor is None or (address.location and named_sensor(address.location).id != sensor.id):
-        sensor = named_sensor(address.location)
+    # The given sensor need not be registered.
+    if sensor is None or address.location not in ("", sensor.id):
+        named = named_sensor(address.location)
+        if sensor is None or named.id != sensor.id:
+            sensor = named
     return SimulatedTransport(address.text, sensor, _make_device(sensor, address.options))
 
 

@@ -70,6 +70,13 @@ def test_a_simulated_sensor_is_a_source(name: str) -> None:
     assert all(scan.points.valid.mean() > 0.95 for scan in found)
 
 
+def test_a_sensor_that_is_not_registered_is_simulated_by_its_id() -> None:
+    sensor = dataclasses.replace(ls.sensor("ldrobot-stl27l"), id="acme-x1", aliases=())
+    with ls.open("sim:acme-x1", sensor) as device:
+        assert device.latest(TIMEOUT_S).complete
+        assert device.sensor.id == "acme-x1"
+
+
 def test_an_unstarted_sensor_sends_nothing() -> None:
     with ls.open("sim:slamtec-rplidar-a1", start=False) as device:
         assert next(iter(device.packets(wait=0.3))).stats.bytes_in == 0

@@ -97,6 +97,7 @@ DECLARED = {
     "bare_coordinates": {"LS201", "LS502"},
     "against_its_axes": {"LS511"},
     "sweep_of_nothing": {"LS508"},
+    "sweep_in_raw_steps": {"LS514"},
     "wrap_too_early": {"LS512"},
     "times_in_milliseconds": {"LS513"},
     "no_wrap_aligned": {"LS504"},

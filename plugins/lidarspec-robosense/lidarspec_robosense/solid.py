@@ -55,6 +55,8 @@ STRONGEST = WAVE_MODES["strongest"]
 GRAVITY = 9.80665
 MAGIC = Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55")
 UNIT_VECTOR = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")
+#: The largest component of a unit vector that a field can represent.
+LARGEST_COMPONENT = 32767 / 32768
 
 
 @dataclass(frozen=True)
@@ -292,7 +294,7 @@ def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
         "seconds": int(time),
         "microseconds": time % 1,
         "blocks.time_offset": np.round(offsets, 6),
-        "blocks.channels.x": np.cos(elevation) * np.cos(azimuth),
+        "blocks.channels.x": np.minimum(np.cos(elevation) * np.cos(azimuth), LARGEST_COMPONENT),
         "blocks.channels.y": np.cos(elevation) * np.sin(azimuth),
         "blocks.channels.z": np.sin(elevation),
     }
