@@ -391,9 +391,9 @@ class CounterOrder:
         return 0 < (number - jump.number) % self._period <= MAX_PLACES_LATE
 
     def _add_loss(self, row: int, ahead: int) -> CountedLoss:
-        """Advance the index to a packet, and count the packets between as lost.
+        """Advance the index to a packet, and count the packets missing before it as lost.
 
-        Masked packets are not counted as lost.
+        Packets that a masked sector leaves out are not counted as lost.
         """
         loss = CountedLoss(ahead - 1)
         before = self._index

@@ -456,7 +456,7 @@ def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> s
     """Return the default data frame type of an input.
 
     If the sensor has several data frame types, and none is configured, this is the type of the
-    first data frame in the input. Returns None if the input has no data frame, and for a sensor
+    first data frame in the input, or None if there is no data frame. Returns None for a sensor
     without points.
     """
     names = sensor.data_frames
