@@ -79,7 +79,7 @@ class Masking:
         if self._is_settled:
             if self.sector is None:
                 return [packets]
-            return [self._mark(packets)]
+            return [self._set_masked(packets)]
         angles = self._reader.angles(packets.table)
         if angles is None:
             self._is_settled = True
@@ -133,7 +133,7 @@ class Masking:
         if not everything:
             return []
         released = join_packets(everything)
-        return [released if self.sector is None else self._mark(released)]
+        return [released if self.sector is None else self._set_masked(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
         """Search the next packets for the sector, and return the row of the first leap."""
@@ -190,8 +190,8 @@ class Masking:
         self._index = packets.index.item(-1)
         return packets
 
-    def _mark(self, packets: Packets) -> Packets:
-        """Set `masked` of packets to the number of packets that the sector leaves out."""
+    def _set_masked(self, packets: Packets) -> Packets:
+        """Return packets with `Packets.masked` set at the sector."""
         angles = self._reader.angles(packets.table)
         sector = self.sector
         if not self._has_marked:

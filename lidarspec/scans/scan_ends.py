@@ -41,8 +41,8 @@ class ScanEnd(NamedTuple):
         point: the index of the first point after the end.
         packet: the row of the packet that shows the end, even if it has no points. None if a point
             shows the end.
-        is_leap: whether the angle leaps at the end. Packets are then missing, or an angle is
-            corrupt.
+        is_leap: whether the angle advances much more at this end than at the previous end. Packets
+            are then missing, or the value is not a valid angle.
     """
 
     point: int
@@ -71,7 +71,7 @@ class EndFinder:
                 self._passes = PassDetector(self._cut, direction=1)
         self._value: float | None = None  # of the row before the next one
         self._start_ns: int | None = None  # the start of the first period
-        self._last_leap = 0.0  # turns by which the angle advanced at the end before
+        self._last_step = 0.0  # turns by which the angle advanced at the end before
 
     def use_sector(self, sector: Sector, angle: float | None) -> None:
         """Cut scans in a masked sector from now on.
@@ -138,8 +138,9 @@ class EndFinder:
         return self._cut * full
 
     def _is_leap(self, step: float) -> bool:
-        last = self._last_leap
-        self._last_leap = step
+        """Return whether a step over a scan end is much larger than the previous one."""
+        last = self._last_step
+        self._last_step = step
         return last > 0 and step > max(MIN_TURNS_AWAY, 2 * last)
 
     def _find_passes(
