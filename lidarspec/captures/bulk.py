@@ -101,7 +101,7 @@ class RecordKind:
         heads = _gather_windows(storage, starts, self.value.nbytes)
         differs = heads.view(np.uint64) ^ self.value
         differs &= self.mask
-        at, good = self.times.ns(heads)
+        at, good = self.times.read_ns(heads)
         if self.trailer is not None:
             ends = (
                 _gather_windows(storage, starts + (self.length - _TRAILER_BYTES), _TRAILER_BYTES)

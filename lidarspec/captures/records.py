@@ -132,7 +132,9 @@ class TimeEncoding:
         """Return whether times up to `_MAX_TIME_S` can be calculated with 64 bits."""
         return self.ticks <= 9 * _SECOND_NS and abs(self.offset) < 1 << 62
 
-    def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
+    def read_ns(
+        self, heads: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
         """Return the times of n records, and a mask of the valid times.
 
         Args:
