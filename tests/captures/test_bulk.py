@@ -417,10 +417,10 @@ def test_packets_of_a_file_stay_right_while_the_file_is_read_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)
-    from tests.captures.test_memory import SENSOR, written
+    from tests.captures.test_memory import SENSOR, write_repeated_capture
 
     path = tmp_path / "kept.pcap"
-    written(path, 12)
+    write_repeated_capture(path, 12)
     with CaptureReader(path) as reader:
         data = [datagram.data for datagram in reader]
     with ls.open(path, SENSOR) as device:

@@ -24,7 +24,7 @@ from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests import made_captures as made
-from tests.captures.test_memory import CHILD, SENSOR, written
+from tests.captures.test_memory import CHILD, SENSOR, write_repeated_capture
 from tests.cli.running import process, ran
 
 ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
@@ -239,7 +239,7 @@ def test_a_missing_library_is_reported_with_its_installation(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_compressed_capture_is_decoded_in_bounded_memory(tmp_path: Path) -> None:
-    written(tmp_path / "long.pcap", 60)
+    write_repeated_capture(tmp_path / "long.pcap", 60)
     subprocess.run(["gzip", "-1", "long.pcap"], check=True)
     done = subprocess.run(
         [sys.executable, "-c", CHILD, "long.pcap.gz", SENSOR],

@@ -35,7 +35,7 @@ print(count, first, most())
 """
 
 
-def written(path: Path, megabytes: int) -> int:
+def write_repeated_capture(path: Path, megabytes: int) -> int:
     """Write a capture that repeats the same frames; return the number of packets."""
     frames = simulate(ls.sensor(SENSOR), 630)
     with path.open("wb") as file:
@@ -55,7 +55,7 @@ def written(path: Path, megabytes: int) -> int:
 @pytest.mark.parametrize("megabytes", [60, pytest.param(1024, marks=pytest.mark.soak)])
 def test_a_capture_of_any_length_is_decoded_below_200_mb(megabytes: int, tmp_path: Path) -> None:
     path = tmp_path / "long.pcap"
-    packets = written(path, megabytes)
+    packets = write_repeated_capture(path, megabytes)
     command, alone = (
         [sys.executable, "-c", CHILD, str(path), SENSOR],
         {**os.environ, "LIDARSPEC_BACKEND": "numpy"},

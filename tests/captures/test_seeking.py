@@ -39,7 +39,7 @@ def _near(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(contents, "MAX_BEGINNING_BYTES", 4 * NEAR)
 
 
-def written(
+def write_records(
     path: Path, *, first: int = 0, number: int = NUMBER, link: int = ETHERNET, head: bool = True
 ) -> Path:
     """Write records of 1000 bytes to a capture, one every `STEP`; return its path.
@@ -94,7 +94,7 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
 def test_seeking_reads_everything_after_a_time_and_little_before(
     tmp_path: Path, name: str, link: int, number: int, in_batches: bool
 ) -> None:
-    with contextlib.closing(open_capture(written(tmp_path / name, link=link))) as source:
+    with contextlib.closing(open_capture(write_records(tmp_path / name, link=link))) as source:
         times = rest(source, START + number * STEP, in_batches=in_batches)
         assert not source.warnings
         assert not source.skip_until(START)
@@ -104,7 +104,7 @@ def test_seeking_reads_everything_after_a_time_and_little_before(
 
 
 def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
-    path = written(tmp_path / "drive.pcap")
+    path = write_records(tmp_path / "drive.pcap")
     data = bytearray(path.read_bytes())
     for place in range(len(data) // 4, len(data) * 3 // 4, 5000):
         data[place : place + 8] = bytes(byte ^ 0xFF for byte in data[place : place + 8])
@@ -116,7 +116,7 @@ def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
 
 
 def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
-    path = written(tmp_path / "drive.pcapng")
+    path = write_records(tmp_path / "drive.pcapng")
     data, size = (
         bytearray(path.read_bytes()),
         len(WRITINGS[".pcapng"].record(datagram_frame(SENT), START)),
@@ -131,7 +131,7 @@ def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
 
 
 def test_seeking_never_goes_back(tmp_path: Path) -> None:
-    with contextlib.closing(open_capture(written(tmp_path / "drive.pcap"))) as source:
+    with contextlib.closing(open_capture(write_records(tmp_path / "drive.pcap"))) as source:
         batches = source.batches()
         next(batches)
         assert source.skip_until(START + NUMBER * 3 // 4 * STEP)
@@ -144,7 +144,7 @@ def test_seeking_never_goes_back(tmp_path: Path) -> None:
 
 def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
     """The interface of the second section has another clock than the first."""
-    path = written(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
+    path = write_records(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
     ticks = made.interface(options=made.option(9, bytes([6])))
     packet = datagram_frame(SENT)
     end = START + NUMBER * STEP
@@ -165,7 +165,7 @@ def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
 
 def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
     path = tmp_path / "drive.pcap.gz"
-    path.write_bytes(gzip.compress(written(tmp_path / "drive.pcap").read_bytes(), 1))
+    path.write_bytes(gzip.compress(write_records(tmp_path / "drive.pcap").read_bytes(), 1))
     with contextlib.closing(open_capture(path)) as source:
         batches = source.batches()
         number = len(next(batches))
@@ -174,7 +174,7 @@ def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
 
 
 def test_the_duration_of_a_long_capture_is_known_without_reading_it(tmp_path: Path) -> None:
-    path = written(tmp_path / "long.pcap")
+    path = write_records(tmp_path / "long.pcap")
     assert path.stat().st_size > contents.MAX_BEGINNING_BYTES
     assert contents.measure_duration(path) == pytest.approx((NUMBER - 1) * STEP * 1e-9)
 
@@ -184,7 +184,7 @@ RATE = 754
 
 
 @pytest.fixture(scope="module")
-def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a capture of four seconds of a simulated sensor."""
     path = tmp_path_factory.mktemp("captured") / "drive.pcap"
     with path.open("wb") as file:
@@ -196,14 +196,14 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(
-    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("LEAD_S", "MIN_SKIP_S"):
         monkeypatch.setattr(selection, name, 0.5)
     packed = tmp_path / "drive.pcap.gz"
-    packed.write_bytes(gzip.compress(captured.read_bytes(), 1))  # a reader cannot seek in it
+    packed.write_bytes(gzip.compress(drive.read_bytes(), 1))  # a reader cannot seek in it
     found, read = [], []
-    for source in (captured, packed):
+    for source in (drive, packed):
         with ls.open(source, "velodyne-vlp16") as device:
             scans = device.scans(select=selection.Selection(times=(3.0, 3.5)))
             found.append(
@@ -218,8 +218,8 @@ def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(
     assert read[0] < read[1] / 2
 
 
-def test_no_scan_continues_across_a_seek(captured: Path) -> None:
-    with ls.open(captured, "velodyne-vlp16") as device:
+def test_no_scan_continues_across_a_seek(drive: Path) -> None:
+    with ls.open(drive, "velodyne-vlp16") as device:
         scans = device.scans()
         next(scans)
         assert device.skip_until(START + 35 * 10**8)
@@ -255,7 +255,7 @@ def test_no_frame_continues_across_a_seek(tmp_path: Path) -> None:
 
 
 def test_a_stream_reader_seeks_as_well(tmp_path: Path) -> None:
-    with written(tmp_path / "stream.pcap", link=USER0).open("rb") as file:
+    with write_records(tmp_path / "stream.pcap", link=USER0).open("rb") as file:
         reader = StreamReader(file)
         assert not reader.skip_until(START)  # nothing was read
         next(iter(reader))

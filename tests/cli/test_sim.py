@@ -28,7 +28,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSI
 STL = "ldrobot-stl27l"
 
 
-def begun(*words: object) -> tuple[subprocess.Popen[str], str]:
+def start_simulator(*words: object) -> tuple[subprocess.Popen[str], str]:
     """Start ``lidarspec sim`` in a process; return it and its first line of output."""
     command = [sys.executable, "-m", "lidarspec", "sim", *map(str, words)]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -44,7 +44,7 @@ def test_it_is_read_by_another_program_and_ends_cleanly(
     number: signal.Signals, tmp_path: Path
 ) -> None:
     link = tmp_path / "ttyLIDAR"
-    running, where = begun("cspc-m1c1-mini", "--link", link, "--rate", "3")
+    running, where = start_simulator("cspc-m1c1-mini", "--link", link, "--rate", "3")
     assert running.stderr is not None
     try:
         assert where == str(link)

@@ -27,7 +27,7 @@ def ack(code: int, result: int = 0) -> Found:
     return Found("ack", 0, SENSOR.build("ack", code=code, result=result))
 
 
-def sent(session: Session) -> list[str]:
+def list_sent_messages(session: Session) -> list[str]:
     """Return the messages that are sent now, as hexadecimal bytes."""
     return [one.data.hex() for one in session.take_outgoing()]
 
@@ -41,7 +41,7 @@ def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     session = Session(sensor)
     pending = session.request("start", 0)
-    assert sent(session) == ["aa55f00f"]
+    assert list_sent_messages(session) == ["aa55f00f"]
     assert not pending.done
     receive(
         sensor,

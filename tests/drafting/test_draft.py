@@ -434,7 +434,7 @@ def test_points_may_depend_on_no_field() -> None:
     assert ([array.tolist() for array in arrays], axes, ready) == ([[0.0], 0.0], (), 3)
 
 
-def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
+def write_draft(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
     """Return the texts of a draft of these frames."""
     return text_of(
         make_draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
@@ -445,7 +445,7 @@ def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_similar_fields_at_equal_distances_are_an_array() -> None:
-    struct = written(simulate(ls.sensor("hesai-xt16"), 300), datagrams=True)["struct"]
+    struct = write_draft(simulate(ls.sensor("hesai-xt16"), 300), datagrams=True)["struct"]
     assert "# 8 blocks of 66 bytes that begin with the same field" in struct
     assert struct.count('Scaled(Int16ul, 0.01, "deg")') == 1
     assert "lies between" not in struct
@@ -463,13 +463,13 @@ def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> N
     ]
     assert (
         'sequence=PacketCounter("counter_4"),  # a jump means lost packets; or counter_2'
-        in written(frames)["arguments"]
+        in write_draft(frames)["arguments"]
     )
 
 
 @pytest.mark.slow
 def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
-    text = written(simulate(ls.sensor("ldrobot-ld06"), 300))
+    text = write_draft(simulate(ls.sensor("ldrobot-ld06"), 300))
     assert "# also possible: Crc(width=8, poly=0x4D, xorout=0x18) at byte 46," in text["struct"]
     assert 'scan=OnWrap("angle_4"),  # or angle_42' in text["arguments"]
 

@@ -69,7 +69,7 @@ def dissector(sensor: Sensor) -> str:
     return export(sensor, "wireshark")
 
 
-def written(sensor: Sensor, folder: Path) -> Path:
+def write_dissector(sensor: Sensor, folder: Path) -> Path:
     """Write the dissector of a sensor to a file; return its path."""
     script = folder / f"{sensor.id}.lua"
     script.write_text(dissector(sensor))

@@ -12,7 +12,7 @@ import lidarspec
 from lidarspec.exports import export
 from tests.cli.running import EXAMPLE
 from tests.docs.pages import blocks
-from tests.exports.sharks import needs_tshark, tshark, write_capture, written
+from tests.exports.sharks import needs_tshark, tshark, write_capture, write_dissector
 
 PAGE, NAME = "how-to/export.md", "ldrobot-stl27l"
 
@@ -28,7 +28,7 @@ def test_the_page_shows_the_output_of_tshark(tmp_path: Path) -> None:
     printed = tshark(
         write_capture(sensor, [EXAMPLE], tmp_path / "it.pcap"),
         "-V",
-        scripts=[written(sensor, tmp_path)],
+        scripts=[write_dissector(sensor, tmp_path)],
     )
     lines = iter(printed.splitlines())
     for line in first("text").splitlines():

@@ -16,7 +16,7 @@ from lidarspec.recording.recorders import FrameRecorder, open_recorder
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
-from tests.exports.sharks import columns, needs_tshark, tshark, written
+from tests.exports.sharks import columns, needs_tshark, tshark, write_dissector
 
 SERIOUS = "_ws.malformed || _ws.expert || ip.checksum.status == 0 || udp.checksum.status == 0"
 CHECKED = ("-o", "ip.check_checksum:TRUE", "-o", "udp.check_checksum:TRUE")
@@ -50,7 +50,7 @@ def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
 @needs_tshark
 @pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("ldrobot-stl27l", "20ms")])
 def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -> None:
-    sensor, script = lidarspec.sensor(name), written(lidarspec.sensor(name), tmp_path)
+    sensor, script = lidarspec.sensor(name), write_dissector(lidarspec.sensor(name), tmp_path)
     simulated, recorded, again = (
         tmp_path / "sim.pcap",
         tmp_path / "it.lsr",

@@ -19,7 +19,14 @@ from lidarspec.spec import Udp
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
-from tests.exports.sharks import columns, dissector, needs_tshark, tshark, write_capture, written
+from tests.exports.sharks import (
+    columns,
+    dissector,
+    needs_tshark,
+    tshark,
+    write_capture,
+    write_dissector,
+)
 from tests.exports.trees import SHAPED, find_recoded, is_recoded, values
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.representatives import REPRESENTATIVES, load_sensor
@@ -117,7 +124,7 @@ def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = 
         for name, data in [*SensorUnderTest(sensor).conversation(rounds=rounds), *outgoing]
     ]
     capture = write_capture(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
-    script = written(sensor, tmp_path)
+    script = write_dissector(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)
 
 
@@ -211,7 +218,7 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     )
     capture, script = (
         write_capture(sensor, [frame], tmp_path / "it.pcap"),
-        written(sensor, tmp_path),
+        write_dissector(sensor, tmp_path),
     )
     (row,) = columns(
         capture,
@@ -246,7 +253,10 @@ def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
             if _only_the_checksum(sensor, kind, _flip(good, spot))
         )
         frames += [good, _flip(good, place)]
-    capture, script = write_capture(sensor, frames, tmp_path / "it.pcap"), written(sensor, tmp_path)
+    capture, script = (
+        write_capture(sensor, frames, tmp_path / "it.pcap"),
+        write_dissector(sensor, tmp_path),
+    )
     prefix = name.replace("-", "_")
     rows = list(
         columns(
@@ -279,7 +289,7 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
     packet = b"\x01\x02\x54" + frames[0] + frames[1] + _flip(frames[2], 20) + b"\x54\x2c\x99"
     capture, script = (
         write_capture(sensor, [packet, bytes(40)], tmp_path / "it.pcap"),
-        written(sensor, tmp_path),
+        write_dissector(sensor, tmp_path),
     )
     names = ["frame", "checksum.status", "skipped", "cut_off", "data.end_angle"]
     first, second = columns(capture, script, [f"ldrobot_stl27l.{name}" for name in names])
@@ -303,7 +313,7 @@ def test_a_frame_after_a_descriptor_is_recognized(tmp_path: Path) -> None:
     ]
     capture, script = (
         write_capture(sensor, [data for _, data in frames], tmp_path / "it.pcap"),
-        written(sensor, tmp_path),
+        write_dissector(sensor, tmp_path),
     )
     assert_shown(sensor, capture, script, frames)
     run = write_capture(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
@@ -320,7 +330,9 @@ def test_frames_without_a_descriptor_are_marked_uncertain(tmp_path: Path) -> Non
     )
     capture = write_capture(sensor, [capsule, announcement, capsule], tmp_path / "it.pcap")
     before, _, behind = columns(
-        capture, written(sensor, tmp_path), ["slamtec_rplidar_t1.frame", "_ws.expert.message"]
+        capture,
+        write_dissector(sensor, tmp_path),
+        ["slamtec_rplidar_t1.frame", "_ws.expert.message"],
     )
     assert before[0] == ["express"]
     assert [message.partition(":")[0] for message in before[1]] == ["express or dense"]
@@ -335,7 +347,7 @@ def test_frames_of_one_size_are_distinguished_by_conditions(tmp_path: Path) -> N
         sensor, [sensor.example(name, seed=2) for name in names], tmp_path / "it.pcap"
     )
     shown = columns(
-        capture, written(sensor, tmp_path), ["robosense_m1.frame", "_ws.expert.message"]
+        capture, write_dissector(sensor, tmp_path), ["robosense_m1.frame", "_ws.expert.message"]
     )
     assert list(shown) == [[[name], []] for name in names]
 
@@ -346,7 +358,7 @@ def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
         lidarspec.sensor(name)
         for name in ("velodyne-vlp16", "hesai-xt32", "ldrobot-stl27l", "cspc-m1c1-mini")
     ]
-    scripts = [written(sensor, tmp_path) for sensor in sensors]
+    scripts = [write_dissector(sensor, tmp_path) for sensor in sensors]
     for sensor in sensors:
         capture = write_capture(
             sensor, [sensor.example(sensor.data_frame)], tmp_path / f"{sensor.id}.pcap"
@@ -370,7 +382,7 @@ def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
         datagrams = [datagram.data for datagram, _ in zip(reader, range(12), strict=False)]
     frames = [(found[0].frame, data) for data in datagrams if (found := sensor.split([data]))]
     assert frames
-    script = written(sensor, tmp_path)
+    script = write_dissector(sensor, tmp_path)
     again = write_capture(sensor, [data for _, data in frames], tmp_path / "again.pcap")
     assert_shown(sensor, again, script, frames)
     shown = tshark(
@@ -398,7 +410,9 @@ def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
     frames = [(found.frame, found.data) for found in sensor.split(source.read_bytes())]
     capture = write_capture(sensor, [source.read_bytes()], tmp_path / "it.pcap")
     ((kinds, angles),) = columns(
-        capture, written(sensor, tmp_path), ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"]
+        capture,
+        write_dissector(sensor, tmp_path),
+        ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"],
     )
     assert kinds == [kind for kind, _ in frames]
     assert angles == [str(sensor.parse(data).end_angle) for _, data in frames]

@@ -53,7 +53,7 @@ from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
 from tests.engine.streams import cut_randomly
 from tests.every_sensor import distinct_frames, distinct_sensors
-from tests.fuzz.words import HOSTILE, run_command, spoken
+from tests.fuzz.words import HOSTILE, make_first_inputs, run_command
 from tests.shapes import SHAPES
 from tests.transports import test_robotics_logs
 
@@ -82,7 +82,7 @@ class Target:
         documented: the documented exceptions.
         words: returns byte strings that mutations insert; `EDGES` by default.
         spots: returns the offsets of the fields of an input.
-        mended: returns the input with its checksums corrected, if it has some.
+        correct_checksums: returns the input with its checksums corrected, if it has some.
         is_text: whether mutations may replace numbers, texts and lists.
         cost: relative cost of an input within the group; expensive ones are read less often.
     """
@@ -93,7 +93,7 @@ class Target:
     documented: tuple[type[Exception], ...] = ()
     words: Callable[[], Sequence[bytes]] = lambda: EDGES
     spots: Callable[[bytes], Sequence[int]] = lambda data: ()
-    mended: Callable[[bytes], bytes] = lambda data: data
+    correct_checksums: Callable[[bytes], bytes] = lambda data: data
     is_text: bool = False
     cost: float = 1.0
 
@@ -116,7 +116,7 @@ class Target:
             else [other[start : start + source.choice((4, 64, LONGEST))]]
         )
         found = material.mutate(data, source, words, self.spots(data))[:LONGEST]
-        return self.mended(found) if source.random() < 0.5 else found
+        return self.correct_checksums(found) if source.random() < 0.5 else found
 
 
 #: group -> its share of all inputs, from what an input costs and how much there is to get wrong.
@@ -192,7 +192,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
             lambda: text,
         )
     )
-    found.append(Target("arguments", functools.partial(run_command, folder), spoken))
+    found.append(Target("arguments", functools.partial(run_command, folder), make_first_inputs))
     return {target.name: target for target in found}
 
 
@@ -224,7 +224,7 @@ def _frame(sensor: Sensor, name: str) -> Target:
         found = layout(data)
         return [] if found is None else sorted({start for start, _ in found.places.values()})
 
-    def mended(data: bytes) -> bytes:
+    def correct_checksums(data: bytes) -> bytes:
         found = layout(data)
         if found is None:
             return data
@@ -241,7 +241,7 @@ def _frame(sensor: Sensor, name: str) -> Target:
         run,
         made,
         spots=spots,
-        mended=mended,
+        correct_checksums=correct_checksums,
         cost=100 + sensor.frames[name].max_length,
     )
 
@@ -499,7 +499,7 @@ def _recording(folder: Path) -> Target:
                 for record in recording:
                     str(record)
 
-    def mended(data: bytes) -> bytes:
+    def correct_checksums(data: bytes) -> bytes:
         """Return the input with a correct checksum in each record.
 
         The length in a record gives the offset of the next one.
@@ -543,7 +543,7 @@ def _recording(folder: Path) -> Target:
         examples,
         (ls.SourceError, ls.WireError),
         lambda: [*EDGES, *values],
-        mended=mended,
+        correct_checksums=correct_checksums,
     )
 
 

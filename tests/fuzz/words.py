@@ -125,7 +125,7 @@ TARGETS = (
 SOURCES = ("stl.bin", "stl.hex", "vlp.pcap", "stl.lsr", "empty.bin", "noise.bin")
 
 
-def spoken() -> list[bytes]:
+def make_first_inputs() -> list[bytes]:
     """Return the first inputs: the bytes of every verb, with a few options."""
     return [
         bytes([verb, *range(start, start + 12)])

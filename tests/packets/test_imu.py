@@ -30,7 +30,7 @@ AT_REST = [0, 0, 9.80665]
 
 
 @functools.cache
-def sent(shake: float = 0.0, sensor: ls.Sensor = SENSOR) -> list[bytes]:
+def simulate_datagrams(shake: float = 0.0, sensor: ls.Sensor = SENSOR) -> list[bytes]:
     """Return the datagrams of two seconds of a simulated sensor."""
     device = SimulatedDevice(sensor, rate=float("inf"), faults=Faults(shake=shake))
     device.start(0)
@@ -84,11 +84,11 @@ def test_both_engines_and_single_packets_agree(frame: str) -> None:
 @pytest.mark.slow
 def test_a_simulated_imu_is_at_rest_unless_shaken() -> None:
     for frame, number in (("imu", 2 * RATE), ("data", 400 * SAMPLES)):
-        found = SENSOR.decode(sent(), frame).imu()
+        found = SENSOR.decode(simulate_datagrams(), frame).imu()
         assert number <= len(found) <= number + SAMPLES
         assert (np.abs(found.linear_acceleration - AT_REST) < 1e-5).all()
         assert (found.angular_velocity == 0).all()
-        shaken = SENSOR.decode(sent(0.1), frame).imu()
+        shaken = SENSOR.decode(simulate_datagrams(0.1), frame).imu()
         assert (np.abs(shaken.linear_acceleration.mean(axis=0) - AT_REST) < 0.05).all()
         assert (
             (shaken.linear_acceleration.std(axis=0) > 0.05)
@@ -110,7 +110,7 @@ def assert_in_their_scans(scans: list[ls.Scan], number: int) -> None:
 
 @pytest.mark.slow
 def test_scans_have_their_imu_samples(tmp_path: Path) -> None:
-    data = sent()
+    data = simulate_datagrams()
     number = len(SENSOR.decode(data, "imu").imu()) + len(SENSOR.decode(data).imu())
     assert_in_their_scans(list(SENSOR.scans(data)), number)
     with ls.open(
@@ -153,7 +153,7 @@ def test_a_mount_and_the_axes_of_the_vendor_turn_it() -> None:
 def test_an_imu_by_another_clock_than_the_points_is_in_no_scan() -> None:
     frames = {**SENSOR.frames, "imu": dataclasses.replace(SENSOR.frames["imu"], clock=None)}
     hosts = dataclasses.replace(SENSOR, frames=frames)
-    assert all(scan.imu is None for scan in hosts.scans(sent(sensor=hosts)))
+    assert all(scan.imu is None for scan in hosts.scans(simulate_datagrams(sensor=hosts)))
     assert (hosts.decode([sample(70, *[0] * 6)], "imu").imu().time_ns == 0).all()
     assert all(
         scan.imu is None

@@ -20,7 +20,7 @@ from tests.shapes import SHAPES
 
 
 class Plugin:
-    """A plugin object with the hooks given."""
+    """A plugin object with the given hooks."""
 
     def __init__(self, **hooks: Any) -> None:
         for name, function in hooks.items():

@@ -53,7 +53,7 @@ def site(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def run_verb(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *filter(None, sys.path)])}
     command = [sys.executable, "-P", "-m", "lidarspec", *words]
     return subprocess.run(
@@ -63,16 +63,16 @@ def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
-    listed = ran(site, "--help")
+    listed = run_verb(site, "--help")
     assert "loaded" not in listed.stderr
     assert "survey  From the plugin acme-survey 1.2." in listed.stdout
-    done = ran(site, "survey", "hills")
+    done = run_verb(site, "survey", "hills")
     assert (done.returncode, done.stdout) == (0, "hills\n")
-    assert "Says a word." in ran(site, "help", "survey").stdout
-    assert "next: lidarspec survey --help" in ran(site, "survey").stderr
-    assert "did you mean 'survey'?" in ran(site, "surveys").stderr
+    assert "Says a word." in run_verb(site, "help", "survey").stdout
+    assert "next: lidarspec survey --help" in run_verb(site, "survey").stderr
+    assert "did you mean 'survey'?" in run_verb(site, "surveys").stderr
     # ours comes first
-    assert "Print the points or the packets of a sensor" in ran(site, "read", "--help").stdout
+    assert "Print the points or the packets of a sensor" in run_verb(site, "read", "--help").stdout
 
 
 @pytest.mark.slow
@@ -87,16 +87,16 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
 def test_a_verb_that_cannot_be_loaded_is_named_with_its_distribution(
     site: Path, verb: str, reason: str
 ) -> None:
-    done = ran(site, verb)
+    done = run_verb(site, verb)
     assert done.returncode == 1
     assert "acme-survey" in done.stderr
     assert reason in done.stderr
-    assert ran(site, "sensors").returncode == 0
+    assert run_verb(site, "sensors").returncode == 0
 
 
 @pytest.mark.slow
 def test_plugins_with_verbs_are_among_the_plugins(site: Path) -> None:
-    found = json.loads(ran(site, "plugins", "--json").stdout)
+    found = json.loads(run_verb(site, "plugins", "--json").stdout)
     errors = {
         one["entry_point"]: one["error"] for one in found if one["distribution"] == "acme-survey"
     }

@@ -1,6 +1,6 @@
 """Tests of switching the recorder on and off from several threads.
 
-It writes only one file at a time.
+The recorder writes only one file at a time.
 """
 
 from __future__ import annotations

@@ -56,20 +56,20 @@ def main() -> int:
     chosen = [promise for promise in EVERY if not given.only or promise.name in given.only]
     figures, began = {}, time.monotonic()
     for promise in chosen:
-        figures[promise] = held(promise, given.share, tests=not given.no_tests)
+        figures[promise] = measure_promise(promise, given.share, tests=not given.no_tests)
         print(f"{promise.name}: {verdict(figures[promise])}: {figures[promise].words}", flush=True)
     effort = "" if given.share == 1 else f" and {100 * given.share:g} % of the full effort"
     text = table(figures, time.monotonic() - began, effort)
     if given.only:
         print(text)
     else:
-        written(text)
+        write_table(text)
     return int(not all(figure.kept for figure in figures.values()))
 
 
-def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
+def measure_promise(promise: Promise, share: float, *, tests: bool = True) -> Figure:
     """Run the tests and measurements of a promise; return the result as text."""
-    parts = [ran(promise, long=share == 1)] if promise.tests and tests else []
+    parts = [run_tests(promise, long=share == 1)] if promise.tests and tests else []
     if promise.measured is not None:
         try:
             parts.append(promise.measured(share))
@@ -84,7 +84,7 @@ def held(promise: Promise, share: float, *, tests: bool = True) -> Figure:
     )
 
 
-def ran(promise: Promise, *, long: bool) -> Figure:
+def run_tests(promise: Promise, *, long: bool) -> Figure:
     """Run the tests of a promise; return their number and the result as text."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.xml")
@@ -114,7 +114,7 @@ def ran(promise: Promise, *, long: bool) -> Figure:
     passed = len(cases) - len(failed) - sum(case.find("skipped") is not None for case in cases)
     if failed or not passed:
         return Figure(f"{len(failed)} of {len(cases)} tests fail: {', '.join(failed[:3])}", False)
-    text = promise.told if long else ""
+    text = promise.result if long else ""
     if not text and promise.measured is None:
         text = f"{passed} tests"
     return Figure(text, True)
@@ -150,7 +150,7 @@ def verdict(figure: Figure) -> str:
     return "" if figure.words == "not run" else "yes" if figure.kept else "**no**"
 
 
-def written(text: str) -> None:
+def write_table(text: str) -> None:
     """Write the table into the page, between its marks."""
     page = PAGE.read_text(encoding="utf-8")
     found = re.sub(

@@ -17,14 +17,14 @@ class Promise:
         name: "P1" and so on.
         words: the promise.
         tests: test files, or tests in them, of this promise.
-        told: the result of these tests, printed if all of them pass.
+        result: the result of these tests, printed if all of them pass.
         measured: returns a figure, given the share of the full effort, from 0 to 1.
     """
 
     name: str
     words: str
     tests: tuple[str, ...] = ()
-    told: str = ""
+    result: str = ""
     measured: Callable[[float], Figure] | None = None
 
 

@@ -25,7 +25,7 @@ def test_each_promise_names_an_existing_test() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_every_promise_is_measured(name: str) -> None:
-    figure = soak.held(BY_NAME[name], 0.01, tests=False)
+    figure = soak.measure_promise(BY_NAME[name], 0.01, tests=False)
     assert "could not be measured" not in figure.words
     assert any(letter.isdigit() for letter in figure.words)
 
@@ -35,7 +35,7 @@ def test_a_broken_promise_is_reported(tmp_path: Path) -> None:
     (tmp_path / "test_promised.py").write_text(
         "def test_kept(): pass\ndef test_broken(): assert False\n"
     )
-    figure = soak.held(
+    figure = soak.measure_promise(
         Promise("P0", "", (str(tmp_path / "test_promised.py"),), "all is well"), 0.01
     )
     assert figure == Figure("1 of 2 tests fail: test_broken", False)
@@ -43,7 +43,7 @@ def test_a_broken_promise_is_reported(tmp_path: Path) -> None:
     def failing(share: float) -> Figure:
         raise OSError("no line")
 
-    assert soak.held(Promise("P0", "", (), "", failing), 0.01) == Figure(
+    assert soak.measure_promise(Promise("P0", "", (), "", failing), 0.01) == Figure(
         "could not be measured: OSError: no line", False
     )
 
@@ -62,7 +62,7 @@ def test_the_table_is_written_between_its_marks(
     monkeypatch.setattr(soak, "ROOT", tmp_path)
     promise = BY_NAME["P1"]
     for figure in (Figure("3 | 4 differ", False), Figure("0 differ", True)):
-        soak.written(soak.table({promise: figure}, 60.0))
+        soak.write_table(soak.table({promise: figure}, 60.0))
     text = page.read_text()
     assert f"| P1 | {promise.words} | 0 differ | yes |" in text
     assert (

@@ -221,7 +221,7 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
 
     struct = sound.make_frame(count=Int16ul)
     assert (
-        left(
+        find_broken_rules(
             sound.sensor(Frame(struct, data=True, max_length=16 + 3 * 65_535, plausible=plausible))
         )
         == set()
@@ -229,7 +229,7 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
     page = Frame(HttpReply, max_length=65_536)
     ask = Frame(HttpRequest, direction="out", max_length=4096)
     assert (
-        left(
+        find_broken_rules(
             sound.sensor(
                 frames={**sound.sensor().frames, "page": page, "ask": ask},
                 links={**sound.sensor().links, "web": Http(80)},
@@ -320,7 +320,7 @@ def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
         )
 
 
-def left(sensor: Sensor) -> set[str]:
+def find_broken_rules(sensor: Sensor) -> set[str]:
     """Return the unacknowledged findings of a declaration."""
     return {
         finding.code
@@ -332,18 +332,24 @@ def left(sensor: Sensor) -> set[str]:
 
 def test_intended_findings_are_acknowledged_with_a_reason() -> None:
     far = sound.sensor(range_limits=(0.05, 100.0))
-    assert left(far) == {"LS210"}
-    assert left(replace(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
+    assert find_broken_rules(far) == {"LS210"}
     assert (
-        left(
+        find_broken_rules(replace(far, acknowledged={"LS210": "the next model reaches so far"}))
+        == set()
+    )
+    assert (
+        find_broken_rules(
             replace(
                 far, acknowledged={"LS210 data.samples.distance": "the next model reaches so far"}
             )
         )
         == set()
     )
-    assert left(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
-    assert left(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {"LS209", "LS210"}
+    assert find_broken_rules(replace(far, acknowledged={"LS210": " "})) == {"LS209", "LS210"}
+    assert find_broken_rules(replace(far, acknowledged={"LS210 data.tilt": "no"})) == {
+        "LS209",
+        "LS210",
+    }
 
 
 @pytest.mark.slow
@@ -361,10 +367,10 @@ def test_table_indices_need_no_unit() -> None:
     def points(f: Fields) -> Polar:
         return Polar(f.samples.distance, take(np.linspace(0, 1, 256), f.number))
 
-    assert left(sound.sensor(points=points)) == set()
-    assert left(sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))) == {
-        "LS201"
-    }
+    assert find_broken_rules(sound.sensor(points=points)) == set()
+    assert find_broken_rules(
+        sound.sensor(points=lambda f: Polar(f.samples.distance, f.number / 256))
+    ) == {"LS201"}
 
 
 BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
