@@ -17,7 +17,7 @@ from lidarspec.device.demo import demonstrate
 from lidarspec.device.session import Session
 from lidarspec.errors import CommandError, OutOfRange, SourceError, SpecError, UsageError
 from lidarspec.spec import Command, Http, Port, Sensor, Simulation, Tcp, Template, Text, Udp
-from lidarspec.testing.check import CheckTarget, reports
+from lidarspec.testing.check import CheckTarget, iter_reports
 from lidarspec.testing.fixtures import virtual_port
 from tests.lines import TIMEOUT_S, free_port, read_until
 from tests.shapes.conversation import HANDLES, REPORTED, SENSOR, make_handle_sensor, page
@@ -58,7 +58,7 @@ def test_an_invalid_template_is_an_error(text: str) -> None:
 
 @pytest.mark.parametrize("sensor", [HANDLES, REPORTED], ids=lambda sensor: sensor.model)
 def test_a_sensor_that_is_started_with_a_handle_conforms(sensor: Sensor) -> None:
-    (report,) = reports(CheckTarget([sensor]), sensor.id, examples=2)
+    (report,) = iter_reports(CheckTarget([sensor]), sensor.id, examples=2)
     assert report.findings == []
 
 
