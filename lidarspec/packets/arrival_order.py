@@ -47,7 +47,7 @@ class ArrivalOrder:
     ) -> tuple[Index, NDArray[np.bool_]]:
         """Return the index of each packet in the stream, and the breaks before packets.
 
-        Both have the shape (n,). The index also counts lost packets. There is a break before a
+        Both have the shape (n,). The index has gaps for lost packets. There is a break before a
         packet if packets are lost before it, or if `batch` has a break there because of skipped
         bytes.
 

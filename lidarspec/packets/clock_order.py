@@ -54,7 +54,7 @@ class RecentPacket:
     Attributes:
         time: the time by the sensor's clock, ns.
         order: the sort key, ns.
-        index: the sequence number, which also counts missing packets.
+        index: the sequence number, with gaps for missing packets.
         missing: the number of packets missing directly before this packet.
         checksum: the CRC-32 of its bytes; None if it is no longer stored.
         angle: the angle at which it begins, in turns; nan if unknown.

@@ -147,7 +147,7 @@ class CounterOrder:
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
         """Return the index of each packet in the stream, and the breaks before packets.
 
-        Both have the shape (n,). The index also counts lost packets.
+        Both have the shape (n,). The index has gaps for lost packets.
 
         Args:
             batch: the packets. `batch.breaks` marks the packets with skipped bytes before them. The
@@ -167,7 +167,7 @@ class CounterOrder:
     ) -> tuple[NDArray[np.int64] | range, NDArray[np.bool_]]:
         """Return the index of each packet in the stream, and the breaks before packets.
 
-        The index also counts lost packets.
+        The index has gaps for lost packets.
         """
         count = len(batch)
         readings = self._read_batch(batch, times)

@@ -136,10 +136,10 @@ def read_samples(
 
 
 class WaitingSamples:
-    """A buffer that keeps IMU samples until the scan that they belong to has ended.
+    """A buffer that keeps IMU samples until their scan has ended.
 
     A scan has the samples from its first point to the first point of the next scan. The first scan
-    also has all earlier samples.
+    has all earlier samples as well.
     """
 
     def __init__(self) -> None:

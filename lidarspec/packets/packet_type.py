@@ -29,8 +29,8 @@ class PacketType:
         others: the names of the other frame types that packets of this type need as their state.
         clock: the clock of the packets; None without a clock.
         timed_sensor: the sensor, with its clock replaced by `clock`.
-        loss_clock: the clock that shows losses. None without a clock, and also if the clock is in
-            the parts of a frame, because a frame without parts then has no time.
+        loss_clock: the clock that shows losses. None without a clock, or if the clock is in the
+            parts of a frame, because a frame without parts then has no time.
         loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
         clock_of_counter: the clock that checks the packet counter; None if there is no such clock.
         is_counted: whether the packets have a counter.

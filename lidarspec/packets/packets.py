@@ -89,7 +89,7 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The index of each packet, (n,), in which missing packets are counted as well.
+        """The index of each packet in the stream, (n,), with gaps for missing packets.
 
         If the sensor has a counter, the index is the unwrapped counter.
         """

@@ -111,7 +111,10 @@ class GroupCounter:
             self._forget(group)
 
     def _count_ended(self) -> None:
-        """Count the incomplete groups whose last packet, or a later packet, has arrived."""
+        """Count the groups that have ended, and are incomplete.
+
+        A group has ended when its last packet or a later packet has arrived.
+        """
         for group, end in list(self._ends.items()):
             if end <= self._newest and group not in self._counted:
                 self._stats.incomplete_returns += 1
@@ -128,7 +131,7 @@ class GroupCounter:
 def _find_incomplete(
     groups: NDArray[np.int64], places: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> NDArray[np.intp]:
-    """Return the rows of packets whose group is not complete in a batch, (k,)."""
+    """Return the rows of packets from groups that are not complete in a batch, (k,)."""
     _, first_rows = np.unique(groups * int(sizes.max()) + places, return_index=True)
     _, numbers, counts = np.unique(groups[first_rows], return_inverse=True, return_counts=True)
     is_incomplete = counts[numbers.reshape(-1)] < sizes[first_rows]
