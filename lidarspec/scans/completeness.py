@@ -28,7 +28,7 @@ class PacketCounts:
 
     Attributes:
         times: the times of the packets, ns.
-        counts: 1 for each packet; for parts, 1 for the first part of a frame, and 0 for the others.
+        counts: 1 for each whole frame and for the first part of a frame; 0 for all other parts.
         sizes: the sizes of the packets, in bytes or in points.
         missing: the number of packets missing directly before each packet.
         is_broken: whether an unknown number of packets is missing directly before each packet.

@@ -84,8 +84,8 @@ class ScanLimits:
             usual: the number of packets of a whole scan.
 
         Returns:
-            The row of this packet, or None; and True if the scan exceeds a limit of all scans,
-            False if it exceeds only the limit of scans with missing packets.
+            The row of this packet, or None; and whether the scan exceeds a limit that holds for all
+            scans. Otherwise it exceeds only the limit for scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

@@ -331,7 +331,7 @@ class ScanSelector:
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
         """Yield the selected parts of selected scans.
 
-        A None in the input, which means that no scan has arrived in time, is yielded as well.
+        None in the input stands for a scan that has not arrived in time. It is yielded unchanged.
 
         Raises:
             UsageError: if there were scans, but none was selected.
