@@ -6,10 +6,11 @@ both times, the field is linear, for example the microseconds or the hour. If bo
 31 days, the field is the month. If both are 365 or 366 days, it is the year.
 
 To write a time, the date is written into the fields of the date. The time of day is distributed
-over the linear fields, from the coarsest to the finest. If the clock is a single field, a time
-difference is added to the field instead, and also to all elements of its array, to the other parts
-of its frame, and to all fields of the same unit, scale and size. These fields have times of the
-same clock, such as the start and the end of a measurement.
+over the linear fields, from the coarsest to the finest.
+
+If the clock is a single field, a time difference is added to this field, in all elements of its
+array and in all parts of its frame, and to all fields of the same unit, scale and size. These
+fields have times of the same clock, such as the start and the end of a measurement.
 
 If the time that was written cannot be read back from a frame, the clock cannot be written.
 """

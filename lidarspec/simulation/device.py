@@ -157,7 +157,7 @@ class ReplyMaker:
         self._decoders = {link: _make_command_decoder(sensor, link) for link in links}
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
-        """Return the commands whose last bytes are in the received bytes.
+        """Return the commands that the received bytes complete.
 
         Bytes that are not part of a command are ignored.
         """

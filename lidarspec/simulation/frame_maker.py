@@ -260,7 +260,7 @@ class FrameMaker:
             values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
     def _find_layout(self, values: Values) -> Layout:
-        """Return the layout of a frame whose header fields have these values."""
+        """Return the layout of a frame, which depends on the values of header fields."""
         while True:
             header = {path: self._get_raw(values, path) for path in self._layout_fields}
             key = tuple(header.values())

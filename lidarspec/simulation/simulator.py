@@ -145,7 +145,7 @@ class Measurement:
         sensor: the sensor.
         frame: the frame type.
         table: example frames, in which the fields with ranges are searched.
-        given: paths of the fields that `sweep` gives. They are not changed unless they are ranges.
+        given: paths of the fields that `sweep` gives. Only ranges among them are changed.
 
     Raises:
         SpecError: if no fields that determine the ranges are found, and the sensor has no `encode`.
@@ -354,7 +354,7 @@ class Measurement:
         return targets
 
     def _probe(self, table: CompiledTable, paths: Iterable[str], *probes: int) -> list[Beams]:
-        """Return the beams of a table for each of several values of some fields.
+        """Set fields to each of several values, and return the beams for each value.
 
         The fields are restored at the end.
 
@@ -570,7 +570,7 @@ def _get_table_name(frame: str, table: CompiledTable) -> str:
 
 
 def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
-    """Return the result of `points` for a table of the first frames of a stream."""
+    """Call `points` for a table, as if its frames were the first ones of a stream."""
     batch = _make_point_batch(sensor, table)
     points = sensor.points_of(_get_table_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
