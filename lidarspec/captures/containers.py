@@ -1,6 +1,6 @@
 """Detect the kind of a file by its first bytes, and decompress it.
 
-Files that cannot contain raw sensor data are refused with a message that names their kind.
+Files that cannot contain raw sensor data are refused. The message names the kind of the file.
 
 A file is decompressed while it is read (`UnpackedFile`), never as a whole. If its bytes are
 truncated or damaged, the content ends there, and `find_damage` returns the reason. The data before
