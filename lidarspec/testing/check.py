@@ -62,7 +62,7 @@ class CheckTarget:
 
 
 def find_target(text: str | Path) -> CheckTarget:
-    """Return the sensors to check for a name that the user typed.
+    """Find the sensors to check by the name that the user typed.
 
     The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
     distribution, or the folder of a distribution.
@@ -424,7 +424,7 @@ def _find_function(frame: str, name: str, sensor: Sensor | None) -> Location | N
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield (kind, name, line) of dict keys and of possible frame types and sensors."""
+    """Yield (kind, name, line) of each text that may be a key, a frame type or a sensor."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):

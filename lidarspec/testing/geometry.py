@@ -222,7 +222,7 @@ def calculate_directions(
 
 
 def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np.float64]] | None:
-    """Return the directions that the spec declares for the first frames, or None."""
+    """Return the directions that the spec declares for simulated frames; None if none."""
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
@@ -568,7 +568,7 @@ def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
 def _decode_with_values(
     subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
-    """Return the points of an example for each of these values of a field.
+    """Decode an example with each of several values of a field; return the points.
 
     Returns an empty list if no example has the same number of points for all values.
 

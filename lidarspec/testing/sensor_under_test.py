@@ -184,7 +184,7 @@ class SensorUnderTest:
             them are not tested again.
         measured: measured values of frames as text, by description.
         picture: measured values of points as text, by description, to compare with the manual.
-        traced: data frame -> the result of `points` for traced columns, if it can be traced.
+        traced: data frame -> the result of `geometry.trace_points`.
         placed: names of the data frames whose golden vectors have points in two quadrants.
         swept: data frame -> the packets of its `sweep` that have been made so far.
     """

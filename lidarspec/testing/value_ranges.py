@@ -294,7 +294,7 @@ def find_ranges(
     """Return the ranges of frames with this header; None if no valid frame is found.
 
     Args:
-        frame: a type with layouts and without parts.
+        frame: a frame type that is compiled and has no parts.
         header: path and raw value of each field that the layout depends on.
     """
     values = dict(header)
@@ -331,7 +331,7 @@ def find_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]
 
 
 def _find_header(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, int], ...]:
-    """Return the values of those fields of a struct that determine its layout."""
+    """Return (path, value) of each field that determines the layout of a struct."""
     values: dict[str, int] = {}
     while True:
         try:
