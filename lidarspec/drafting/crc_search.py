@@ -180,7 +180,7 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
 
 @dataclass(frozen=True)
 class _BitOrder:
-    """A conversion of frames to polynomials.
+    """The bit and byte order in which frames are converted to polynomials.
 
     Attributes:
         width: width of the CRC, in bits.

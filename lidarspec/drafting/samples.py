@@ -83,7 +83,7 @@ class CoveredSpan:
         return [(first, last) for first, last in chosen if last > first]
 
     def describe(self, place: ChecksumPlace, length: int) -> str:
-        """Return a text that describes the covered bytes."""
+        """Describe the covered bytes of a frame of this length as text."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
         ) == length - place.size:

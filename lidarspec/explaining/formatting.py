@@ -395,7 +395,7 @@ def format_limits(low: float, high: float, between: str = "..") -> str:
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Return the range of a numeric command argument, or another argument's type."""
+    """Return the range of a command argument if it is a number, otherwise its type."""
     if isinstance(kind, Range):
         return format_limits(kind.low, kind.high, between)
     return kind.describe(None)

@@ -502,10 +502,7 @@ def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
 
 
 def _iter_size_functions(layout: CLayout) -> Iterator[str]:
-    """Yield a C function that returns the size, for each part with alternatives.
-
-    Parts are omitted if all their alternatives have the same size.
-    """
+    """Yield the size function of each part whose alternatives differ in size."""
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.list_sizes(entry)
@@ -525,7 +522,7 @@ def _find_inner_axes(part: tree.Part) -> tuple[str, ...]:
 
 
 def _write_inner_count(layout: CLayout, axis: str) -> Iterator[str]:
-    """Yield the count function of an array inside a bit block."""
+    """Yield the C function that returns the length of an array inside a bit block."""
     inside = [
         (access, access.part)
         for entry in layout.entries
@@ -551,7 +548,7 @@ def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
 
 
 def _write_field(layout: CLayout, path: str) -> Iterator[str]:
-    """Yield the functions of a field: its value, presence and conversions to units."""
+    """Yield the C functions of a field, for its value, its presence and unit conversions."""
     ways = find_accesses(layout, path)
     name = layout.name(path, "")
     first = ways[0]

@@ -559,7 +559,7 @@ def _find_word_order(block: tree.Block) -> str | None:
 
 
 def _find_lowest_bit(bits: BitField, size: int, order: str) -> int | None:
-    """Return the position of the lowest bit of a field in a block read as one word.
+    """Return the position of a field's lowest bit, if its block is read as one word.
 
     Returns None if the bits of the field are not contiguous in that word.
     """
