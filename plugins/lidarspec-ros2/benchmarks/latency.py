@@ -46,7 +46,7 @@ def send(sensor: str, seconds: float, place: str, notes: str) -> None:
     Args:
         sensor: the id of the sensor.
         seconds: how long to send.
-        place: the name of a new serial line; "" to send by UDP.
+        place: the path of the pseudo-terminal to create; "" to send by UDP.
         notes: the file for the times.
     """
     spec = ls.sensor(sensor)

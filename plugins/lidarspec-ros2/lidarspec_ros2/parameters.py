@@ -285,7 +285,7 @@ class Settings:
         return detect(self["source"]) if sensor is None else sensor
 
     def find_known_sensor(self) -> Sensor | None:
-        """Return the sensor of the parameters or the source; None if it must be detected.
+        """Return the sensor that the parameters or the source name; None if neither does.
 
         Raises:
             UsageError: if a sensor is not installed, or does not accept an option.
@@ -295,13 +295,13 @@ class Settings:
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configured_sensor(self) -> Sensor | None:
-        """Return the sensor that the parameters name, with its options; else None."""
+        """Return the sensor that the parameters name, with its options; None if none."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)
 
     def find_mount(self) -> Mount | None:
-        """Return the mount in the parameters or else in `lidarspec.toml`; None if neither."""
+        """Return the mount from the parameters, else from `lidarspec.toml`; None if unset."""
         mount = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
         if mount != Mount():
             return mount

@@ -188,7 +188,7 @@ class PageMessages:
         """Send a command, and return the reply as text.
 
         Raises:
-            UsageError: if commands are not sent, or an argument is missing or invalid.
+            UsageError: if commands are not allowed, or an argument is missing or invalid.
             CommandError: if the sensor refuses the command or does not reply.
         """
         if self.why_no_control:

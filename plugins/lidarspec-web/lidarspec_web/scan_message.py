@@ -81,7 +81,7 @@ def thin_out(indices: NDArray[np.intp], max_points: int) -> NDArray[np.intp]:
 
 
 def _count_padding(size: int) -> int:
-    """Return the number of padding bytes after a part of this size."""
+    """Return the number of padding bytes that follow `size` bytes of the message."""
     return -size % ALIGNMENT_BYTES
 
 
