@@ -25,7 +25,7 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 STEP_NS = 20_000_000
 
 
-def arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, Any]:
+def make_arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, Any]:
     """Return a valid value for each argument of a command, by name.
 
     Args:
@@ -61,7 +61,7 @@ def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
     """
     for share in (0.0, 0.37, 1.0):
         try:
-            _check_parses_back(subject.sensor, name, arguments(subject, name, share))
+            _check_parses_back(subject.sensor, name, make_arguments(subject, name, share))
         except LidarSpecError as error:
             raise ViolationError("LS601", str(error), f"commands.{name}") from error
 
@@ -116,7 +116,7 @@ def arguments_outside_ranges_are_errors(subject: SensorUnderTest, name: str) -> 
             ends = ()
         for outside in ends:
             try:
-                subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
+                subject.sensor.command(name, **{**make_arguments(subject, name, 0.0), key: outside})
             except UsageError:
                 continue
             raise ViolationError(
@@ -184,7 +184,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
     refused = ""
     for share in (0.0, 0.37, 1.0) if command.args else (0.0,):
         try:
-            reply = _get_reply(subject, name, arguments(subject, name, share))
+            reply = _get_reply(subject, name, make_arguments(subject, name, share))
         except CommandError as error:
             refused = refused or str(error)
             continue

@@ -98,7 +98,7 @@ def frames(sensor: str | Sensor, frame: str, fields: Fields | None = None) -> Se
     Raises:
         UnknownFrame: for a frame type that the sensor does not have.
     """
-    resolved = _resolve(sensor)
+    resolved = _find_sensor(sensor)
     if frame not in resolved.frames:
         raise UnknownFrame(frame, resolved.frames, place=resolved.id)
     engine = get_codec(resolved.frames[frame])
@@ -124,7 +124,7 @@ def values(
     Raises:
         UnknownFrame: for a frame type that the sensor does not have.
     """
-    resolved = _resolve(sensor)
+    resolved = _find_sensor(sensor)
     return _parsed_values(resolved, frame, frames(resolved, frame, fields))
 
 
@@ -151,7 +151,7 @@ def commands(sensor: str | Sensor, name: str | None = None) -> SearchStrategy[Co
         UnknownCommand: for a command that the sensor does not have.
         UsageError: for a sensor without commands.
     """
-    resolved = _resolve(sensor)
+    resolved = _find_sensor(sensor)
     if name is not None and name not in resolved.commands:
         raise UnknownCommand(name, resolved.commands, place=resolved.id)
     if not resolved.commands:
@@ -222,7 +222,7 @@ def streams(
         noise: with True, random bytes and truncated frames are inserted, as datagrams if the sensor
             sends datagrams. With a strategy, the bytes that it draws are inserted.
     """
-    resolved = _resolve(sensor)
+    resolved = _find_sensor(sensor)
     runs = [_consecutive_frames(resolved, name) for name in resolved.incoming]
     if noise is True:
         noise = st.binary(min_size=1, max_size=MAX_NOISE_BYTES)
@@ -274,7 +274,7 @@ def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
         SpecError: if the fields that the ranges are calculated from cannot be found, or if the
             simulated sensor sends no complete scan.
     """
-    resolved = _resolve(sensor)
+    resolved = _find_sensor(sensor)
     return _scans(resolved, _packets_per_scan(resolved), lost)
 
 
@@ -335,7 +335,7 @@ def _join_frames(sensor: Sensor, packets: list[bytes]) -> Any:
     return b"".join(announced)
 
 
-def _resolve(sensor: str | Sensor) -> Sensor:
+def _find_sensor(sensor: str | Sensor) -> Sensor:
     if isinstance(sensor, Sensor):
         return sensor
     return named_sensor(sensor)
