@@ -328,7 +328,7 @@ class Broadcast:
     def _update(self) -> None:
         """Store a new scan, new statistics and the end of a file; call `news` if there are any."""
         has_news = self._update_scan()
-        if self._update_figures():
+        if self._update_statistics():
             has_news = True
         if self._update_end():
             has_news = True
@@ -351,7 +351,7 @@ class Broadcast:
         self._scan_count += 1
         return True
 
-    def _update_figures(self) -> bool:
+    def _update_statistics(self) -> bool:
         """Read the statistics once a second, and return whether they were read."""
         now = time.monotonic()
         duration_s = now - self._measured_at
@@ -359,7 +359,7 @@ class Broadcast:
             return False
         self._measured_at = now
         if self._is_playing:
-            self.history.append(self._figures(duration_s))
+            self.history.append(self._make_statistics(duration_s))
         self.warnings = self.device.warnings
         self.info = self.device.info
         return True
@@ -374,7 +374,7 @@ class Broadcast:
             self.warnings = self.device.warnings
         return True
 
-    def _figures(self, duration_s: float) -> dict[str, Any]:
+    def _make_statistics(self, duration_s: float) -> dict[str, Any]:
         stats = self.device.stats
         reading = self._feed.meter.reading(stats, duration_s if self.is_live else None)
         now = self.now()

@@ -118,7 +118,7 @@ class OpenPage:
             await self._greet()
             while True:
                 self._has_news.clear()
-                message = await self._next_message()
+                message = await self._choose_message()
                 if message is None:
                     await self._wait_for_news()
                 elif not await self._send_in_time(message):
@@ -156,20 +156,20 @@ class OpenPage:
         else:
             await self._socket.send_text(json.dumps(message, allow_nan=False))
 
-    async def _next_message(self) -> bytes | dict[str, Any] | None:
+    async def _choose_message(self) -> bytes | dict[str, Any] | None:
         """Return the message to send next; None if there is none."""
         if self._replies:
             return self._replies.popleft()
         return (
-            self._next_scan_message()
+            self._make_scan_message()
             or self._end_message()
-            or await self._frame_message()
-            or self._state_message()
+            or await self._make_frame_message()
+            or self._make_state_message()
         )
 
-    def _next_scan_message(self) -> bytes | None:
+    def _make_scan_message(self) -> bytes | None:
         max_points = self._wanted_points
-        shown = self._unseen_scan()
+        shown = self._find_unseen_scan()
         if max_points is None or shown is None:
             return None
         self._wanted_points = None
@@ -185,7 +185,7 @@ class OpenPage:
             return {"is": "ended", "text": self._broadcast.ending}
         return None
 
-    async def _frame_message(self) -> dict[str, Any] | None:
+    async def _make_frame_message(self) -> dict[str, Any] | None:
         if not self._shows_frames:
             self._frame_due = math.inf
             return None
@@ -203,7 +203,7 @@ class OpenPage:
         except LidarSpecError:
             return None  # a frame without an explanation is not shown
 
-    def _state_message(self) -> dict[str, Any] | None:
+    def _make_state_message(self) -> dict[str, Any] | None:
         now = time.monotonic()
         recording = self._find_recording()
         if now < self._state_due and recording == self._sent_recording:
@@ -227,7 +227,7 @@ class OpenPage:
         current = switch.recording
         return current[0] if current is not None else "", switch.trouble
 
-    def _unseen_scan(self) -> ShownScan | None:
+    def _find_unseen_scan(self) -> ShownScan | None:
         """Return the newest scan; None if the page has it already, or is paused."""
         shown = self._broadcast.shown
         if shown is None or self._frozen is not None:

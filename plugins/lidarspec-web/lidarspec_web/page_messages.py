@@ -178,7 +178,7 @@ class PageMessages:
             UsageError: if an argument is missing or invalid.
         """
         sensor = self.broadcast.device.sensor
-        data = sensor.command(name, **parse_arguments(sensor, name, _assignments(texts)))
+        data = sensor.command(name, **parse_arguments(sensor, name, _make_assignments(texts)))
         explanation = None
         if data:
             explanation = explain(data, sensor, sensor.commands[name].frame).to_dict()
@@ -194,7 +194,7 @@ class PageMessages:
         if self.why_no_control:
             raise UsageError(self.why_no_control)
         device = self.broadcast.device
-        values = parse_arguments(device.sensor, name, _assignments(texts))
+        values = parse_arguments(device.sensor, name, _make_assignments(texts))
         reply = device.send(name, **values)
         return {
             "is": "replied",
@@ -245,7 +245,7 @@ def _make_discarded_reply(what: str) -> dict[str, Any]:
     return {"is": "gone", "what": what}
 
 
-def _assignments(texts: Mapping[str, str]) -> list[str]:
+def _make_assignments(texts: Mapping[str, str]) -> list[str]:
     return [f"{name}={text}" for name, text in texts.items()]
 
 

@@ -106,7 +106,7 @@ class _DecoderInput:
 
 
 @dataclass(frozen=True)
-class _Result:
+class _FoundFrames:
     """The frames in one input of the decoder, and the number of the first frame."""
 
     first_number: int
@@ -149,7 +149,7 @@ class RecentBytes:
         self._joins_datagrams = False
         self._inputs = deque[_DecoderInput]()
         self._input_size = 0
-        self._results = deque[_Result]()
+        self._results = deque[_FoundFrames]()
         self._frame_count = 0
         self._end = 0  # end of the last frame, an offset in the input
         self._damaged = deque[DamagedBytes](maxlen=MAX_DAMAGED)
@@ -173,7 +173,7 @@ class RecentBytes:
         with self._lock:
             if frames.gaps.any():
                 self._keep_skipped(frames)
-            self._results.append(_Result(self._frame_count, frames))
+            self._results.append(_FoundFrames(self._frame_count, frames))
             self._frame_count += len(frames)
             self._end = int(frames.places[-1]) + int(frames.sizes[-1])
 
