@@ -104,7 +104,7 @@ def find_common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     return divisor
 
 
-def divisors(polynomial: int, degree: int) -> list[int]:
+def find_divisors(polynomial: int, degree: int) -> list[int]:
     """Return a polynomial's divisors of the given degree that may be CRC polynomials.
 
     CRC polynomials have the constant term 1.
@@ -417,7 +417,7 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
     xor_polynomial = (1 << width) | 1  # its CRC is a plain XOR, which is searched elsewhere
     polynomials = [
         poly
-        for poly in divisors(find_common_divisor(multiples, floor=width), width)
+        for poly in find_divisors(find_common_divisor(multiples, floor=width), width)
         if poly != xor_polynomial
     ]
     catalogued = [

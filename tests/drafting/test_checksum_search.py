@@ -13,8 +13,8 @@ import lidarspec
 import lidarspec.spec
 from lidarspec.drafting.checksum_search import OffsetChecksum, WordSum, search
 from lidarspec.drafting.crc_search import (
-    divisors,
     find_common_divisor,
+    find_divisors,
     iter_crc_matches,
     quotient,
     remainder,
@@ -282,10 +282,10 @@ def test_divisors_of_a_common_multiple() -> None:
         return product
 
     multiples = [times(source.getrandbits(200)) for _ in range(4)]
-    assert divisors(find_common_divisor(multiples), 16) == [poly]
-    assert poly in divisors(times(0b1011), 16)
-    assert poly in divisors(multiples[0], 16)  # every polynomial of degree 16 is tried at once
-    assert divisors(0, 8) == []
+    assert find_divisors(find_common_divisor(multiples), 16) == [poly]
+    assert poly in find_divisors(times(0b1011), 16)
+    assert poly in find_divisors(multiples[0], 16)  # every polynomial of degree 16 is tried at once
+    assert find_divisors(0, 8) == []
 
 
 def test_linear_equations_and_their_freedom() -> None:
