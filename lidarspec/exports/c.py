@@ -317,10 +317,10 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
                     and part.symbol in ("//", "%")
                     and not isinstance(part.args[1], int)
                 ):
-                    yield f"if ({before}!lidarspec_int({layout.formula(part.args[1])})) return 0;"
+                    yield f"if ({before}!lidarspec_int({layout.format_formula(part.args[1])})) return 0;"
             if isinstance(entry.node, Repeat | Blob) and not isinstance(value, int):
                 yield (
-                    f"if ({before}!lidarspec_within({layout.formula(value)}, {longest})) return 0;"
+                    f"if ({before}!lidarspec_within({layout.format_formula(value)}, {longest})) return 0;"
                 )
 
 
@@ -402,7 +402,7 @@ def _iter_value_checks(layout: CLayout) -> Iterator[str]:
                 f"memcmp(p + {entry.start}, {quote_bytes(node.const)}, {len(node.const)}) != 0",
             )
         elif isinstance(node, Check):
-            yield _format_check(entry, f"!{layout.formula(node.condition)}")
+            yield _format_check(entry, f"!{layout.format_formula(node.condition)}")
         elif isinstance(node, Never):
             yield _format_check(entry, "1")
         elif isinstance(node, Number | Block):
@@ -418,7 +418,7 @@ def _iter_value_checks(layout: CLayout) -> Iterator[str]:
                 elif access.info.is_enforced and access.info.rebuilt is not None:
                     yield _format_check(
                         entry,
-                        f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}",
+                        f"(int64_t)({access.expression}) != {layout.format_formula(access.info.rebuilt)}",
                     )
 
 

@@ -167,7 +167,7 @@ class CEntry:
         """The C expression of the field's raw value."""
         node = self.node
         if self.part is not None:
-            return _bits(self.part, self.start)
+            return _format_bits(self.part, self.start)
         assert isinstance(node, tree.Number)
         if node.size == 1:
             raw = f"p[{self.start}]"
@@ -247,7 +247,7 @@ class CLayout:
         """Return the entry that contains all elements or alternatives of a node."""
         return next(entry for entry in self.entries if entry.path == path)
 
-    def formula(self, value: tree.Formula) -> str:
+    def format_formula(self, value: tree.Formula) -> str:
         """Return a formula as a C expression of type int64_t.
 
         Raises:
@@ -262,11 +262,11 @@ class CLayout:
 
         return tree.write(value, format_field, _OPERATIONS)
 
-    def length(self, value: tree.Formula) -> str:
+    def format_length(self, value: tree.Formula) -> str:
         """Return a number of elements or bytes as a C expression."""
         if isinstance(value, int):
             return str(value)
-        return f"(size_t)({self.formula(value)})"
+        return f"(size_t)({self.format_formula(value)})"
 
     def count(self, node: tree.Repeat, depth: int) -> int | str:
         """Return the number of elements of an array inside `depth` other arrays.
@@ -397,7 +397,7 @@ class CLayout:
             ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value)
         )
         if isinstance(node, tree.When):
-            holds = self.formula(node.condition)
+            holds = self.format_formula(node.condition)
             if isinstance(node.condition, tree.Op) and node.condition.symbol in tree.COMPARISONS:
                 holds = holds[1:-1]
             else:
@@ -405,7 +405,7 @@ class CLayout:
             cases = [(holds, node.then), (f"!({holds})", node.otherwise)]
         else:
             assert isinstance(node, tree.Select)
-            key = self.formula(node.key)
+            key = self.format_formula(node.key)
             others = " && ".join(f"{key} != {value}" for value, _ in node.cases) or "1"
             cases = [
                 *((f"{key} == {value}", case) for value, case in node.cases),
@@ -438,7 +438,7 @@ def format_word(start: SizeFormula, size: int, order: str) -> str:
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
-def _bits(part: tree.Part, start: SizeFormula) -> str:
+def _format_bits(part: tree.Part, start: SizeFormula) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
     for segment in part.bits.segments:
@@ -543,7 +543,7 @@ def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
         for entry in layout.entries
         if entry.path == axis and isinstance(entry.node, tree.Repeat)
     ]
-    ways = [(entry.full_condition, layout.length(count)) for entry, count in arrays]
+    ways = [(entry.full_condition, layout.format_length(count)) for entry, count in arrays]
     yield _format_function("size_t", layout.name(axis, "count"), arrays[0][0].depth, ways)
 
 
@@ -561,7 +561,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
     if isinstance(first.node, tree.Blob):
         kind = ""
         sizes = [
-            (access.full_condition, layout.length(access.node.size))
+            (access.full_condition, layout.format_length(access.node.size))
             for access in ways
             if isinstance(access.node, tree.Blob)
         ]

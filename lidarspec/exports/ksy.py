@@ -598,7 +598,8 @@ class _KaitaiWriter:
         if seal is None:
             sealed = ""
         else:
-            sealed = f"{seal.algorithm.describe()} over {_span(seal)}, which is not checked here"
+            covered = _describe_covered(seal)
+            sealed = f"{seal.algorithm.describe()} over {covered}, which is not checked here"
         if info.is_enforced:
             unchecked = "a length, which is not checked here"
         else:
@@ -660,7 +661,7 @@ def _name_value(node: tree.Node) -> tree.Node:
     return replace(node, name="value")
 
 
-def _span(seal: tree.Sealed) -> str:
+def _describe_covered(seal: tree.Sealed) -> str:
     if seal.over is None:
         return "all other bytes"
     first, last = (path.rpartition(".")[2] for path in seal.over)

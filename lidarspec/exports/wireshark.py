@@ -230,7 +230,7 @@ class _TableWriter:
             "le": (node.order == "little" and node.size > 1) or None,
             **self._make_number_entries(node.info, kind),
         }
-        return table | {"skip": self._skip(node.info, node.size)}
+        return table | {"skip": self._find_skip_bytes(node.info, node.size)}
 
     def _make_blob_table(self, node: tree.Blob) -> Table:
         if node.ending is not None:
@@ -246,12 +246,12 @@ class _TableWriter:
             "name": name,
             "field": new,
             "size": format_formula(node.size),
-            "keep": self._keep(path),
+            "keep": self._name_if_kept(path),
         }
         table["const"] = LuaCode(quote_lua(node.const)) if node.const is not None else None
         return table | {
             "skip": (
-                self._skip(node.info, node.size)
+                self._find_skip_bytes(node.info, node.size)
                 if isinstance(node.size, int) and node.const is None
                 else None
             )
@@ -377,7 +377,7 @@ class _TableWriter:
         return {
             "kind": "parts",
             "name": node.name,
-            "total": self._keep(node.total.path),
+            "total": self._name_if_kept(node.total.path),
             **formulas,
             "kinds": kinds,
         }
@@ -418,7 +418,7 @@ class _TableWriter:
             table["allowed"] = None
         else:
             table["allowed"] = [list(run) for run in tree.find_runs(info.allowed)]
-        return table | {"keep": self._keep(info.path)}
+        return table | {"keep": self._name_if_kept(info.path)}
 
     def _declare_field(
         self,
@@ -455,12 +455,12 @@ class _TableWriter:
             f" {masked}, {quote_lua(docs)})"
         )
 
-    def _keep(self, path: str) -> str | None:
+    def _name_if_kept(self, path: str) -> str | None:
         if path in self.kept:
             return path
         return None
 
-    def _skip(self, info: tree.FieldInfo, size: int) -> int | None:
+    def _find_skip_bytes(self, info: tree.FieldInfo, size: int) -> int | None:
         if info.path in self.kept or info.const is not None or info.allowed is not None:
             return None
         return size
