@@ -258,10 +258,10 @@ class LibraryError(UsageError):
         else:
             needed = distribution
         if installed_version:
-            found = f"version {installed_version} is installed"
+            found = f"but version {installed_version} is installed"
         else:
-            found = "this library is not installed"
-        super().__init__(f"this requires {needed}; {found}" + (f" ({cause})" if cause else ""))
+            found = "which is not installed"
+        super().__init__(f"this requires {needed}, {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
 

@@ -355,8 +355,8 @@ class Registry:
         names = {other.name for other in self._offered[home] if other.value == entry.value}
         if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"the entry point {entry.name!r} loads {entry.value}, a sensor with another id"
-                " and without this alias",
+                f"the entry point {entry.name!r} loads {entry.value}, but the sensor has neither"
+                " this id nor this alias",
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
@@ -982,7 +982,9 @@ def load_verb(entry: EntryPoint) -> click.Command:
         for command in commands:
             if command.name == entry.name:
                 return command  # type: ignore[no-any-return]
-    raise SpecError(f"its lidarspec_verbs returns no verb {entry.name!r}", path=entry.distribution)
+    raise SpecError(
+        f"the hook lidarspec_verbs returns no verb {entry.name!r}", path=entry.distribution
+    )
 
 
 @contextlib.contextmanager

@@ -128,8 +128,8 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
     sensor_arguments = _iter_sensor_arguments(angles, counters)
     text = {
         "frame_summary": (
-            f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)} with"
-            f" {draft.share:.1%} of its {draft.bytes_in} bytes"
+            f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)}, which contain"
+            f" {draft.share:.1%} of the {draft.bytes_in} bytes"
         ),
         "origin": origin,
         "checksum_class": checksum_class,

@@ -606,7 +606,9 @@ class _ResultPart:
 
     def __init__(self, expression: Expression, to_integers: IntegerConverter) -> None:
         if any(info.axes or info.optional for info in expression.fields):
-            raise UntraceableError("a field that is used is optional or inside an array")
+            raise UntraceableError(
+                "the expression uses a field that is optional or inside an array"
+            )
         self._expression = expression
         self._to_integers = to_integers
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}

@@ -225,8 +225,8 @@ class PointCloud:
             else:
                 reason = f"does not fit into {columns} columns"
             raise UsageError(
-                f"column {wrong[0]} {reason}: pass the points of one revolution, and its"
-                " number of columns"
+                f"column {wrong[0]} {reason}: pass only the points of one revolution, and the"
+                " number of columns of a revolution"
             )
         place = np.full(columns, -1)
         place[self.column[::column_size]] = np.arange(self.shape[0])

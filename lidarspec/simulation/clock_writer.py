@@ -493,7 +493,8 @@ class StatusWriter:
         locked_states = {choice.state.locked for choice in self._choices}
         if not locked_states >= {True, False}:
             raise UsageError(
-                f"{sensor.id} cannot lose its lock: its status does not distinguish a locked clock"
+                f"the clock of {sensor.id} cannot lose its lock: its status needs a value for a"
+                " locked clock, and one for an unlocked clock"
             )
 
     def write(self, table: CompiledTable, states: NDArray[np.int64], follows: str) -> None:

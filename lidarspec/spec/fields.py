@@ -249,8 +249,8 @@ class Checksummed(layer.SealedStruct):
             if self.over is None and inner.over is None:
                 both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
                 raise SpecError(
-                    f"{both}: name the fields that the inner Checksummed covers, with its"
-                    " argument over="
+                    f"{both}: pass over= to the inner Checksummed, to name the fields that it"
+                    " covers"
                 )
             inner = inner.subcon
 

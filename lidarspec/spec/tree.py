@@ -1283,7 +1283,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
 
 def _refuse_fraction(sign: str) -> Any:
     raise UntraceableExpressionError(
-        f"an expression with {sign!r}, whose result may not be an integer"
+        f"the result of an expression with {sign!r} is not always an integer"
     )
 
 

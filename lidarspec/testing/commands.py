@@ -71,7 +71,7 @@ def _check_parses_back(sensor: Sensor, name: str, arguments_given: dict[str, flo
     command = sensor.commands[name]
     data = sensor.command(name, **arguments_given)
     if command.frame is None:
-        assert data == b"", "the command declares no frame, but it has bytes"
+        assert data == b"", "the command has bytes, but declares no frame type"
         return
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, (

@@ -122,8 +122,8 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     times = packets.points().time
     spread = float(np.ptp(times)) if len(times) else 0.0
     message = (
-        f"the points of {len(packets)} packets cover {spread:.3g} s, but the clock advances by"
-        f" {step:.3g} s per packet"
+        f"the times of the points of {len(packets)} packets cover {spread:.3g} s, but the clock"
+        f" advances by {step:.3g} s per packet"
     )
     require(
         step <= 0 or spread <= (len(packets) + MAX_SPREAD_STEPS) * step,

@@ -502,7 +502,7 @@ def _check_strength(
         yield (
             "LS206",
             (
-                f"its constants and checksums have only {weakest} bits, and it declares neither"
+                f"the constants and checksums have only {weakest} bits, and it declares neither"
                 " plausible nor confirm"
             ),
             name,

@@ -200,7 +200,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
         for path in free
         if path not in sealing and not SPARE_NAMES.search(path.rpartition(".")[2])
     ]
-    problems = {"no vector has a value of": [path for path in required if path not in pinned]}
+    problems = {"no vector states a value of": [path for path in required if path not in pinned]}
     problems["all vectors have 0 for"] = [path for path in required if pinned.get(path) is False]
     message = "; ".join(f"{words} {', '.join(paths)}" for words, paths in problems.items() if paths)
     require(not message, "LS711", message, name)

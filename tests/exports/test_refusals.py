@@ -48,7 +48,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
             "x: a Python function branches on the values",
         ),
         (with_frame("x" / Bytes(lambda c: {0: 1}[c.a])), "x: a Python function"),
-        (with_frame("x" / Bytes(this.a / 2)), "x: an expression with '/'"),
+        (with_frame("x" / Bytes(this.a / 2)), "x: the result of an expression with '/'"),
         (
             with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])),
             "l[1]: the layout depends on this array element",

@@ -460,7 +460,7 @@ def test_examples_pass_checks_of_the_whole_frame() -> None:
     [
         (Probe(), "use lidarspec explain"),
         (StopIf(this.k == 0), "If(this.more, Struct"),
-        (Seek(4), "declare those bytes"),
+        (Seek(4), "declare the skipped bytes"),
     ],
 )
 def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str) -> None:

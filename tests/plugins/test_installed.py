@@ -271,8 +271,8 @@ def test_the_first_of_two_plugins_with_one_id_wins(
     [
         (
             "liar-x2 = liar",
-            "liar-x1: the entry point 'liar-x2' loads liar:liar_x2, a sensor with another"
-            " id and without this alias",
+            "liar-x1: the entry point 'liar-x2' loads liar:liar_x2, but the sensor has"
+            " neither this id nor this alias",
         ),
         ("odd-x1 = odd", "lidarspec_sensors must return sensors, got int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),

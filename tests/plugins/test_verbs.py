@@ -80,7 +80,7 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     ("verb", "reason"),
     [
         ("absent", "No module named 'acme_absent'"),
-        ("other", "its lidarspec_verbs returns no verb 'other'"),
+        ("other", "the hook lidarspec_verbs returns no verb 'other'"),
         ("plain", "lidarspec_verbs lacks @hookimpl"),
     ],
 )

@@ -437,7 +437,7 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     )
     first["values"]["samples[2].distance"] = 0
     assert list_lacking(sound.sensor(), [first, second]) == [
-        "LS711 data: no vector has a value of last; all vectors have 0 for samples.distance"
+        "LS711 data: no vector states a value of last; all vectors have 0 for samples.distance"
     ]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert list_lacking(sound.sensor(), [ack]) == []

@@ -257,7 +257,9 @@ class _Builder:
             info = _describe_integer(place.info)
             offset = place.offset()
             if offset is None:
-                reason = f"{info.path}: Tell is used in an array, or after a part of unknown size"
+                reason = (
+                    f"{info.path}: Tell cannot be used in an array, or after a part of unknown size"
+                )
                 offset = tree.Untraced(reason, "?")
             self._add_value(place, offset)
             return tree.Derived(info, "offset")
@@ -310,7 +312,7 @@ class _Builder:
         )
         value = self.node(con.subcon, inside)
         size = tree.size(value)
-        reason = "RawCopy is used in an array, or contains or follows a part of unknown size"
+        reason = "RawCopy cannot be in an array, or contain or follow a part of unknown size"
         unknown = tree.Untraced(f"{info.path}: {reason}", "?")
         start = None if place.offset is None else place.offset()
         end = tree.combine("+", start, size)
@@ -418,21 +420,21 @@ class _Builder:
             if not isinstance(expression, ExprMixin) and any(
                 ref.info.optional for ref in scope.asked
             ):
-                reason = "a Python function of an optional field"
+                reason = "a Python function uses an optional field"
             elif isinstance(value, bool | int):
                 return int(value)
             elif not isinstance(value, tree.Symbol):
-                reason = f"an expression with the constant value {value!r}"
+                reason = f"the expression has the constant value {value!r}"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
                 reason = "an expression uses a named value as a number"
             elif fraction is not None and not may_be_fraction:
-                reason = f"an expression with {fraction!r}, whose result may not be an integer"
+                reason = f"the result of an expression with {fraction!r} is not always an integer"
             else:
                 return value.formula
         except tree.UntraceableExpressionError as untraceable:
             reason = str(untraceable)
         except Exception as error:
-            reason = f"a Python function of other fields ({type(error).__name__}: {error})"
+            reason = f"a Python function of other fields fails ({type(error).__name__}: {error})"
         path = place.info.path
         return tree.Untraced(f"{path}: {reason}", _format_expression(expression, path))
 
@@ -457,7 +459,7 @@ class _Builder:
             elif isinstance(key, tree.Ref) and isinstance(odd[0], str):
                 reason = f"{key.path} has no value named {odd[0]!r}"
             else:
-                reason = f"a case for {odd[0]!r}, which is not an integer"
+                reason = f"the case {odd[0]!r}, which is not an integer"
             path = place.info.path
             key = tree.Untraced(f"{path}: {reason}", _format_expression(con.keyfunc, path))
         if isinstance(key, tree.Untraced):

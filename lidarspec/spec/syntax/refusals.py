@@ -69,7 +69,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
     ),
     construct.Seek: (
         "LS112",
-        "Seek reads outside the frame: declare those bytes, 'reserved' / Bytes(n)",
+        "Seek reads outside the frame: declare the skipped bytes, 'reserved' / Bytes(n)",
     ),
     construct.Select: (
         "LS113",

@@ -127,7 +127,7 @@ INFO = Checksummed(
         "model" / Bytes(12) * "ASCII, terminated by 00",
         "zero_angle"
         / Scaled(Int16ul, 1, "deg")
-        * "from the mark on the housing to the zero of the data, clockwise",
+        * "clockwise angle from the mark on the housing to the zero direction of the data",
         "direction" / Enum(Int8ul, clockwise=0),
         "correction" / Int8ul * "1: the host must correct the angles",
         "reserved" / Bytes(3),

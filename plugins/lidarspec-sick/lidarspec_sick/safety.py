@@ -94,7 +94,7 @@ def make_block(offsets: range | None = None) -> Struct:
 
 
 BEAM = Struct(
-    "distance" / Scaled(Int16ul, MM, "m") * "before the multiplication by `factor`",
+    "distance" / Scaled(Int16ul, MM, "m") * "to be multiplied by `factor`",
     "reflectivity" / Int8ul,
     "status"
     / BitStruct(

@@ -41,7 +41,7 @@ MIN_DISTANCE_M = 0.016
 AHEAD_DEG = 90.0  # the direction straight ahead on the wire (sick_scan_xd)
 DISTANCE = (
     Scaled(Int16ub, 0.001, "m")
-    * "before the multiplication by the scale factor; raw values below 16: no distance"
+    * "to be multiplied by the scale factor; raw values below 16: no distance"
 )
 #: The unit of the rate is 100 Hz, but some firmware erroneously sends the rate in Hz
 #: (sick_scan_xd). A rate above this limit is therefore divided by 100.

@@ -104,7 +104,7 @@ VALUES: dict[int, Construct] = {
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
     ANSWER_TYPE: "answer_type"
     / Enum(Int8ul, **STREAMS)
-    * "the type in the descriptor that is sent before the data frames of this mode",
+    * "type of the data frames of this mode; a descriptor before them states it",
 }
 _VALUE_BYTES = np.full(MODE_NAME + 1, np.nan)
 _VALUE_BYTES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]

@@ -206,7 +206,7 @@ def relatives(name: str) -> dict[str, str | Relative]:
     }
     return models | dict.fromkeys(
         CSPC_MODELS.get(own_model.sample_format.size, ()),
-        "info, which a CSPC sends when it is started",
+        "a CSPC sends the frame info when it is started",
     )
 
 
