@@ -100,8 +100,8 @@ class Mirror(Calibration):
 
     Attributes:
         faces: (faces,) the mirror angles at which the faces begin, degrees.
-        azimuth_adjust, elevation_adjust: (181, channels) the degrees to add, in steps of 2 degrees
-            of the mirror; None for no correction.
+        azimuth_adjust, elevation_adjust: (181, channels) the degrees to add, with a row for every 2
+            degrees of the mirror; None for no correction.
     """
 
     faces: Table = dataclasses.field(default_factory=lambda: np.array([23.075, 143.44, 263.133]))
