@@ -158,8 +158,8 @@ def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
 def even_firing_times(*counts: int) -> NDArray[np.float64]:
     """Return the firing time of each laser in seconds.
 
-    Lasers fire at 16 times, 3.236 us apart. The lasers are listed in two groups. `counts` has the
-    number of lasers of the first group at each time, and then those of the second group. Source:
+    Lasers fire at 16 times, 3.236 us apart, in two groups that use the same times. `counts` has the
+    number of lasers at each time: 16 numbers for the first group, and 16 for the second. Source:
     rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
