@@ -1034,6 +1034,16 @@ def split_file_and_id(text: str) -> tuple[Path, str]:
     return Path(f"{path}.py" if colon else text), wanted
 
 
+def no_sensors_error(file: Path) -> SpecError:
+    """Return the error for a file without a hook that returns sensors."""
+    return SpecError(
+        "the file has no function that returns its sensors: add a function"
+        " lidarspec_sensors, decorated with @hookimpl, that returns them, such as [SENSOR]",
+        path=str(file),
+        rule="LS006",
+    )
+
+
 def _load_file(text: str) -> Sensor:
     file, wanted = split_file_and_id(text)
     module = import_file(file)
@@ -1041,12 +1051,7 @@ def _load_file(text: str) -> Sensor:
     with _convert_errors(file):
         ids = local.add(module, name=str(file))
     if not ids:
-        raise SpecError(
-            "the file must define a function lidarspec_sensors, decorated with @hookimpl, that"
-            " returns a sensor",
-            path=str(file),
-            rule="LS006",
-        )
+        raise no_sensors_error(file)
     if len(ids) > 1 and not wanted:
         raise UsageError(
             f"{file} describes several sensors: choose one of"

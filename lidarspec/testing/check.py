@@ -24,7 +24,13 @@ from typing import Any
 
 from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
-from lidarspec.plugins import Registry, import_file, registry, split_file_and_id
+from lidarspec.plugins import (
+    Registry,
+    import_file,
+    no_sensors_error,
+    registry,
+    split_file_and_id,
+)
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import Finding, list_unacknowledged
@@ -112,11 +118,7 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
         target.family = tuple(sensor.id for sensor in target.sensors[1:] and target.sensors)
         target.findings += _check_taken_ids(target.sensors, file)
         if not target.sensors:
-            raise SpecError(
-                "the file must define a function lidarspec_sensors, decorated with @hookimpl,"
-                " that returns a sensor",
-                rule="LS006",
-            )
+            raise no_sensors_error(file)
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
