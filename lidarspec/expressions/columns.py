@@ -11,7 +11,7 @@ cannot be mixed by accident. If values depend on later packets, ``ready`` is the
 whose values are final. `FlatColumn` has the values of a column in stream order, without padding;
 `previous`, `following` and `last` use it.
 
-`align` also aligns other arrays. An array made by `along` is aligned by the name of its array. A
+`align` accepts columns and arrays. An array made by `along` is aligned by the name of its array. A
 plain array is aligned by its length, if exactly one array of the frame has this length. If a plain
 array has as many axes as there are nested arrays, it is aligned by position, as in NumPy.
 """
