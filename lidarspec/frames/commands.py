@@ -106,13 +106,13 @@ class ArgumentSlot:
         info: the field.
         length: the size of the field in bytes, or the number of elements of an array; None if it
             varies.
-        in_template: whether the argument is a part of a text.
+        is_in_template: whether the argument is a part of a text.
     """
 
     info: FieldInfo
     length: int | None
     is_array: bool = False
-    in_template: bool = False
+    is_in_template: bool = False
 
 
 def find_argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
@@ -170,8 +170,8 @@ def _find_template_slot(
             sensor=sensor.id,
         )
     if isinstance(declared.kind, Range):
-        return ArgumentSlot(FieldInfo(declared.path, kind="float"), None, in_template=True)
-    return ArgumentSlot(FieldInfo(declared.path, kind="bytes"), None, in_template=True)
+        return ArgumentSlot(FieldInfo(declared.path, kind="float"), None, is_in_template=True)
+    return ArgumentSlot(FieldInfo(declared.path, kind="bytes"), None, is_in_template=True)
 
 
 def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:

@@ -27,24 +27,24 @@ def check_compilable(root: tree.Node) -> None:
 
     It is also raised for values that no column can represent.
     """
-    _check(root, "", in_array=False)
+    _check(root, "", is_in_array=False)
     _check_columns(root)
 
 
-def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
+def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
     match node:
         case tree.Opaque():
             raise NotCompilableError(node.info.path, node.reason)
         case tree.Sealed():
-            if in_array:
+            if is_in_array:
                 raise NotCompilableError(path, "the checksum is inside an array")
             _ = node.algorithm
-        case tree.Blob() if in_array and node.ending is not None:
+        case tree.Blob() if is_in_array and node.ending is not None:
             raise NotCompilableError(
                 node.info.path,
                 "the content of each element determines its end: use an array of structs",
             )
-        case tree.PartSequence() if in_array:
+        case tree.PartSequence() if is_in_array:
             raise NotCompilableError(path, "the sequence of parts is inside an array")
         case tree.Block():
             for part in node.parts:
@@ -68,7 +68,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             below = f"{path}.{child.name}".strip(".")
         else:
             below = path
-        _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
+        _check(child, below, is_in_array=is_in_array or isinstance(node, tree.Repeat))
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:

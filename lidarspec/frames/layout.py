@@ -628,14 +628,14 @@ class LayoutRefusal:
 
     Attributes:
         error: the error of a plugin expression that failed.
-        by_constant: whether a constant is wrong. If it is False and `error` is None, the frame is
-            too long.
+        has_wrong_constant: whether a constant is wrong. If this is False and `error` is None, the
+            frame is too long.
         constants: if the frame is too long, the constants before the part that is too long. If one
-            of them is wrong in a candidate, the wrong constant is the fault of that candidate.
+            of them is wrong in a candidate, this constant is the fault of the candidate.
     """
 
     error: PluginError | None = None
-    by_constant: bool = False
+    has_wrong_constant: bool = False
     constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
 

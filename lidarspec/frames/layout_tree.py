@@ -890,7 +890,9 @@ class HeaderTree:
                 groups[-1] = result, which[~wrong]
                 places.refuted.append(which[wrong])
         return groups + [
-            (LayoutRefusal(by_constant=True), which) for which in places.refuted if len(which)
+            (LayoutRefusal(has_wrong_constant=True), which)
+            for which in places.refuted
+            if len(which)
         ]
 
     def group_by_layout(
@@ -1083,7 +1085,7 @@ class HeaderTree:
         except TooLongError:
             node.result = LayoutRefusal(constants=self._select_new_constants(walk))
         except UnknownPartError:
-            node.result = LayoutRefusal(by_constant=True)
+            node.result = LayoutRefusal(has_wrong_constant=True)
         except SpecError:
             raise
         except Exception as error:

@@ -357,7 +357,7 @@ class _PartWalk:
     def _set_refusal(self, refused: LayoutRefusal, which: Offsets) -> None:
         if refused.error:
             self._status[which] = FAILED
-        elif refused.by_constant:
+        elif refused.has_wrong_constant:
             self._status[which] = CONSTANT
         else:
             self._status[which] = LENGTH

@@ -189,7 +189,7 @@ class Schema:
 
     @property
     def part_kinds(self) -> Mapping[str, Kind]:
-        """The kinds of the separate parts, by path, such as "tags.points"."""
+        """The kinds of parts in `separate_parts`, by path, such as "tags.points"."""
         return {
             f"{axis}.{kind.name}".rstrip("."): kind
             for axis, node in self.separate_parts.items()

@@ -6,7 +6,7 @@ exception. Modules in reading order:
 
 * `results`: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 * `plausibility`: checks many candidates of one layout at once.
-* `variable_lengths`: checks candidates together whose layouts differ only in an array's length.
+* `variable_lengths`: checks candidates of layouts that differ only in the length of an array.
 * `frame_codec`: the interface of the codec of one frame type, which checks candidates and makes
   tables of frames.
 * `text_frames`: the codec of frames with a wire form.

@@ -55,7 +55,7 @@ class SearchState:
         run: the name of the weak type of the last accepted run.
         run_end: the stream offset of the end of this run.
         size: the size of the last frame in bytes.
-        steady: whether the last frames had this size and no bytes between them.
+        is_steady: whether the last frames had this size and no bytes between them.
     """
 
     after: str | None = None
@@ -63,7 +63,7 @@ class SearchState:
     run: str | None = None
     run_end: int = -1
     size: int = 0
-    steady: bool = True
+    is_steady: bool = True
 
 
 @dataclass
@@ -73,7 +73,7 @@ class PieceResult:
     Attributes:
         frames: the accepted frames; their offsets count from the start of the piece.
         end: the offset of the first byte that must be searched again.
-        waiting: whether more bytes are required to decide about the candidate at `end`.
+        is_waiting: whether more bytes are required to decide about the candidate at `end`.
         need: the number of bytes from `end` on that the next search requires; 0 if unknown.
         rejected: the number of rejected candidates, by the name of the counter.
         errors: the exceptions that plugin code has raised.
@@ -81,7 +81,7 @@ class PieceResult:
 
     frames: Frames
     end: int
-    waiting: bool = False
+    is_waiting: bool = False
     need: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
     errors: list[PluginError] = field(default_factory=list)

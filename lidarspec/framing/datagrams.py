@@ -51,18 +51,18 @@ def sort_datagrams(
     Returns:
         All datagrams as frames; datagrams that are not frames have the kind -1.
     """
-    steady = find_regular_datagrams(framing, buffer, starts, sizes, mode)
-    if steady is not None and steady.is_all_valid:
-        return PieceResult(steady, len(buffer))
-    return _DatagramBatch(framing, buffer, to_array(starts), sizes, steady).sort(mode)
+    regular_frames = find_regular_datagrams(framing, buffer, starts, sizes, mode)
+    if regular_frames is not None and regular_frames.is_all_valid:
+        return PieceResult(regular_frames, len(buffer))
+    return _DatagramBatch(framing, buffer, to_array(starts), sizes, regular_frames).sort(mode)
 
 
 class _DatagramBatch:
     """Checks some datagrams, once for each set of active types.
 
     Args:
-        steady: the result of checking the datagrams as frames of one type and layout; None if this
-            was not possible.
+        regular_frames: the result of checking the datagrams as frames of one type and layout; None
+            if this was not possible.
     """
 
     def __init__(
@@ -71,13 +71,13 @@ class _DatagramBatch:
         buffer: Bytes1D,
         starts: Indices,
         sizes: Indices,
-        steady: Frames | None,
+        regular_frames: Frames | None,
     ) -> None:
         self._framing = framing
         self._buffer = buffer
         self._starts = starts
         self._sizes = sizes
-        self._steady = steady
+        self._regular_frames = regular_frames
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
@@ -193,10 +193,14 @@ class _DatagramBatch:
 
     def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
         """Check datagrams as frames of one type, and return them with their status."""
-        steady = self._steady
-        self._steady = None
-        if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
-            return steady
+        regular_frames = self._regular_frames
+        self._regular_frames = None
+        if (
+            regular_frames is not None
+            and regular_frames.kinds[0] == kind
+            and len(starts) == len(regular_frames)
+        ):
+            return regular_frames
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
     def _count_rejected(

@@ -356,8 +356,8 @@ class Decoder:
             parts += [frames] if len(frames) else []  # none at all would keep its bytes
             start = start + piece.end
             self._base = self._base + piece.end
-            self._need = piece.need if piece.waiting and last else 0
-            if piece.waiting and last:
+            self._need = piece.need if piece.is_waiting and last else 0
+            if piece.is_waiting and last:
                 break
             most = (
                 MAX_REGULAR_PIECE_BYTES if 2 * frames.total_bytes > piece.end else MAX_PIECE_BYTES

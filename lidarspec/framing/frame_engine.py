@@ -104,7 +104,7 @@ class CompiledCodec(Codec):
             if isinstance(layout, LayoutRefusal):
                 if layout.error:
                     status[which] = PLUGIN
-                elif layout.by_constant:
+                elif layout.has_wrong_constant:
                     status[which] = CONSTANT
                 else:
                     status[which] = LENGTH

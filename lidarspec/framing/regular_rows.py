@@ -38,7 +38,7 @@ def find_regular_frames(
         mode: the state between pieces, which is updated.
         base: the offset of the buffer in the stream.
     """
-    if not mode.size or not (mode.steady or len(buffer) <= SMALL_PIECE_BYTES):
+    if not mode.size or not (mode.is_steady or len(buffer) <= SMALL_PIECE_BYTES):
         return None
     number = len(buffer) // mode.size
     if not number:
@@ -60,8 +60,8 @@ def find_regular_frames(
             valid = lead
         else:
             valid = int((frames.status != 0).argmax())
-        mode.steady = 2 * valid > number
-        if not mode.steady:
+        mode.is_steady = 2 * valid > number
+        if not mode.is_steady:
             return None
         if is_weak:
             mode.run_end = base + valid * mode.size

@@ -127,7 +127,7 @@ class _FrameWalk:
         Args:
             position: the offset to start from.
             piece: the result for the piece. If the search ends at an incomplete candidate, the
-                attributes `end`, `waiting` and `need` of the result are set.
+                attributes `end`, `is_waiting` and `need` of the result are set.
 
         Returns:
             The end of the last accepted frame, or of the piece.
@@ -149,7 +149,7 @@ class _FrameWalk:
             if frames.status.item(last) == SHORT:
                 self._accept_rows(row, last - 1)
                 piece.end = frames.starts.item(last)
-                piece.waiting = self._is_whole
+                piece.is_waiting = self._is_whole
                 piece.need = frames.sizes.item(last)
                 break
             self._accept_rows(row, last)
@@ -231,7 +231,7 @@ def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
     own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
         mode.size = frames.sizes.item(-1)
-        mode.steady = own.item(-1) - own.item(0) == mode.size * (len(own) - 1)
+        mode.is_steady = own.item(-1) - own.item(0) == mode.size * (len(own) - 1)
 
 
 def count_rejected(

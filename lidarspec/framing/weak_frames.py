@@ -146,7 +146,7 @@ def find_runs(
 
 
 def _find_rows(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return the rows of wanted values in an ascending array, and whether each exists."""
+    """Return the index of each wanted value in an ascending array, and whether it exists."""
     if not len(values):
         return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)
     rows = np.minimum(values.searchsorted(wanted), len(values) - 1)

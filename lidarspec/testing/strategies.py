@@ -180,7 +180,7 @@ def _argument_values(slot: ArgumentSlot, kind: Taken) -> SearchStrategy[Any]:
             limits = slot.info.limits
             raw = st.integers(max(ends[0], limits[0]), min(ends[1], limits[1]))
             return _physical_values(slot.info, raw, low, high)
-        case Text(size) if slot.in_template:
+        case Text(size) if slot.is_in_template:
             return st.text("abcXYZ019_.-", max_size=size)
         case Text(size):
             longest = min(size, slot.length or size)
