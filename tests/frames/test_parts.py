@@ -279,7 +279,7 @@ def test_a_wrong_part_is_reported_before_the_bytes_behind_the_parts() -> None:
     assert (fault.value.path, fault.value.offset) == ("parts[1].mark", 17)
     assert "constant aa ba, expected aa bb" in fault.value.reason
     last = ls.explain(bytes(data), sensor).rows[-1]
-    assert (last.path, last.data, last.right) == ("end", b"\x99", True)
+    assert (last.path, last.data, last.matches_spec) == ("end", b"\x99", True)
 
 
 def test_a_header_that_is_cut_off_is_reported_before_the_parts() -> None:
