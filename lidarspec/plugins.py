@@ -1034,12 +1034,16 @@ def split_file_and_id(text: str) -> tuple[Path, str]:
     return Path(f"{path}.py" if colon else text), wanted
 
 
-def no_sensors_error(file: Path) -> SpecError:
-    """Return the error for a file without a hook that returns sensors."""
+def no_sensors_error(path: str = "") -> SpecError:
+    """Return the error for a file without a hook that returns sensors.
+
+    Args:
+        path: the file; "" if the caller names it.
+    """
     return SpecError(
         "the file has no function that returns its sensors: add a function"
         " lidarspec_sensors, decorated with @hookimpl, that returns them, such as [SENSOR]",
-        path=str(file),
+        path=path,
         rule="LS006",
     )
 
@@ -1051,7 +1055,7 @@ def _load_file(text: str) -> Sensor:
     with _convert_errors(file):
         ids = local.add(module, name=str(file))
     if not ids:
-        raise no_sensors_error(file)
+        raise no_sensors_error(str(file))
     if len(ids) > 1 and not wanted:
         raise UsageError(
             f"{file} describes several sensors: choose one of"

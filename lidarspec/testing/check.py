@@ -118,7 +118,7 @@ def _find_file_target(file: Path, wanted: str) -> CheckTarget:
         target.family = tuple(sensor.id for sensor in target.sensors[1:] and target.sensors)
         target.findings += _check_taken_ids(target.sensors, file)
         if not target.sensors:
-            raise no_sensors_error(file)
+            raise no_sensors_error()
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
