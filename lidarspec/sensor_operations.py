@@ -251,8 +251,8 @@ class Sensor(SensorDescription):
         packets, imu = self._decode(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
             warnings.warn(
-                f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): does it"
-                " come from another sensor?",
+                f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): does the"
+                " data come from another sensor?",
                 stacklevel=2,
             )
         scans = iter_scans(self, [packets], imu)

@@ -90,8 +90,8 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
             if path and (path in names or (part is alternative and not is_only_one)):
                 raise NotCompilableError(
                     path,
-                    "its content determines its size, but another case of the same If or"
-                    " Switch has a different field with this name",
+                    "the content of the part determines its size, but another case of the same If"
+                    " or Switch has a different field with this name",
                 )
 
 

@@ -534,7 +534,7 @@ class ParsedTable:
             if info.dtype is None:
                 return _make_object_column(values)
             raise SpecError(
-                "its branches have values of different shapes, so it cannot be a column",
+                "the branches have values of different shapes, so the field cannot be a column",
                 path=path,
             ) from None
         return column

@@ -350,8 +350,8 @@ def _check_reported(sensor: SensorDescription, name: str) -> None:
         if opening in sensor.commands
     ):
         raise SpecError(
-            "only the data link may have port=`reported`. A command in `on_open` that is sent over"
-            " another link must then provide the port by its reply",
+            "only the data link may have port=`reported`. The port must then be in the reply to a"
+            " command in `on_open`, which must be sent over another link",
             path=f"links.{name}",
             sensor=sensor.id,
         )

@@ -210,10 +210,9 @@ def _check_learned_options(subject: SensorUnderTest, name: str, reply: Reply) ->
             sensor.configure(**values)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
-            which = "that answers= of the Simulation provides"
+            what = f"the options cannot be read from the reply that answers= provides: {error}"
         else:
-            which = "that was simulated without answers="
-        what = f"the options in the reply {which} cannot be read: {error}"
+            what = f"the options cannot be read from the simulated reply: {error}"
         raise ViolationError("LS604", what, f"commands.{name}") from error
 
 

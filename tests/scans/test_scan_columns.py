@@ -325,7 +325,7 @@ def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> 
     other = b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 40))
     with pytest.warns(
         UserWarning,
-        match=r"ldrobot-stl27l: no data frame in the data .*does it come from another sensor\?",
+        match=r"ldrobot-stl27l: no data frame in the data .* come from another sensor\?",
     ):
         assert not list(ls.sensor("ldrobot-stl27l").scans(other))
     with pytest.warns(UserWarning, match=r"distnace.*, at 12 packets"):

@@ -569,7 +569,7 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     )
     (empty,) = finding(learning, page)
     assert empty.startswith(
-        "LS604 commands.ask: the options in the reply that was simulated without answers="
+        "LS604 commands.ask: the options cannot be read from the simulated reply:"
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(

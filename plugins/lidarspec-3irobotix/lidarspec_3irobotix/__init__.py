@@ -161,7 +161,7 @@ def make_lidar(name: str) -> Sensor:
     has_vectors = model == "Delta-2A"
     source = "kaiaai/LDS and lds2d"
     if has_vectors:
-        source += "; two packets of a unit"
+        source += "; two packets captured from a unit"
     return Sensor(
         name,
         vendor="3iRobotix",

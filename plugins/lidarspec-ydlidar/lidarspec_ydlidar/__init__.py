@@ -216,7 +216,7 @@ def make_lidar(name: str) -> Sensor:
     has_requests = not model.is_send_only
     source = "YDLIDAR SDK: communication protocol, data set of models"
     if model.status == "capture":
-        source += "; packets of a unit"
+        source += "; packets captured from a unit"
     return Sensor(
         make_id(name),
         vendor="YDLIDAR",
