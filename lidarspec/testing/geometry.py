@@ -469,7 +469,7 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that counter and clock increase from packet to packet of the sweep.
+    """Check that the counter and the clock never run backwards in the sweep.
 
     No packet may count as lost, late or duplicate.
     """
