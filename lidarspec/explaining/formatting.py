@@ -235,18 +235,18 @@ class ExplainedRow:
 
     @property
     def is_in_first_element(self) -> bool:
-        """Whether the row is in the first element of each array that contains it.
+        """Whether the row is in the first element of each array around it, or in no array.
 
-        Texts that are the same in all elements are shown only in the first.
+        Texts that are the same in all elements are shown only in the first element.
         """
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
-        """Return each value as text, with the bits if this is the first element of an array.
+        """Return each value as text; in later elements of an array, the bits are omitted.
 
         Args:
-            alone: whether the row is a single field. If not, a text begins with the name of its
-                field unless the unit identifies the field.
+            alone: whether the row is a single field. Otherwise, a text begins with the name of its
+                field, unless no other field of the row has the same unit.
         """
         if alone and self.remarks:
             return []
@@ -402,7 +402,7 @@ def format_argument_type(kind: Taken, between: str = "..") -> str:
 
 
 def describe_argument(sensor: Sensor, command: str, argument: str, between: str = "..") -> str:
-    """Return the values that an argument accepts as text: names, a range, or both."""
+    """Describe the values that an argument accepts: by name, by range, or by type."""
     kind = sensor.commands[command].arguments[argument].kind
     if isinstance(kind, Range):
         choices = list_choices(find_argument_slot(sensor, command, argument).info, kind)
