@@ -7,7 +7,7 @@ There are three measurements of SECONDS each:
 * A simulated sensor sends packets in real time, the node publishes, and a subscriber receives. The
   latency is the time from the last packet of a scan to the callback of the subscriber.
 * `lidarspec stats` reads the same packets.
-* A publisher without a node sends messages of the same size at the same rate.
+* A program that only publishes sends messages of the same size at the same rate.
 
 The second and the third measurement show how much of the processor time is spent on decoding and on
 publishing.
