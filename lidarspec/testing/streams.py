@@ -1,8 +1,9 @@
 """Properties of a sensor's streams: no lost frame, repeatable results, equal scans in batches.
 
-Two kinds of faults are found. A frame of one type is mistaken for another type. A function of the
-sensor (`plausible`, `points`, `clock`) depends on more than its arguments, for example on earlier
-calls, random numbers, or the other packets of a batch. The engine itself is tested elsewhere.
+The properties find two kinds of faults. One is a frame that is mistaken for another type. The other
+is a function of the sensor (`plausible`, `points`, `clock`) that depends on more than its
+arguments, for example on earlier calls, random numbers, or other packets of the same batch. The
+engine itself is tested elsewhere.
 """
 
 from __future__ import annotations
