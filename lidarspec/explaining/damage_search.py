@@ -70,11 +70,10 @@ class FrameChange(NamedTuple):
 def find_changes(
     frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
 ) -> list[FrameChange]:
-    """Return the single changes that explain the damage to a frame.
+    """Return the changes of a frame that each explain its damage alone.
 
     A change explains the damage if undoing it gives one valid and plausible frame of the type. The
-    kinds are tried in turn. The result contains only changes of the first kind that explains the
-    damage.
+    kinds are tried one after another, until changes of one kind explain the damage.
 
     Args:
         frame: the frame type.

@@ -117,7 +117,7 @@ class CEntry:
     """A node of a frame tree, at one position in the frame.
 
     Attributes:
-        path: the path of the node, without indices; for an array, the path of its axis.
+        path: the path of the node, without indices; for an array, its `axis`.
         node: the node.
         start: the offset of the first byte of the node in the frame.
         size: the size of the node in bytes.
