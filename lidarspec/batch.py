@@ -564,7 +564,7 @@ def convert(
             todo = [piece for piece in todo if not finished[piece.source]]
         for piece in todo:
             manifest.clear(piece)
-        with _without_partial_files(folder, to), _open_executor(jobs, scheduler) as executor:
+        with _remove_partial_files(folder, to), _open_executor(jobs, scheduler) as executor:
             for record, is_old in _iter_results(
                 executor, todo, (lambda _: None) if force else manifest.find_finished
             ):
@@ -638,7 +638,7 @@ def _check_format(to: str) -> None:
 
 
 @contextlib.contextmanager
-def _without_partial_files(folder: str, to: str) -> Iterator[None]:
+def _remove_partial_files(folder: str, to: str) -> Iterator[None]:
     """Remove partial files of killed processes from a folder, on entry and on exit."""
 
     def sweep() -> None:

@@ -515,14 +515,14 @@ class Registry:
         for name, sensor in self._list_loaded_sensors().items():
             home = self._find_owner(name)
             if name not in rows and home is not None:
-                rows[name] = make_row(sensor, home[0], self._version(home[0]))
+                rows[name] = make_row(sensor, home[0], self._find_version(home[0]))
         return [rows[name] for name in sorted(rows)]
 
     def _has_name(self, distribution: str, name: str) -> bool:
         home = self._find_owner(name)
         return home is not None and home[0] == distribution
 
-    def _version(self, distribution: str) -> str:
+    def _find_version(self, distribution: str) -> str:
         versions = (
             entry.version
             for entries in self._offered.values()

@@ -205,7 +205,7 @@ def _complete_files(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
 
-def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
+def _complete_verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
     root = ctx.find_root().command
     if isinstance(root, click.Group):
         return root.list_commands(ctx)
@@ -221,7 +221,7 @@ WITHOUT_FILES = (
     _complete_frames,
     _complete_commands,
     _complete_assignments,
-    _verbs,
+    _complete_verbs,
     _complete_columns,
     _complete_formats,
 )
@@ -234,7 +234,7 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "command": _complete_commands,
     "assignments": _complete_assignments,
     "name": _complete_sensors_and_distributions,
-    "verb": _verbs,
+    "verb": _complete_verbs,
     "ramp": _complete_columns,
     "suffix": _complete_formats,
     **dict.fromkeys(

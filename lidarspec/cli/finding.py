@@ -319,9 +319,9 @@ def detect(
             output,
         )
     elif fitting:
-        emit(_detected_text(found_verdicts, output), output)
+        emit(_format_detected(found_verdicts, output), output)
     elif unknown is not None:
-        emit(_structure_text(unknown), output)
+        emit(_format_structure(unknown), output)
     for line in _iter_conclusions(source, found_verdicts, unknown, start=start):
         note(line)
     if not any(verdict.candidates for verdict in fitting):
@@ -390,7 +390,7 @@ def _find_structure(verdicts: Sequence[Verdict]) -> FrameStructure | None:
     return None
 
 
-def _detected_text(verdicts: Sequence[Verdict], output: str | None) -> str:
+def _format_detected(verdicts: Sequence[Verdict], output: str | None) -> str:
     rows = []
     for verdict in verdicts:
         alike = {score.sensor.id for score in verdict.candidates}
@@ -603,7 +603,7 @@ def _structure_to_dict(structure: FrameStructure | None) -> dict[str, Any] | Non
     }
 
 
-def _structure_text(structure: FrameStructure) -> str:
+def _format_structure(structure: FrameStructure) -> str:
     if structure.period:
         length = f"{structure.period} bytes each"
     else:

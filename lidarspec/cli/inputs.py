@@ -273,7 +273,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
             WireError(no_bytes(sample.source, sample.warnings), sensor=sensor.id),
             f"lidarspec build {sensor.id} --help",
         )
-    if (fault := _wrong_checksums_error(sample)) is not None:
+    if (fault := _make_wrong_checksums_error(sample)) is not None:
         return fault
     if len(data) > longest:
         kind = " of text" if sample.is_text else ""
@@ -303,7 +303,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
     if not sample.data:
         return suggest(WireError(no_bytes(sample.source, sample.warnings)), "lidarspec sensors")
-    if (fault := _wrong_checksums_error(sample)) is not None:
+    if (fault := _make_wrong_checksums_error(sample)) is not None:
         return fault
     best = find_nearest_fault(sample.data)
     if best is None:
@@ -318,7 +318,7 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
     return suggest(best, f"lidarspec explain {quote(sample.source)} -s {best.sensor}")
 
 
-def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
+def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
     """Return an error if the input has frames that match a sensor except for all checksums.
 
     Returns None for any other input.
@@ -349,7 +349,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
                 WireError(f"{source} {instead[0]}", sensor=sensor.id), f"repeat with {instead[1]}"
             )
         sample = None if stats.frames else reread(source)
-        if sample is not None and (fault := _wrong_checksums_error(sample)) is not None:
+        if sample is not None and (fault := _make_wrong_checksums_error(sample)) is not None:
             return fault
         if sample is not None and sample.is_text:
             error = WireError(f"{source} is text and has no data frame: {stats}", sensor=sensor.id)

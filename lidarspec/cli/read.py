@@ -292,7 +292,7 @@ class StatsPrinter:
     def print_interval(self, at: float | None, reading: MeterReading) -> None:
         """Print the values of an interval that ended `at` seconds after the start."""
         if self.as_json:
-            self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
+            self._emit({"kind": "interval", "at_s": at, **self._collect_figures(reading)})
             return
         if self.printed % ROWS_PER_HEADER == 0:
             say(_format_row(["time", *(name for name, _, _, _ in COLUMNS), "queue"], WIDTHS))
@@ -313,7 +313,7 @@ class StatsPrinter:
             self._emit(
                 {
                     "kind": "summary",
-                    **self._figures(reading),
+                    **self._collect_figures(reading),
                     "clock": clock.to_dict(),
                     "stats": self.device.stats.to_dict(),
                     "info": self.device.info,
@@ -337,7 +337,7 @@ class StatsPrinter:
         for fact, value in self.device.info.items():
             say(f"  {fact}: {printable(value)}")
 
-    def _figures(self, reading: MeterReading) -> dict[str, Any]:
+    def _collect_figures(self, reading: MeterReading) -> dict[str, Any]:
         facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}
         return {
             **facts,

@@ -116,7 +116,7 @@ def record(
         raise
     except SourceError as error:
         if task.recorder is not None and task.recorder.error is error:
-            suggest(error, _view_command(task.recorder, sensor))
+            suggest(error, _make_view_command(task.recorder, sensor))
         raise
     assert task.recorder is not None
     try:
@@ -186,7 +186,7 @@ def _sum_up_recording(
     if stats is not None and (damage := _describe_damage(stats)):
         summary += f"; {damage}"
     note(summary)
-    note(f"next: {_view_command(recorder, sensor)}")
+    note(f"next: {_make_view_command(recorder, sensor)}")
     if as_json:
         facts = {"output": recorder.path, "source": source, "sensor": sensor.id if sensor else None}
         counts = {
@@ -213,12 +213,12 @@ def _describe_damage(stats: Counters) -> str:
     return ", ".join(f"{name} {value}" for name, value in counters.items() if value)
 
 
-def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
+def _make_view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
     """Return the command that shows a recording."""
     if isinstance(recorder, Recorder) and recorder.header.sensor:
         verb = "view" if sensor is None else verb_to_show(sensor)
         return f"lidarspec {verb} {shlex.quote(recorder.path)}"
-    return f"lidarspec {_view_words(sensor, recorder.path)}"
+    return f"lidarspec {_make_view_words(sensor, recorder.path)}"
 
 
 @click.command()
@@ -353,17 +353,17 @@ def _announce(file: str, target: str, sensor: Sensor | None, *, as_json: bool) -
         say(target)
     if not target.startswith("udp:"):
         note(f"replaying {file} to {target} when a reader opens it")
-        note(f"next: lidarspec {_view_words(sensor, target)}")
+        note(f"next: lidarspec {_make_view_words(sensor, target)}")
         return
     source = target
     has_port = ":" in target.removeprefix("udp://")
     if not has_port:
         source = "udp://" if sensor else "udp://:PORT"
     note(f"replaying {file} to {target}")
-    note(f"next: lidarspec {_view_words(sensor, source)}")
+    note(f"next: lidarspec {_make_view_words(sensor, source)}")
 
 
-def _view_words(sensor: Sensor | None, target: str) -> str:
+def _make_view_words(sensor: Sensor | None, target: str) -> str:
     """Return the arguments of `lidarspec` that show the data of a source."""
     if sensor is None:
         return f"detect {shlex.quote(target)}"
@@ -397,7 +397,7 @@ def _print_summary(
             f" from one address; select one sender with '{file}?src=ADDRESS'"
         )
     if is_file:
-        note(f"next: lidarspec {_view_words(sensor, target)}")
+        note(f"next: lidarspec {_make_view_words(sensor, target)}")
     if as_json:
         summary = {
             "source": file,

@@ -172,10 +172,10 @@ def _check_permission(port: str) -> Iterator[Diagnosis]:
             f"sudo usermod -aG {group} $USER",
         )
     else:
-        yield Diagnosis(False, f"{text}; only root may open it", _udev_rule_command(port))
+        yield Diagnosis(False, f"{text}; only root may open it", _make_udev_rule_command(port))
 
 
-def _udev_rule_command(port: str) -> str:
+def _make_udev_rule_command(port: str) -> str:
     """Return a command that adds a udev rule.
 
     All users may then open this port and ports of the same kind.

@@ -488,7 +488,7 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     """
     unchecked = _score_each(
         _list_sensors_with_frames(),
-        lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored_checksums),
+        lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_read_stored_checksums),
     )
     matches = [
         score
@@ -517,7 +517,7 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     )
 
 
-def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
+def _read_stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
     """Return the stored checksums in place of computed ones, so that all are valid."""
     return seal.load_stored(rows)
 

@@ -70,11 +70,11 @@ def recognize(sample: SampleBytes) -> list[KnownSensor]:
     matching = []
     if best >= MIN_MATCHING_SHARE:
         matching = [row for row, share in zip(missing, shares, strict=True) if share == best]
-    at_port = [row for row in matching or missing if sample.ports & _udp_ports(row)]
+    at_port = [row for row in matching or missing if sample.ports & _find_udp_ports(row)]
     return at_port or matching
 
 
-def _udp_ports(row: KnownSensor) -> set[int]:
+def _find_udp_ports(row: KnownSensor) -> set[int]:
     return {port for link in row.links.values() if link.kind == "udp" for port in link.numbers}
 
 

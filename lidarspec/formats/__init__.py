@@ -98,7 +98,7 @@ def format_of(path: str | Path) -> Format:
     return (
         _find_by_suffix(path, BUILT_IN)
         or _find_by_suffix(path, formats_by_suffix := formats())
-        or _unknown_format_error(path, formats_by_suffix)
+        or _raise_unknown_format(path, formats_by_suffix)
     )
 
 
@@ -112,7 +112,7 @@ def _find_by_suffix(path: str | Path, formats_by_suffix: Mapping[str, Format]) -
     )
 
 
-def _unknown_format_error(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> NoReturn:
+def _raise_unknown_format(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> NoReturn:
     raise UnknownFormat(Path(path).suffix or str(path), formats_by_suffix, place=str(path))
 
 
@@ -127,7 +127,7 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
     """
     path = Path(path)
     formats_by_suffix = {format.suffix: format for format in (CSV, NPZ)}
-    chosen = _find_by_suffix(path, formats_by_suffix) or _unknown_format_error(
+    chosen = _find_by_suffix(path, formats_by_suffix) or _raise_unknown_format(
         path, formats_by_suffix
     )
     with replace_file(path) as part:

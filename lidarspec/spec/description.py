@@ -52,14 +52,14 @@ def reject_unknown_arguments(described: type[_Described]) -> type[_Described]:
     def checked_init(self: Any, *args: Any, **arguments: Any) -> None:
         for name in arguments:
             if name not in known:
-                raise SpecError(_unknown_argument(type(self).__name__, name, known))
+                raise SpecError(_describe_unknown_argument(type(self).__name__, name, known))
         init(self, *args, **arguments)
 
     described.__init__ = checked_init  # type: ignore[method-assign]
     return described
 
 
-def _unknown_argument(owner: str, name: str, known: Iterable[str]) -> str:
+def _describe_unknown_argument(owner: str, name: str, known: Iterable[str]) -> str:
     """Return the error message for an argument that a class does not have."""
     if name in Simulation.__dataclass_fields__:
         suggestion = f"; write {owner}(simulation=Simulation({name}=...))"

@@ -130,7 +130,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
         for info in engine.schema.fields.values()
         if info.rebuilt is not None or info.is_enforced
     }
-    for data in _changed_examples(subject, name):
+    for data in _iter_changed_examples(subject, name):
         try:
             parsed = subject.sensor.parse(data, frame=name, verify=False)
             again = subject.sensor.parse(subject.sensor.build(name, parsed), frame=name)
@@ -139,7 +139,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
         _require_same_values(parsed, again, sealed | follows, name)
 
 
-def _changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
+def _iter_changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
     """Yield copies of examples with one changed byte each."""
     source = subject.make_random(f"raw {name}")
     changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGED_VALUES), MAX_CHANGED_BYTES)

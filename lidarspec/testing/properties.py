@@ -141,7 +141,7 @@ class Property:
                     Finding(error.rule or "LS414", error.reason, path, subject.sensor.id)
                 )
             except Exception as error:
-                findings.append(_unexpected_error(error, ".".join(case), subject))
+                findings.append(_make_unexpected_error(error, ".".join(case), subject))
         return findings
 
 
@@ -291,7 +291,7 @@ def _find_first_line(error: BaseException) -> str:
     return next(lines, type(error).__name__)
 
 
-def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
+def _make_unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
     """Return the finding for an undocumented exception.
 
     The finding has the file and line at which the plugin raised the exception, if any.

@@ -144,7 +144,7 @@ def _make_control_line(link: Link) -> OutletLine | None:
 
     Returns None for a link type that only a plugin supports.
     """
-    for port in (_declared_port(link), 0):
+    for port in (_find_declared_port(link), 0):
         with contextlib.suppress(OSError, SourceError):
             if isinstance(link, Tcp):
                 return TcpLine(LOCALHOST, port)
@@ -157,7 +157,7 @@ def _make_control_line(link: Link) -> OutletLine | None:
     return None
 
 
-def _declared_port(link: Link) -> int:
+def _find_declared_port(link: Link) -> int:
     """Return the port at which a sensor receives commands; 0 if it declares none."""
     if isinstance(link, Tcp | Http):
         return link.port

@@ -188,7 +188,7 @@ class Window:
         is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES
         width = columns - SIDE_COLUMNS - 1 if is_wide else columns
         height = max(lines - (1 if is_wide else 2), 1)
-        current_look = self._current_look()
+        current_look = self._get_current_look()
         window = CellGrid.blank(columns, lines)
         window.paste(1, 0, self._draw_picture(width, height, current_look))
         write_title(window, self._device.sensor.id, self._source, *self._describe_state())
@@ -213,7 +213,7 @@ class Window:
 
     def _handle_key(self, key: str) -> None:
         ramps = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
-        self.settings = self.settings.after_key(key, self._current_look().reach, ramps)
+        self.settings = self.settings.after_key(key, self._get_current_look().reach, ramps)
         if key in ("r", "R") and self._record is not None:
             self._record.toggle()
 
@@ -243,7 +243,7 @@ class Window:
             new = replace(new, full=old.full, low=min(old.low, new.low))
         self._look = new
 
-    def _current_look(self) -> CloudAppearance:
+    def _get_current_look(self) -> CloudAppearance:
         """Return the appearance of the picture, with the settings that keys have changed."""
         if self._look is None:
             return CloudAppearance("range", 1.0, 1.0)
@@ -281,9 +281,9 @@ class Window:
             WindowFigure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
             WindowFigure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
             *self._list_scan_figures(),
-            _rate_figure("errors", reading.error_rate if self._reading else None),
-            _rate_figure("skipped", reading.skipped_rate if self._reading else None),
-            self._lost_figure(reading),
+            _make_rate_figure("errors", reading.error_rate if self._reading else None),
+            _make_rate_figure("skipped", reading.skipped_rate if self._reading else None),
+            self._make_lost_figure(reading),
             WindowFigure("jitter", format_figure(reading.jitter_s, "{:.2f} ms", 1e3)),
         ]
         if self._device.queued is not None:
@@ -314,7 +314,7 @@ class Window:
             figures.insert(0, WindowFigure("calibration", "nominal", ALARM))
         return figures
 
-    def _lost_figure(self, reading: MeterReading) -> WindowFigure:
+    def _make_lost_figure(self, reading: MeterReading) -> WindowFigure:
         lost = self._device.stats.lost
         if lost:
             return WindowFigure("lost", str(lost), ALARM)
@@ -341,7 +341,7 @@ class Window:
         return ""
 
 
-def _rate_figure(name: str, rate: float | None) -> WindowFigure:
+def _make_rate_figure(name: str, rate: float | None) -> WindowFigure:
     is_alarm = rate is not None and rate >= ALARM_RATE
     return WindowFigure(name, format_figure(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
 

@@ -281,7 +281,7 @@ class Settings:
             UsageError, WireError, SourceError: if the sensor is not installed, does not accept an
                 option, or cannot be detected.
         """
-        sensor = self._configured_sensor()
+        sensor = self._configure_sensor()
         return detect(self["source"]) if sensor is None else sensor
 
     def find_known_sensor(self) -> Sensor | None:
@@ -291,10 +291,10 @@ class Settings:
             UsageError: if a sensor is not installed, or does not accept an option.
             SourceError: if a file cannot be opened.
         """
-        sensor = self._configured_sensor()
+        sensor = self._configure_sensor()
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
-    def _configured_sensor(self) -> Sensor | None:
+    def _configure_sensor(self) -> Sensor | None:
         """Return the sensor that the parameters name, with its options; None if none."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
