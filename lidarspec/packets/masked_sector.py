@@ -246,7 +246,7 @@ class GapLoss(Protocol):
 
 
 class MaskedGaps:
-    """Finds out which gaps in one stream are at the masked sector, and are not losses.
+    """Decides which gaps in one stream are at the masked sector, and which are losses.
 
     The packets may be in any order. A gap counts as a loss until it recurs one revolution later.
 
