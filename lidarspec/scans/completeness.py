@@ -87,7 +87,7 @@ class PacketCounts:
         return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
 
     def part(self, start: int, stop: int) -> PacketCounts:
-        """Return the counts of the packets from row `start` to before row `stop`."""
+        """Return the counts of the packets in rows `start` to `stop - 1`."""
         rows = slice(start, stop)
         return PacketCounts(
             self.times[rows],
