@@ -42,15 +42,15 @@ from lidarspec.spec.tree import FieldInfo
 
 Times = NDArray[np.int64]
 DAY_NS = DAY_S * 10**9
-#: Possible numbers of days in a year. The next constant has the possible numbers of days in a
-#: month.
+#: Possible numbers of days in a year.
 YEAR_DAYS = (365, 366)
+#: Possible numbers of days in a month.
 MONTH_DAYS = (28, 29, 30, 31)
 #: Maximum raw value to write.
 MAX_RAW = 2**63 - 1
-#: Maximum number of values of a field that are tried to find the values of a calculated status. The
-#: next constant is the maximum number of combinations of the values of several fields.
+#: Maximum number of values of one field that are tried to find the values of a calculated status.
 MAX_STATUS_VALUES = 16
+#: Maximum number of combinations of the values of several fields that are tried.
 MAX_STATUS_COMBINATIONS = 256
 #: Time difference that is added to test whether a clock can be written, ns. It is more than a
 #: second.

@@ -44,9 +44,9 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: Maximum duration of a batch of packets, in ns of the device's time. The next constant is the
-#: maximum number of packets in a batch.
+#: Maximum duration of a batch of packets, in ns of the device's time.
 MAX_BATCH_NS = SECOND // 4
+#: Maximum number of packets in a batch.
 MAX_BATCH_PACKETS = 128
 #: Number of fillers that are sent in a pause.
 PAUSE_FILLERS = 14

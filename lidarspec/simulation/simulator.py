@@ -66,11 +66,12 @@ CLOCK_TOLERANCE_NS = 1_000_000
 EXTRA_PACKETS = 1
 #: Maximum number of packets that are made to find the fields with ranges, and the packet rate.
 MAX_PROBED_PACKETS = 256
+#: Minimum number of these packets.
+MIN_PROBED_PACKETS = 4
+#: Maximum total size of these packets, unless fewer than the minimum number fit.
+MAX_PROBED_BYTES = 1 << 21
 #: Number of packets from which the fields of the clock are found.
 CLOCK_PROBE_PACKETS = 2
-#: Maximum total size of these packets. The next constant is their minimum number.
-MAX_PROBED_BYTES = 1 << 21
-MIN_PROBED_PACKETS = 4
 Floats = NDArray[np.float64]
 #: Maximum number of repeated measurements if directions depend on ranges.
 MAX_ROUNDS = 8
