@@ -52,15 +52,16 @@ _SIMPLE_PACKET = 3
 ENHANCED_PACKET = 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
 _LAST_KIND = 10  # the largest block type of the draft, apart from the section header
-#: Codes of options of an interface block: this constant and the next one.
+#: Code of the option of an interface block with the resolution of times.
 _TIME_RESOLUTION = 9
+#: Code of the option of an interface block with the offset of times.
 _TIME_OFFSET = 14
 
 MAX_BLOCK_BYTES = 1 << 20  # a packet with its options; longer blocks are skipped
 #: The number of offsets that are checked in one step of the search for the next record.
 _STEP_BYTES = 1 << 16
-#: The number of bytes after an offset that this check requires: a packet, its options and the
-#: header of the next packet.
+#: The number of bytes that the search has to read after an offset, to check whether a record begins
+#: there: a packet, its options and the header of the next packet.
 _REACH_BYTES = MAX_PACKET_BYTES + (1 << 12)
 #: The position that `seek_time` finds is at most this number of bytes before the packet.
 NEAR_BYTES = 1 << 21
@@ -70,8 +71,8 @@ _MAX_RECORD_STEP_S = 86_400
 _MAX_FILE_SPAN_S = 31_536_000
 _MAX_INTERFACES = 1024
 _SECOND_NS = 1_000_000_000
-#: The latest time that `TimeEncoding.ns` converts. Records with later times are read singly, so
-#: that no int64 overflows.
+#: The latest time that `TimeEncoding.read_ns` converts. Records with later times are read singly,
+#: so that no int64 overflows.
 _MAX_TIME_S = 4_000_000_000
 
 
@@ -333,7 +334,7 @@ class PcapngBlocks:
 
     Attributes:
         sections: number of sections that have begun.
-        order: the byte order of the section, as in `struct`.
+        order: the byte order of the current section, as in `struct`.
     """
 
     def __init__(self, source: BufferedInput) -> None:
