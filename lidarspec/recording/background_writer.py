@@ -23,9 +23,9 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-#: records are written when their total size reaches this limit. The next constant is the maximum
-#: time between writes.
+#: records are written when their total size reaches this limit.
 FLUSH_BYTES = 1 << 16
+#: maximum time between two writes.
 FLUSH_PERIOD_S = 0.2
 #: time between two calls of fsync.
 SYNC_PERIOD_S = 1.0
