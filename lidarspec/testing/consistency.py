@@ -146,10 +146,14 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         for path in values
         if path in fields and path in following and fields[path].unit in FULL_TURNS
     ]
-    angles = [path for path in candidates if not np.array_equal(values[path], following[path])]
-    if not angles or len({(fields[path].unit, fields[path].scale) for path in angles}) > 1:
+    angles = {
+        path: fields[path]
+        for path in candidates
+        if not np.array_equal(values[path], following[path])
+    }
+    if not angles or len({(info.unit, info.scale) for info in angles.values()}) > 1:
         return
-    info = fields[angles[0]]
+    info = next(iter(angles.values()))
     full = FULL_TURNS[info.unit]
     radians = 2 * np.pi / full
     still = _read_azimuths(subject, name, values)
@@ -184,14 +188,22 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
 
 
 def _turn_angles(
-    values: Mapping[str, Any], angles: list[str], shift: float, full: float
+    values: Mapping[str, Any], angles: Mapping[str, FieldInfo], shift: float, full: float
 ) -> dict[str, Any]:
     """Return a packet's values with `shift` added to its angles.
 
+    An angle that its field cannot represent becomes negative: 350 degrees become -10 degrees.
+
     Args:
+        angles: the fields of the angles, by path.
         full: the full circle, in the unit of the angles.
     """
-    return {**values, **{path: (np.asarray(values[path]) + shift) % full for path in angles}}
+    turned = dict(values)
+    for path, info in angles.items():
+        angle = (np.asarray(values[path]) + shift) % full
+        highest = max(info.physical(limit) for limit in info.limits)
+        turned[path] = np.where(angle > highest, angle - full, angle)
+    return turned
 
 
 def _read_azimuths(

@@ -25,6 +25,7 @@ from construct import (
     Float64l,
     GreedyBytes,
     Int8ul,
+    Int16sl,
     Int16ub,
     Int16ul,
     NullTerminated,
@@ -51,7 +52,7 @@ from lidarspec.spec import (
     Sum,
     take,
 )
-from lidarspec.testing import frames
+from lidarspec.testing import consistency, frames
 from lidarspec.testing.check import CheckTarget, iter_reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
@@ -692,3 +693,21 @@ def test_a_frame_around_a_sweep_has_as_many_elements_as_are_drawn(number: int) -
         random_frame(sensor, "data", random.Random(1), {"count": lambda _: number})
     )
     assert [sample.quality for sample in frame.samples] == [7] * number
+
+
+def test_angles_of_a_signed_field_are_turned_within_its_limits() -> None:
+    # Hundredths of a degree up to 327.67: an angle of 350 degrees is sent as -10 degrees.
+    signed = Scaled(Int16sl, 0.01, "deg")
+
+    def signed_sweep(number: int) -> dict[str, float]:
+        values = sound.sweep(number)
+        return {**values, **{name: (values[name] + 180) % 360 - 180 for name in ("first", "last")}}
+
+    def is_plausible(f: Fields) -> Any:
+        return (f.count >= 1) & (f.count <= sound.LONGEST) & (f.time < sound.WRAP)
+
+    sensor = sound.sensor(
+        sound.frame(sound.make_frame(first=signed, last=signed), plausible=is_plausible),
+        simulation=Simulation(signed_sweep),
+    )
+    consistency.turned_angles_turn_the_points(SensorUnderTest(sensor), "data")
