@@ -55,9 +55,9 @@ from lidarspec.formats.arrow_tables import iter_tables
 from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.remote_files import (
-    digest,
     files_in,
     find_files,
+    hash_ends,
     is_remote,
     normalise_path,
     open_stored,
@@ -150,7 +150,7 @@ class FilePiece:
             named = detect(self.source)
         return FileScans(self.source, named, self.bookmark)
 
-    def record(self, **more: Any) -> Record:
+    def make_record(self, **more: Any) -> Record:
         """Return the record of the piece for the manifest."""
         return {
             "source": self.source,
@@ -166,7 +166,7 @@ class FilePiece:
         reason = str(error)
         if not isinstance(error, LidarSpecError):
             reason = f"{type(error).__name__}: {error}"
-        return self.record(error=reason)
+        return self.make_record(error=reason)
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
         """Yield the selected scans of the piece, with their numbers in the file."""
@@ -210,7 +210,7 @@ def convert_piece(piece: FilePiece) -> Record:
     """Write the points of a piece, and return its record for the manifest."""
     counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
-        about = {**read_stamp(piece.source), "digest": digest(piece.source)}
+        about = {**read_stamp(piece.source), "digest": hash_ends(piece.source)}
         with piece.open_scans() as scans:
             counted = _count_scans(piece, piece.iter_numbered(scans), counts)
             first = next(counted, None)
@@ -218,7 +218,7 @@ def convert_piece(piece: FilePiece) -> Record:
                 raise WireError(f"no scan found: {scans.stats}")
             if first is not None:
                 _write(piece, itertools.chain([first], counted))
-            return piece.record(
+            return piece.make_record(
                 **about,
                 **counts,
                 output=piece.output if first is not None else None,
@@ -391,7 +391,7 @@ class Manifest:
         now = read_stamp(source)
         return bool(
             now["size"] == record["size"]
-            and (now["modified"] == record["modified"] or digest(source) == record["digest"])
+            and (now["modified"] == record["modified"] or hash_ends(source) == record["digest"])
         )
 
     def find_records(self, piece: FilePiece) -> list[Record]:

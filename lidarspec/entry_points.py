@@ -122,7 +122,7 @@ def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     is_damaged = "\ufffd" in text and group == GROUP
     if not is_damaged and f"[{group}]" not in text:
         return
-    name_and_version = _name_and_version(folder)
+    name_and_version = _read_name_and_version(folder)
     if is_damaged:
         yield EntryPoint("entry_points.txt", "", *name_and_version)
     section = ""
@@ -134,7 +134,7 @@ def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
             yield EntryPoint(name.strip(), value.strip(), *name_and_version)
 
 
-def _name_and_version(folder: str) -> tuple[str, str]:
+def _read_name_and_version(folder: str) -> tuple[str, str]:
     header = (_read_text(folder, "METADATA") or _read_text(folder, "PKG-INFO")).partition("\n\n")[0]
     fields = dict(re.findall(r"^(Name|Version):[ \t]*(.*?)[ \t\r]*$", header, re.MULTILINE))
     return fields.get("Name", "?"), fields.get("Version", "?")

@@ -319,7 +319,7 @@ class Registry:
         _check_hooks(plugin, name)
         try:
             self._manager.register(plugin, name)
-            sensors = self._sensors_of(plugin)
+            sensors = self._make_sensors(plugin)
         except BaseException as error:
             if self._manager.has_plugin(name):
                 self._manager.unregister(name=name)
@@ -369,7 +369,7 @@ class Registry:
         failed = next((plugin for plugin in tried if plugin.error), tried[0])
         return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}")
 
-    def _sensors_of(self, plugin: Any) -> list[Sensor]:
+    def _make_sensors(self, plugin: Any) -> list[Sensor]:
         function = getattr(plugin, "lidarspec_sensors", None)
         if function is not None and _is_hook(function):
             sensors = list(function())
@@ -597,15 +597,19 @@ class Registry:
         if not points.get_hookimpls():
             return replace(sensor, frames=frames, hooked=self.apply_hooks)
 
-        def ask(function: Any) -> Any:
+        def add_hooks(function: Any) -> Any:
             if isinstance(function, Mapping):
-                return {path: ask(own) for path, own in function.items()}
+                return {path: add_hooks(own) for path, own in function.items()}
             if function is None or isinstance(function, HookedPoints):
                 return function
             return HookedPoints(sensor, function, points)
 
-        frames = {name: replace(frame, points=ask(frame.points)) for name, frame in frames.items()}
-        return replace(sensor, frames=frames, points=ask(sensor.points), hooked=self.apply_hooks)
+        frames = {
+            name: replace(frame, points=add_hooks(frame.points)) for name, frame in frames.items()
+        }
+        return replace(
+            sensor, frames=frames, points=add_hooks(sensor.points), hooked=self.apply_hooks
+        )
 
     def call(self, hook: str, **arguments: Any) -> Any:
         """Call the hook with this name in all plugins, and return its result."""
@@ -1111,8 +1115,8 @@ def rebuild_sensor(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
     return installed.configure(**options) if options else installed
 
 
-def _reduce(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
+def _reduce_sensor(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
     return rebuild_sensor, (value.id, dict(value.options))
 
 
-copyreg.pickle(Sensor, _reduce)
+copyreg.pickle(Sensor, _reduce_sensor)

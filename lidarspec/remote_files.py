@@ -163,7 +163,7 @@ def read_stamp(path: str) -> dict[str, Any]:
     return {"size": info["size"], "modified": str(tag)}
 
 
-def digest(path: str) -> str:
+def hash_ends(path: str) -> str:
     """Return a hash of the beginning and the end of a file."""
     with contextlib.closing(open_stored(path)) as file:
         head = file.read(DIGESTED_END_BYTES)

@@ -35,7 +35,7 @@ from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, find_target, iter_reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
 from lidarspec.transports.open_url import open_transport
-from lidarspec.transports.protocol import Chunk, no_bytes
+from lidarspec.transports.protocol import Chunk, no_bytes_message
 
 #: Maximum number of bytes of a capture to analyse.
 MAX_CAPTURE_BYTES = 1 << 22
@@ -133,7 +133,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
         groups.values(), key=lambda group: sum(len(chunk.data) for chunk in group), default=[]
     )
     if not any(chunk.data for chunk in chunks):
-        raise WireError(no_bytes(capture, opened.warnings))
+        raise WireError(no_bytes_message(capture, opened.warnings))
     frame_draft = make_draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(
         f"{capture}: found {len(frame_draft.frames)} frames, which contain"

@@ -69,7 +69,7 @@ from lidarspec.scans.selection import (
 )
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
-from lidarspec.transports.protocol import Chunk, no_bytes
+from lidarspec.transports.protocol import Chunk, no_bytes_message
 
 #: How many types of parts a remark lists.
 MAX_LISTED_PARTS = 3
@@ -502,7 +502,8 @@ def _write_packets(
             raise WriteError(target, error.reason, "nothing was written") from None
         if not file.records:
             raise suggest(
-                WireError(no_bytes(source, opened.warnings)), f"lidarspec info {quote(source)}"
+                WireError(no_bytes_message(source, opened.warnings)),
+                f"lidarspec info {quote(source)}",
             )
     note(f"{target}: {file.records} packets, {format_size(file.bytes)}")
     for warning in opened.warnings:
@@ -629,7 +630,7 @@ def _make_no_data_error(device: Device, target: str, content: str = "") -> Excep
     source = str(device.source)
     if stats.bytes_in == 0:
         return suggest(
-            WireError(no_bytes(source, device.warnings), sensor=sensor.id),
+            WireError(no_bytes_message(source, device.warnings), sensor=sensor.id),
             f"lidarspec show {sensor.id}",
         )
     failure = stats.failure(sensor.id)

@@ -13,7 +13,7 @@ import traceback
 import click
 
 from lidarspec import errors
-from lidarspec.cli.terminal import note, voice
+from lidarspec.cli.terminal import note, verbosity
 from lidarspec.known_sensors import no_sensors_text
 
 FINDINGS = 1
@@ -47,8 +47,10 @@ def report(error: Exception, verb: str) -> int:
         ((code, command) for kind, code, command in CODES if isinstance(error, kind)),
         (FINDINGS, ""),
     )
-    is_detailed = voice.loudness > 0 or (not command and bool(os.environ.get("LIDARSPEC_DEBUG")))
-    voice.loudness = 0
+    is_detailed = verbosity.loudness > 0 or (
+        not command and bool(os.environ.get("LIDARSPEC_DEBUG"))
+    )
+    verbosity.loudness = 0
     if is_detailed:
         note("".join(traceback.format_exception(error)))
     if not command:

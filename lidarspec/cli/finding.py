@@ -17,7 +17,7 @@ from lidarspec.cli.failures import DEVICE, FINDINGS, NO_DATA
 from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
-from lidarspec.cli.terminal import note, voice
+from lidarspec.cli.terminal import note, verbosity
 from lidarspec.detect.doctor import examine, examine_computer
 from lidarspec.detect.identification import (
     Verdict,
@@ -48,10 +48,10 @@ from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, list_serial_ports
-from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.protocol import no_bytes_message
 
 #: A match with fewer bits of evidence may be a coincidence.
 WEAK_BITS = 12
@@ -99,7 +99,7 @@ def _list_sensors_at_port(port: int) -> list[str]:
     return [
         sensor.id
         for sensor in sensors().values()
-        if (link := data_link(sensor, Udp)) and port in link.ports
+        if (link := find_data_link(sensor, Udp)) and port in link.ports
     ]
 
 
@@ -189,7 +189,7 @@ def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     if path != "-" and not path.endswith(HEX):
         sample = max(read_samples(path), key=lambda sample: sample.size)
         if not sample.size:
-            raise suggest(WireError(no_bytes(path, sample.warnings)), "lidarspec sensors")
+            raise suggest(WireError(no_bytes_message(path, sample.warnings)), "lidarspec sensors")
         for warning in sample.warnings:
             note(warning)
         chunks = sample.chunks
@@ -395,7 +395,7 @@ def _format_detected(verdicts: Sequence[Verdict], output: str | None) -> str:
     for verdict in verdicts:
         alike = {score.sensor.id for score in verdict.candidates}
         listed = verdict.scores
-        if voice.loudness <= 0 and (verdict.candidates or verdict.others):
+        if verbosity.loudness <= 0 and (verdict.candidates or verdict.others):
             listed = verdict.candidates  # without the sensors that were ruled out
         for score in listed:
             if score.sensor.id not in alike:
@@ -411,7 +411,7 @@ def _format_detected(verdicts: Sequence[Verdict], output: str | None) -> str:
                     verdict_of,
                     f"{score.share:.1%}",
                     str(score.data_frames),
-                    score.why,
+                    score.evidence,
                 ]
             )
         verdict_of = "perhaps" if alike else "yes"
@@ -494,7 +494,7 @@ def _iter_conclusions(
     has_warnings = any(verdict.sample.warnings for verdict in verdicts)
     if source is not None and live_address(source) is None:
         if not has_warnings:
-            yield no_bytes(source, ())
+            yield no_bytes_message(source, ())
         yield "next: lidarspec sensors"
         return
     if not has_warnings:
@@ -553,7 +553,7 @@ def _format_source(verdict: Verdict) -> str:
     """Return the SOURCE of a verdict, with baud rate and sender, for use in a command."""
     source = verdict.sample.source
     sample = verdict.sample
-    link = data_link(verdict.sensor, Serial)
+    link = find_data_link(verdict.sensor, Serial)
     if (
         sample.baud is not None
         and "baud=" not in source
@@ -583,7 +583,7 @@ def _verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
                 "sensor": score.sensor.id,
                 "share": round(score.share, 4),
                 "data_frames": score.data_frames,
-                "told_by": score.why,
+                "told_by": score.evidence,
             }
             for score in verdict.scores
         ],

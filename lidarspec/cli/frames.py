@@ -91,7 +91,7 @@ def _iter_tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | Non
     for index, piece in enumerate(frames):
         field_values = read_values(piece.data, sensor, piece.frame).values()
         rows = [
-            [value.path, _raw_text(value.raw), str(value) if value.has_meaning else ""]
+            [value.path, _format_raw(value.raw), str(value) if value.has_meaning else ""]
             for value in field_values
         ]
         yield (
@@ -466,7 +466,7 @@ def _format_title(sensor: Sensor, piece: InputPiece, frame: str) -> str:
     )
 
 
-def _raw_text(raw: Any) -> str:
+def _format_raw(raw: Any) -> str:
     if not isinstance(raw, bytes | bytearray):
         return str(raw)
     if len(raw) <= 2 * LINE_BYTES:

@@ -46,7 +46,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal, parse_hex
-from lidarspec.transports.protocol import Chunk, no_bytes
+from lidarspec.transports.protocol import Chunk, no_bytes_message
 
 if TYPE_CHECKING:
     from lidarspec.device.device import Device
@@ -270,7 +270,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
     command = f"lidarspec explain {quote(sample.source)} -s {sensor.id}"
     if not data:
         return suggest(
-            WireError(no_bytes(sample.source, sample.warnings), sensor=sensor.id),
+            WireError(no_bytes_message(sample.source, sample.warnings), sensor=sensor.id),
             f"lidarspec build {sensor.id} --help",
         )
     if (fault := _make_wrong_checksums_error(sample)) is not None:
@@ -302,7 +302,9 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
     from lidarspec.detect.uninstalled_sensors import suggest_installation
 
     if not sample.data:
-        return suggest(WireError(no_bytes(sample.source, sample.warnings)), "lidarspec sensors")
+        return suggest(
+            WireError(no_bytes_message(sample.source, sample.warnings)), "lidarspec sensors"
+        )
     if (fault := _make_wrong_checksums_error(sample)) is not None:
         return fault
     best = find_nearest_fault(sample.data)
@@ -357,7 +359,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
         if stats.bytes_in:
             reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
         else:
-            reason = no_bytes(source, device.warnings)
+            reason = no_bytes_message(source, device.warnings)
         return suggest(
             WireError(reason, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
         )

@@ -45,7 +45,7 @@ def configuration_options(function: Function) -> Function:
             *args, sensor_id=configure_sensor(sensor_id, options, calibration), **others
         )
 
-    return _make_optional(call_with_sensor)  # type: ignore[return-value]
+    return _add_configuration_options(call_with_sensor)  # type: ignore[return-value]
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -54,7 +54,7 @@ def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
     The verb gets the arguments `sensor_id`, `options` and `calibration`, as texts, and can pass
     them to `configure_sensor`.
     """
-    return _add_sensor_option(_make_optional(function))
+    return _add_sensor_option(_add_configuration_options(function))
 
 
 def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -62,7 +62,7 @@ def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=help_text)(function)
 
 
-def _make_optional(function: Callable[..., Any]) -> Callable[..., Any]:
+def _add_configuration_options(function: Callable[..., Any]) -> Callable[..., Any]:
     unit = click.option(
         "--calibration",
         metavar="FILE",

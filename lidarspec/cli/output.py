@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lidarspec.cli.terminal import note, say, voice
+from lidarspec.cli.terminal import note, say, verbosity
 from lidarspec.errors import printable, system_errors
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
     """
 
     def __init__(self, unit: Callable[[float], str] = str, period: float = UPDATE_PERIOD_S) -> None:
-        self._is_shown = sys.stderr.isatty() and voice.loudness >= 0
+        self._is_shown = sys.stderr.isatty() and verbosity.loudness >= 0
         self._due = 0.0
         self._unit = unit
         self._period = period

@@ -83,7 +83,7 @@ def record(
     """
     check_suffix(target)
     if times is not None:
-        raise _slice_error(source, target, times)
+        raise _make_slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
     configured_device = find_device(source)
     sensor: Sensor | None = None
@@ -129,7 +129,7 @@ def record(
         raise click.exceptions.Exit(INTERRUPTED)
 
 
-def _slice_error(source: str, target: str, times: str) -> UsageError:
+def _make_slice_error(source: str, target: str, times: str) -> UsageError:
     """Return the error for `record --slice`, which suggests a command that works."""
     if is_live(source):
         return suggest(

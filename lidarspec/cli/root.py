@@ -18,7 +18,7 @@ import click
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, report
-from lidarspec.cli.terminal import discard_output, note, prepare_streams, say, voice
+from lidarspec.cli.terminal import discard_output, note, prepare_streams, say, verbosity
 from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean, suggest
 from lidarspec.known_sensors import install_command
@@ -115,7 +115,7 @@ def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Optio
 
     def set_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value:
-            voice.loudness = loudness
+            verbosity.loudness = loudness
 
     return click.Option(names, is_flag=True, expose_value=False, callback=set_verbosity, help=help)
 
@@ -218,19 +218,19 @@ class Verbs(click.Group):
 
             sys.exit(complete(self, instruction))
         words = list(sys.argv[1:] if args is None else args)
-        sys.exit(_run(self, words))
+        sys.exit(_run_verb(self, words))
 
 
 def _load_verb(entry: EntryPoint) -> str:
     return f"From the plugin {entry.distribution} {entry.version}."
 
 
-def _run(group: click.Group, words: list[str]) -> int:
+def _run_verb(group: click.Group, words: list[str]) -> int:
     began = time.monotonic()
     try:
         with prepare_streams(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
-            if voice.loudness > 0:
+            if verbosity.loudness > 0:
                 note(_format_cost(time.monotonic() - began))
         return 0
     except click.exceptions.Exit as done:

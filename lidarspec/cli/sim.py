@@ -36,7 +36,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, Outlet, has_terminals
 from lidarspec.transports.serving import serve
@@ -318,7 +318,7 @@ def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[
         harm = "of the datagrams were lost"
     else:
         harm = "of the bytes were damaged"
-    lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
+    lacks_pty = find_data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
         where = f"{result.address} (this system has no pseudo-terminals)"
     else:

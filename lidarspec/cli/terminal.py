@@ -32,7 +32,7 @@ class Verbosity:
     loudness = 0
 
 
-voice = Verbosity()
+verbosity = Verbosity()
 #: Matches an escape sequence that changes only colours.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
@@ -65,7 +65,7 @@ def note(text: str) -> None:
 
     If standard error is closed, nothing is printed.
     """
-    if voice.loudness < 0:
+    if verbosity.loudness < 0:
         return
     try:
         click.echo(printable(text), err=True)
@@ -83,7 +83,7 @@ def prepare_streams() -> Iterator[None]:
         BrokenPipeError: if the reader has closed the pipe.
         SourceError: if output cannot be written for another reason.
     """
-    voice.loudness = 0
+    verbosity.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:
             # Otherwise a file that is opened later would get the descriptor of the closed stream,

@@ -33,9 +33,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
 from lidarspec.transports.addresses import SourceAddress, with_option
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.open_url import live_address, resolve
-from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.protocol import no_bytes_message
 from lidarspec.transports.udp import (
     REQUESTED_BUFFER_BYTES,
     describe_small_buffer,
@@ -128,7 +128,7 @@ def _examine_file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
         yield from _check_single_sender(path, verdicts)
         texts = list(largest.sample.warnings)
         if not texts and not largest.sample.size:
-            texts = [no_bytes(path, ())]
+            texts = [no_bytes_message(path, ())]
         for text in texts:
             yield Diagnosis(False, text)
 
@@ -222,7 +222,7 @@ def _select_udp_ports(address: SourceAddress, sensor: Sensor | None) -> list[int
     text = address.options.get("port", "")
     if text:
         return [int(part) for part in text.split(",") if part.isdecimal()]
-    link = data_link(sensor, Udp)
+    link = find_data_link(sensor, Udp)
     if port:
         return [port]
     if link:
@@ -350,7 +350,9 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
     sample = verdict.sample
     ids = [score.sensor.id for score in verdict.scores]
     # id of each possible sensor -> evidence
-    possible = {score.sensor.id: score.why for score in verdict.candidates} or dict(verdict.others)
+    possible = {score.sensor.id: score.evidence for score in verdict.candidates} or dict(
+        verdict.others
+    )
     quoted = quote(source)
     if not sample.size and sample.warnings:
         return Diagnosis(
@@ -390,7 +392,7 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
         text = f"received frames of {other}{rate}, not of {name}; evidence: {why}"
         return Diagnosis(False, text, command)
     score = next(score for score in verdict.scores if score.sensor.id == name)
-    link = data_link(score.sensor, Serial)
+    link = find_data_link(score.sensor, Serial)
     if sample.baud is not None and link and sample.baud not in link.bauds:
         again = quote(with_option(source, "baud", sample.baud))
         return Diagnosis(
@@ -411,7 +413,7 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
         )
     device = "".join(
         f", {name} {text}"
-        for name, text in read_info(score.sensor, score.found).items()
+        for name, text in read_info(score.sensor, score.frames).items()
         if name in IDENTITY
     )
     return Diagnosis(

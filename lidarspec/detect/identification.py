@@ -49,10 +49,10 @@ from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
 from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, open_transport, resolve
-from lidarspec.transports.protocol import no_bytes
+from lidarspec.transports.protocol import no_bytes_message
 
 #: The relative tolerance of the clock step per packet.
 PACE_TOLERANCE = 0.03
@@ -411,15 +411,15 @@ class Score:
         sensor: the sensor.
         share: the share of the bytes that are in frames of the sensor.
         data_frames: number of decoded data frames.
-        found: all decoded frames.
-        why: further evidence for this sensor; "" without any.
+        frames: all decoded frames.
+        evidence: further evidence for this sensor; "" without any.
     """
 
     sensor: Sensor
     share: float
     data_frames: int
-    found: tuple[Found, ...] = ()
-    why: str = ""
+    frames: tuple[Found, ...] = ()
+    evidence: str = ""
 
 
 @dataclass(frozen=True)
@@ -497,9 +497,9 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     ]
     if not matches or _score(matches[0].sensor, chunks, datagrams=datagrams) is not None:
         return ""
-    names = [item.frame for item in matches[0].found]
+    names = [item.frame for item in matches[0].frames]
     name = max(set(names), key=names.count)
-    frames = [item.data for item in matches[0].found if item.frame == name]
+    frames = [item.data for item in matches[0].frames if item.frame == name]
     ids = " or ".join(score.sensor.id for score in matches)
     text = (
         f"{len(frames)} {name} frames have the constants and lengths of {ids}, but all have wrong"
@@ -608,23 +608,25 @@ def identify_sample(sample: SampleBytes) -> Verdict:
             sample, fault=find_wrong_checksums(sample.chunks, datagrams=sample.datagrams)
         )
     result = distinguish(
-        [score.sensor for score in best], {score.sensor.id: score.found for score in best}
+        [score.sensor for score in best], {score.sensor.id: score.frames for score in best}
     )
     possible = [
-        replace(score, why=result.candidates[score.sensor.id])
+        replace(score, evidence=result.candidates[score.sensor.id])
         for score in best
         if score.sensor.id in result.candidates
     ]
     if len(possible) > 1 and sample.baud is not None:
         why = f"the sensor sends at {sample.baud} baud"
-        links = [(score, data_link(score.sensor, Serial)) for score in possible]
+        links = [(score, find_data_link(score.sensor, Serial)) for score in possible]
         possible = [
-            replace(score, why=why) for score, link in links if link and sample.baud in link.bauds
+            replace(score, evidence=why)
+            for score, link in links
+            if link and sample.baud in link.bauds
         ] or possible
     possible = [
         replace(
             score,
-            why=score.why
+            evidence=score.evidence
             or ", ".join(f"{name}={value}" for name, value in score.sensor.options.items()),
         )
         for score in possible
@@ -806,7 +808,7 @@ def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception
         )
         return suggest_installation(error, largest)
     if live_address(source) is None:
-        return WireError(no_bytes(source, largest.warnings))
+        return WireError(no_bytes_message(source, largest.warnings))
     if largest.warnings:
         why = largest.warnings[0]
     else:

@@ -22,9 +22,9 @@ from lidarspec.plugins import sensors
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.open_url import live_address, open_live, open_transport
-from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
+from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, name_senders
 
 #: The maximum number of datagrams to read from a file.
 MAX_FILE_DATAGRAMS = 400
@@ -63,7 +63,7 @@ def list_bauds() -> list[int]:
 
 def list_udp_ports() -> list[int]:
     """Return the UDP ports that installed sensors declare for data."""
-    links = (data_link(sensor, Udp) for sensor in sensors().values())
+    links = (find_data_link(sensor, Udp) for sensor in sensors().values())
     return sorted({port for link in links if link for port in link.ports})
 
 
@@ -171,7 +171,7 @@ def _split_by_sender(sample: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[S
 
     With only one sender, the attribute `sender` is "".
     """
-    names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
+    names = name_senders((chunk.sender, chunk.receiver) for chunk in chunks)
     by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
     for chunk in chunks:
         by_sender[names[chunk.sender]].append(chunk)
@@ -222,7 +222,7 @@ def list_start_required() -> list[Sensor]:
         for sensor in sensors().values()
         if any(sensor.commands[name].starts for name in sensor.on_open)
     ]
-    return [sensor for sensor in started if data_link(sensor, Serial)]
+    return [sensor for sensor in started if find_data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[SampleBytes]:
@@ -240,7 +240,7 @@ def probe(source: str | Path) -> Iterator[SampleBytes]:
         return
     ignores_baud = has_no_baud(address.location)
     for sensor in list_start_required():
-        link = data_link(sensor, Serial)
+        link = find_data_link(sensor, Serial)
         for baud in link.bauds if link else ():
             commands = [sensor.command(name) for name in sensor.on_open]
             attempt = (None if ignores_baud else baud, *commands)

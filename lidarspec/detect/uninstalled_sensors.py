@@ -84,9 +84,9 @@ def _measure_share(row: KnownSensor, sample: SampleBytes) -> float:
     if is_datagram != sample.datagrams:
         return 0.0
     if sample.datagrams:
-        measure = _share_of_datagrams
+        measure = _measure_datagrams
     else:
-        measure = _share_of_stream
+        measure = _measure_stream
     return max((measure(signature, sample) for signature in row.signatures), default=0.0)
 
 
@@ -97,7 +97,7 @@ def _make_pattern(sync: str) -> bytes:
     )
 
 
-def _share_of_datagrams(signature: Signature, sample: SampleBytes) -> float:
+def _measure_datagrams(signature: Signature, sample: SampleBytes) -> float:
     begins = re.compile(_make_pattern(signature.sync), re.DOTALL)
     if signature.size:
         sizes = {signature.size}
@@ -109,7 +109,7 @@ def _share_of_datagrams(signature: Signature, sample: SampleBytes) -> float:
     return count / len(sample.chunks)
 
 
-def _share_of_stream(signature: Signature, sample: SampleBytes) -> float:
+def _measure_stream(signature: Signature, sample: SampleBytes) -> float:
     data = sample.data
     offsets = [
         match.start()

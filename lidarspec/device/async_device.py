@@ -113,7 +113,7 @@ class AsyncDevice:
         else:
             deadline = time.monotonic() + timeout
         while self._newest is None:
-            await _run(self._reading, partial(self._find_newest, deadline))
+            await _run_in_thread(self._reading, partial(self._find_newest, deadline))
         newest = self._newest
         self._newest = None
         return newest
@@ -121,23 +121,25 @@ class AsyncDevice:
     async def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """Send a command and return the reply; see `Device.send`."""
         send = partial(self.device.send, name, timeout=timeout, **arguments)
-        return await _run(self._sending, send)
+        return await _run_in_thread(self._sending, send)
 
     async def write(self, data: bytes, link: str = "data") -> None:
         """Send bytes as they are; see `Device.write`."""
-        await _run(self._sending, partial(self.device.write, data, link))
+        await _run_in_thread(self._sending, partial(self.device.write, data, link))
 
     async def close(self) -> None:
         """Stop the sensor and close the source; see `Device.close`."""
         if self._device is not None:
-            await _finish(asyncio.get_running_loop().run_in_executor(None, self._device.close))
+            await _await_result(
+                asyncio.get_running_loop().run_in_executor(None, self._device.close)
+            )
         self._reading.shutdown(wait=False)
         self._sending.shutdown(wait=False)
 
     async def __aenter__(self) -> AsyncDevice:
         opening = asyncio.get_running_loop().run_in_executor(self._sending, self._opening)
         try:
-            self._device = await _finish(opening)
+            self._device = await _await_result(opening)
         except BaseException:
             is_open = opening.done() and not opening.cancelled() and opening.exception() is None
             if is_open:
@@ -170,7 +172,7 @@ class AsyncDevice:
                 yield iterator.items.popleft()
             if iterator.ended:
                 return
-            await _run(self._reading, iterator.find_next)
+            await _run_in_thread(self._reading, iterator.find_next)
 
     def _find_newest(self, deadline: float | None) -> None:
         """Wait up to `_MAX_WAIT_S` for the newest scan; called in a worker thread."""
@@ -215,11 +217,11 @@ class _ThreadedIterator(Generic[T]):
             self.items.append(item)
 
 
-async def _run(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
+async def _run_in_thread(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
     return await asyncio.get_running_loop().run_in_executor(executor, function)
 
 
-async def _finish(future: asyncio.Future[T]) -> T:
+async def _await_result(future: asyncio.Future[T]) -> T:
     """Return the result of a future.
 
     If the caller is cancelled, CancelledError is raised only after the future is done. Otherwise, a

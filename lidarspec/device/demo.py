@@ -27,7 +27,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec.links import Serial, Tcp
-from lidarspec.transports.base import data_link
+from lidarspec.transports.base import find_data_link
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
@@ -96,7 +96,7 @@ def demonstrate(
         recorded_bytes = path.stat().st_size
         with open_device(path, sensor) as recording:
             whole_scans = (scan for scan in recording.scans() if scan.whole)
-            recorded_digest = digest(list(itertools.islice(whole_scans, turns)))
+            recorded_digest = hash_points(list(itertools.islice(whole_scans, turns)))
     return Demonstration(
         sensor,
         address,
@@ -105,13 +105,13 @@ def demonstrate(
         stats,
         sent=line.sent,
         intact=line.intact,
-        digest=digest([scan for scan in scans if scan.whole]),
+        digest=hash_points([scan for scan in scans if scan.whole]),
         recorded_digest=recorded_digest,
         recorded_bytes=recorded_bytes,
     )
 
 
-def digest(scans: Sequence[Scan]) -> str:
+def hash_points(scans: Sequence[Scan]) -> str:
     """Return the SHA-256 of the coordinates, ranges and intensities of scans."""
     hasher = hashlib.sha256()
     for scan in scans:
@@ -134,12 +134,12 @@ def _run_live(
             )
             served = stack.enter_context(Served(simulated, outlet))
             return outlet.source, *_read(device, served, turns)
-    if has_terminals() and data_link(sensor, Serial):
+    if has_terminals() and find_data_link(sensor, Serial):
         destination = "pty"
     else:
         destination = f"tcp://{LOCALHOST}:0"
     # A connection whose port is reported is opened only after a command.
-    link = data_link(sensor, Tcp)
+    link = find_data_link(sensor, Tcp)
     patient = link is None or not link.reported
     with (
         Served(simulated, make_simulated_outlet(sensor, destination), patient=patient) as served,

@@ -173,7 +173,7 @@ class FileScans(ClosingContext):
     def _resume(self, bookmark: bytes) -> None:
         opened = self._transport
         assert isinstance(opened, FileTransport)
-        loaded = _Loader(
+        loaded = _StateUnpickler(
             io.BytesIO(bookmark), self._sensor, self._input.decoder, opened.file
         ).load()
         self._input.decoder, self._input.senders, reader, self._reader, self._stream = loaded
@@ -262,7 +262,7 @@ class _StatePickler(pickle.Pickler):
         return NotImplemented
 
 
-class _Loader(pickle.Unpickler):
+class _StateUnpickler(pickle.Unpickler):
     """Unpickles the state of a reader, for the same sensor."""
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:

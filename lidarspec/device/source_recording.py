@@ -108,7 +108,7 @@ class TimedLog:
             return None
         return (self.last - self.first) / 1e9
 
-    def has(self, chunk: Chunk) -> bool:
+    def contains(self, chunk: Chunk) -> bool:
         """Return whether a received chunk is in the file."""
         return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
@@ -241,7 +241,7 @@ class SourceRecording:
         Returns:
             Whether the file may contain more packets.
         """
-        arrived = _next_arrival_times(device)
+        arrived = _read_arrival_times(device)
         if len(arrived) == 0:
             return False
         count = int(np.count_nonzero(arrived <= (log.last or 0)))
@@ -305,7 +305,7 @@ class SourceRecording:
                 raise item
             if isinstance(item, LinkEvent):
                 events.append(item)
-            elif source.datagrams and log.has(item):
+            elif source.datagrams and log.contains(item):
                 self.packets += 1
         return events
 
@@ -363,7 +363,7 @@ class SourceRecording:
         return is_late or (self._count is not None and self.packets >= self._count)
 
 
-def _next_arrival_times(device: Device) -> NDArray[np.int64]:
+def _read_arrival_times(device: Device) -> NDArray[np.int64]:
     """Return the arrival times of the next packets, (n,) ns since 1970.
 
     If the sensor has no points, they are the arrival times of `Sensor.main_frames`.

@@ -30,10 +30,10 @@ class StreamTransport(LiveTransport):
     """Base class for byte streams, which pauses for a short time after each read.
 
     Attributes:
-        gone: the exceptions that reading raises if the device is disconnected.
+        disconnect_errors: the exceptions that reading raises if the device is disconnected.
     """
 
-    gone: tuple[type[BaseException], ...] = (OSError, ValueError)
+    disconnect_errors: tuple[type[BaseException], ...] = (OSError, ValueError)
 
     def __init__(self, label: str, sensor: Sensor | None) -> None:
         self.label = label
@@ -45,7 +45,7 @@ class StreamTransport(LiveTransport):
         sleep_until(self._pause_end_s)
         try:
             data = self._receive(timeout)
-        except self.gone as error:
+        except self.disconnect_errors as error:
             if self.closed:
                 return []
             raise disconnected_error(self.label, error) from None
@@ -125,7 +125,7 @@ def error_numbers(error: BaseException) -> list[int]:
     return [number for number in error.args if isinstance(number, int)]
 
 
-def data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
+def find_data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
     """Return the data link of a sensor if it is of this kind, else None."""
     if sensor is not None:
         link = sensor.links.get("data")

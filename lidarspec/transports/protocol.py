@@ -66,7 +66,7 @@ def endpoint(sender: Sender) -> str:
     return f"{sender[0]}:{sender[1]}"
 
 
-def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
+def name_senders(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
     """Return a name for each sender: its address, or ADDRESS:PORT if necessary.
 
     The name includes the port if several ports of the address send to the same receiving port. The
@@ -226,7 +226,7 @@ class Transport(ABC):
         """Close the port, socket or file."""
 
 
-def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
+def no_bytes_message(source: str | Path, warnings: Sequence[str]) -> str:
     """Return the error message for a file without bytes.
 
     Args:

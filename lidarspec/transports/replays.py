@@ -16,7 +16,7 @@ from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import Outlet
-from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
+from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, name_senders
 
 _SECOND_NS = 1_000_000_000
 #: A chunk is counted as late if it is sent more than this time after its deadline.
@@ -146,7 +146,7 @@ class Replay:
     @property
     def senders(self) -> set[str]:
         """The names of the recorded senders of datagrams."""
-        return set(sender_names(self._endpoints).values()) - {""}
+        return set(name_senders(self._endpoints).values()) - {""}
 
     def run(self) -> Iterator[str]:
         """Send the file once, or repeatedly if `loop` is set.

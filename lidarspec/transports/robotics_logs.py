@@ -279,16 +279,17 @@ def _has_packets(types: Mapping[str, Any], name: str) -> bool:
     fields = dict(types[name][1])
     packet_type: Any = None
     if "packets" in fields:
-        packet_type = _element_type(fields.get("packets"))
+        packet_type = _find_element_type(fields.get("packets"))
     elif "packet" in name.lower():
         packet_type = name
     packet_fields = dict(types[packet_type][1]) if packet_type in types else {}
     return any(
-        _element_type(packet_fields.get(field_name)) == ("uint8", 0) for field_name in DATA_FIELDS
+        _find_element_type(packet_fields.get(field_name)) == ("uint8", 0)
+        for field_name in DATA_FIELDS
     )
 
 
-def _element_type(field: Any) -> Any:
+def _find_element_type(field: Any) -> Any:
     """Return the element type of an array field; None for other fields.
 
     Returns:

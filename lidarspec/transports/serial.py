@@ -24,9 +24,9 @@ from lidarspec.spec.links import Serial
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import (
     StreamTransport,
-    data_link,
     disconnected_error,
     error_numbers,
+    find_data_link,
     sensor_option,
     source_error,
     system_reason,
@@ -40,7 +40,7 @@ except ImportError:  # no POSIX
     TermiosError = OSError  # type: ignore[assignment,misc]
 
 #: the exceptions that a port raises if the device has disappeared.
-GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
+DISCONNECT_ERRORS = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
 #: maximum number of bytes per read.
 MAX_READ_BYTES = 1 << 16
 #: maximum time until a device has accepted written bytes.
@@ -66,7 +66,7 @@ class SerialTransport(StreamTransport):
     """
 
     baud: int
-    gone = GONE
+    disconnect_errors = DISCONNECT_ERRORS
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class SerialTransport(StreamTransport):
                 self._send(self._port.fileno(), memoryview(data))
             else:
                 self._port.write(data)
-        except GONE as error:
+        except DISCONNECT_ERRORS as error:
             raise disconnected_error(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
@@ -116,7 +116,7 @@ class SerialTransport(StreamTransport):
             self._levels[name] = level
             try:
                 setattr(self._port, name, level)
-            except GONE as error:
+            except DISCONNECT_ERRORS as error:
                 has_no_lines = {errno.ENOTTY, errno.EINVAL} & set(error_numbers(error))
                 if not has_no_lines:  # pseudo-terminals have no control lines
                     raise disconnected_error(self.label, error) from None
@@ -130,7 +130,7 @@ class SerialTransport(StreamTransport):
         self._close_port()
 
     def _close_port(self) -> None:
-        with contextlib.suppress(*GONE):
+        with contextlib.suppress(*DISCONNECT_ERRORS):
             self._port.close()
 
     def _open(self) -> serial.Serial:
@@ -143,8 +143,8 @@ class SerialTransport(StreamTransport):
                 setattr(port, name, level)
         try:
             port.open()
-        except GONE as error:
-            with contextlib.suppress(*GONE):
+        except DISCONNECT_ERRORS as error:
+            with contextlib.suppress(*DISCONNECT_ERRORS):
                 port.close()
             raise self._make_open_error(error) from None
         return port
@@ -205,7 +205,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
         SourceError: if the port cannot be opened.
     """
     address.check(OPTIONS)
-    declared = data_link(sensor, Serial)
+    declared = find_data_link(sensor, Serial)
     baud = address.number("baud", 50, 20_000_000) or (declared.baud if declared else None)
     if not address.location:
         raise UsageError(f"{address.text}: expected a port, as in serial:///dev/ttyUSB0")

@@ -83,7 +83,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
     """Open a simulated device; yield the commands sent to it, and the data that it sends."""
     sensor = device.sensor
     start_ns = time.time_ns()
-    opening = _commands_on_open(sensor)
+    opening = _list_opening_commands(sensor)
     now = 0
     device.utc_offset_ns = start_ns
     device.start(now)
@@ -98,7 +98,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
             yield chunk, "in"
 
 
-def _commands_on_open(sensor: Sensor) -> list[str]:
+def _list_opening_commands(sensor: Sensor) -> list[str]:
     """Return the opening commands of a sensor that do more than set control lines."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
@@ -123,7 +123,9 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
             " commands: run sim without --to, and send commands to it"
         )
     recognized = ", ".join(device.commands_received) or "no command"
-    missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
+    missed = [
+        name for name in _list_opening_commands(sensor) if name not in device.commands_received
+    ]
     cause = f"the sensor received {recognized}, and sends no data until another command starts it"
     if missed:
         cause = f"the command {missed[0]!r} was sent, but the sensor recognized {recognized}"

@@ -14,8 +14,8 @@ from lidarspec.spec.links import Tcp
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import (
     StreamTransport,
-    data_link,
     disconnected_error,
+    find_data_link,
     sensor_option,
     source_error,
     system_reason,
@@ -156,7 +156,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
     """
     address.check(())
     host, port = address.host_and_port()
-    link = data_link(sensor, Tcp)
+    link = find_data_link(sensor, Tcp)
     if port is None and link is not None and link.port:
         port = link.port
     is_reported = link is not None and bool(link.reported)

@@ -117,7 +117,7 @@ def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
     )[:, 0]
     dots = {
         "c": column,
-        "cmap": colour_map(),
+        "cmap": make_colour_map(),
         "s": np.clip(20000 / max(len(cloud), 1), 0.4, 6),
         "linewidths": 0,
         "vmin": look.low,
@@ -224,7 +224,7 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
         edges,
         np.ma.masked_equal(counts, 0),
         norm=colours,
-        cmap=colour_map(),
+        cmap=make_colour_map(),
         rasterized=True,
     )
     medians = [
@@ -349,7 +349,7 @@ class RateSeries:
         return np.arange(counts.shape[1] + 1) * self.width, counts
 
 
-def colour_map() -> Any:
+def make_colour_map() -> Any:
     """Return the colour map for matplotlib on a white background."""
     colours = import_library("matplotlib.colors", "plot")
     return colours.ListedColormap(

@@ -170,7 +170,7 @@ class _ViewDrawer:
         for radius in radii:
             text = f"{radius:g} m"
             away = radius * scale
-            width = _text_width(text)
+            width = _estimate_text_width(text)
             right = (across + away - 3 - width, down - 4)
             leftward = (across - away + 3, down - 4)
             ahead = (across + 6, down - away + 14)
@@ -295,7 +295,7 @@ class _Labels:
             positions: possible positions of the left end of the base line, in pixels.
         """
         for left, base in positions:
-            right = left + _text_width(text)
+            right = left + _estimate_text_width(text)
             top = base - FONT_HEIGHT_PX
             if left < 0 or right > self._side or top < self._top or base > self._bottom:
                 continue
@@ -309,7 +309,7 @@ class _Labels:
             return
 
 
-def _text_width(text: str) -> float:
+def _estimate_text_width(text: str) -> float:
     """Return the approximate width of a text in pixels."""
     return CHARACTER_WIDTH_PX * len(text)
 

@@ -157,7 +157,7 @@ def test_clocks_tell_twins_apart(name: str) -> None:
     data = simulate(sensor, 60, start=7)
     found = identify_sample(SampleBytes("", tuple(data), datagrams=sensor.datagrams))
     assert found.sensor is sensor
-    assert "the clock advances by" in found.candidates[0].why
+    assert "the clock advances by" in found.candidates[0].evidence
 
 
 def old_firmware(
@@ -194,7 +194,7 @@ def test_the_clock_identifies_a_model_on_a_bad_network(
     as_it_comes: Callable[[list[bytes]], list[bytes]],
 ) -> None:
     found = identify_sample(SampleBytes("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
-    assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
+    assert (found.sensor and found.sensor.id, found.candidates[0].evidence) == (
         "velodyne-vlp16",
         "the clock advances by 1.33 ms per packet",
     )
@@ -268,12 +268,12 @@ def test_the_baud_rate_decides_between_equal_candidates() -> None:
     assert {score.sensor.id for score in found.candidates} == {
         f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")
     }
-    assert found.candidates[0].why == "the sensor sends at 1000000 baud"
+    assert found.candidates[0].evidence == "the sensor sends at 1000000 baud"
     named = sensor.build(
         "info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16)
     )
     found = identify_sample(SampleBytes("", (named, *data), baud=1_000_000))
-    assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
+    assert (found.sensor and found.sensor.id, found.candidates[0].evidence) == (
         "slamtec-rplidar-s3",
         "info.model is RPLIDAR S3, S3M1",
     )
@@ -389,7 +389,7 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
         assert made.device.commands_received == []
         heard = next(heard for heard in probe(made.path) if heard.size)
         found = identify_sample(heard)
-        assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
+        assert (found.sensor and found.sensor.id, found.candidates[0].evidence) == (
             "cspc-m1c1-mini",
             "info.model is M1C1_Mini",
         )

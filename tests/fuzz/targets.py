@@ -41,7 +41,7 @@ from lidarspec.recording.format import (
     Recording,
     pack_record,
 )
-from lidarspec.remote_files import digest, read_stamp
+from lidarspec.remote_files import hash_ends, read_stamp
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.findings import ViolationError
@@ -452,7 +452,9 @@ def _manifest(folder: Path) -> Target:
         source.write_bytes(b"")
         made_of = read_stamp(str(source))
         counts = {"first_scan": 0, "scans": 3, "points": 900, "warnings": []}
-        done = piece.record(**made_of, digest=digest(str(source)), **counts, output=piece.output)
+        done = piece.make_record(
+            **made_of, digest=hash_ends(str(source)), **counts, output=piece.output
+        )
         failed = replace(piece, number=1).describe_failure(ls.SourceError("gone"))
         return [b"".join(json.dumps(record).encode() + b"\n" for record in (done, failed))]
 

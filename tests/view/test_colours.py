@@ -46,6 +46,6 @@ def test_terminal_and_svg_have_the_scale() -> None:
 
 @needs("matplotlib")
 def test_plot_has_the_scale() -> None:
-    colours = Library("lidarspec.view.matplotlib_figures").colour_map()
+    colours = Library("lidarspec.view.matplotlib_figures").make_colour_map()
     for share in (0.0, 0.5, 1.0):
         assert colours(share, bytes=True)[:3] == pytest.approx(colour(share, "light"), abs=2)

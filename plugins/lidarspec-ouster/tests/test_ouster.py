@@ -241,7 +241,7 @@ def test_packets_identify_their_layout() -> None:
         found = identify_senders(capture(f"ouster/{name}.pcap"))[0]
         options = found.candidates[0].sensor.options
         assert (options["profile"], options["rows"], options["turn"]) == layout
-        assert f"profile={layout[0]}, rows={layout[1]}, turn=1024" in found.candidates[0].why
+        assert f"profile={layout[0]}, rows={layout[1]}, turn=1024" in found.candidates[0].evidence
 
 
 @pytest.mark.parametrize("name", VECTORS)

@@ -155,7 +155,7 @@ def test_a_tmini_is_identified_by_its_state_field() -> None:
         "info", model=150, firmware={"minor": 0, "major": 1}, hardware=2, serial=bytes(16)
     )
     found = identify_sample(SampleBytes("", (information + heard.chunks[0],)))
-    assert (found.sensor, found.candidates[0].why) == (TMINI, "info.model is T-mini Pro")
+    assert (found.sensor, found.candidates[0].evidence) == (TMINI, "info.model is T-mini Pro")
     others = identify_sample(SampleBytes("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
     assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {
         score.sensor.id for score in others.candidates
