@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -106,13 +106,13 @@ def test_datagrams_for_another_computer_are_read_there_at_every_interface() -> N
 
 
 def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
-    path, began = tmp_path / "made.lsr", time.monotonic()
-    result = ran("sim", STL, "--to", path, "-t", "5s", "--errors", "0.1%", "--seed", "3")
-    assert time.monotonic() - began < 5
+    path = tmp_path / "made.lsr"
+    # In real time, it would last longer than `ran` waits.
+    result = ran("sim", STL, "--to", path, "-t", "125s", "--errors", "0.1%", "--seed", "3")
     assert result.stdout == f"{path}\n"
-    assert "9000 data frames sent" in result.stderr or "9001 data frames sent" in result.stderr
+    assert re.search("22500[01] data frames sent", result.stderr)
     with ls.open(path) as device:
-        assert len([scan for scan in device.scans() if scan.whole]) in range(46, 51)
+        assert len([scan for scan in device.scans() if scan.whole]) in range(1150, 1251)
         assert device.stats.bad_checksum > 0
     assert "exists" in ran("sim", STL, "--to", path, code=2).stderr
     ran("sim", STL, "--to", path, "-t", "1s", "--force")

@@ -175,9 +175,9 @@ def test_a_port_among_the_arguments_redirects_the_data() -> None:
         other.bind(("127.0.0.1", 0))
         other.settimeout(TIMEOUT_S)
         device.latest(TIMEOUT_S)
-        device.send("send_to", host="0.0.0.0", port=other.getsockname()[1])
+        device.send("send_to", host="0.0.0.0", port=other.getsockname()[1], timeout=TIMEOUT_S)
         sensor.parse(other.recv(2000), "data")
-        device.send("send_to", host="127.0.0.1", port=links["data"].ports[0])
+        device.send("send_to", host="127.0.0.1", port=links["data"].ports[0], timeout=TIMEOUT_S)
         device.latest(TIMEOUT_S)
 
 

@@ -165,7 +165,7 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
             for command in (*sensor.on_open, *sensor.on_close)
             if sensor.commands[command].frame
         ]
-        until(lambda: port.device.commands_received == wanted)
+        port.wait_for_commands(wanted, timeout=TIMEOUT_S)
     for scan in found:
         assert scan.points.valid.mean() > 0.98
         assert (
