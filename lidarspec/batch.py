@@ -382,11 +382,11 @@ class Manifest:
         ):
             return None
         is_there = record["output"] is None or self.has(record["output"])
-        if is_there and self._is_same(piece.source, record):
+        if is_there and self._is_unchanged(piece.source, record):
             return record
         return None
 
-    def _is_same(self, source: str, record: Record) -> bool:
+    def _is_unchanged(self, source: str, record: Record) -> bool:
         """Return whether a file has not changed since a record was written."""
         now = read_stamp(source)
         return bool(

@@ -1,10 +1,10 @@
 """The sensors of this project's distributions, installed or not, read from a table.
 
-`known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in
-the core that names sensors. It serves two purposes: messages can name the distribution of a sensor
-that is not installed, and installed sensors can be listed without loading their plugins. A row
-describes a sensor in one version of its distribution. `plugins` uses the row only if that version
-is installed and its entry points have the same names as the row.
+The table `known_sensors.json` is generated from the plugins by `make known-sensors`, and is the
+only place in the core that names sensors. It serves two purposes: messages can name the
+distribution of a sensor that is not installed, and installed sensors can be listed without loading
+their plugins. A row of the table describes a sensor in one version of its distribution. It is used
+only if this version is installed, and if its entry points have the names in the row.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry for
 each id and alias, so that a request for one sensor loads only one plugin. The registry reads the
-aliases of a sensor from these entries. Modules with other hooks are in the group ``lidarspec`` and
-are loaded before any sensor is returned. A hook is a function with one of the names below, marked
+aliases of a sensor from these entries. A module with hooks is named in the group ``lidarspec``, and
+is loaded before any sensor is returned. A hook is a function with one of the names below, marked
 with ``@hookimpl``.
 
 Each plugin is loaded separately. If a plugin cannot be imported, has an unknown hook or adds an
@@ -229,16 +229,16 @@ class Plugin:
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Several plugins may claim the same name (an id or an alias). Claims by an entry point with this
-    name, or by a module that is always loaded, have priority over claims by a sensor that only
-    declares the name. If several distributions remain, the name belongs to its owner. The owner is
-    the distribution that the user's own settings name. Without such a setting, `lidarspec-VENDOR`
-    owns the ids that begin with this vendor, and the aliases of these sensors. A request for a name
-    without an owner is an error. If one distribution has two modules with the name, the name
-    belongs to the first module. A plugin that loses a name keeps its other names.
+    Several plugins may claim the same name, which is an id or an alias. These rules decide, in this
+    order, which plugin provides the sensor:
 
-    If two threads load the same sensor at the same time, it is added twice, which has the same
-    result as adding it once.
+    * A plugin with an entry point of this name, or with hooks, has priority over a plugin whose
+      sensor only declares the name.
+    * The user's settings may name the distribution that owns the name.
+    * `lidarspec-VENDOR` owns the ids that begin with VENDOR, and the aliases of these sensors.
+    * If one distribution has two modules with the name, the first module provides the sensor.
+
+    If no rule decides, a request for the name is an error.
 
     Args:
         modules: entry points of modules with hooks, which are loaded immediately.
@@ -335,6 +335,7 @@ class Registry:
         return self.add(plugin, name=f"{entry.distribution}:{entry.module}")
 
     def _load(self, entry: EntryPoint) -> None:
+        # If two threads load an entry at the same time, its sensor is added twice, with no effect.
         if entry not in self._tried:
             self._tried[entry] = _load_entry(
                 entry, entry.name, functools.partial(self._add_offered, entry)

@@ -138,7 +138,7 @@ def normalise_path(path: object) -> str:
 
 
 def read_stamp(path: str) -> dict[str, Any]:
-    """Return the `size` of a file, and the time at which it was `modified`.
+    """Return the size of a file and the time of its last change, as `size` and `modified`.
 
     Some stores provide a tag instead of the time.
 

@@ -1,9 +1,8 @@
 """Completion of the command line in bash, zsh and fish.
 
 This module extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the
-code to load into bash. `BY_NAME` has a completion function for each name of a parameter. The
-function returns, for example, sensor ids, frames, fields, ports, or the devices of
-`lidarspec.toml`.
+code to load into bash. For a parameter of a verb, `BY_NAME` has a function that returns the
+possible values, such as sensor ids, fields, ports, or the devices of `lidarspec.toml`.
 """
 
 from __future__ import annotations

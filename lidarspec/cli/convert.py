@@ -309,7 +309,7 @@ def _write_imu(
 def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
     """Yield the IMU samples of the selected packets, with times by the selected clock.
 
-    Errors of a plugin are counted.
+    Exceptions of a plugin's function are counted instead of raised.
 
     Raises:
         UsageError: if a required time is unknown, or if only some of the samples have a clock.

@@ -86,7 +86,7 @@ AMBIGUOUS = {
 
 
 class HexText:
-    """Reads a text line by line. Comments, arrays and dumps may have several lines."""
+    """Reads a text line by line. Comments, arrays and dumps may extend over several lines."""
 
     def __init__(self) -> None:
         self._in_comment = self._in_array = False

@@ -584,7 +584,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
 
 def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | None, bool]:
-    """Return the address for commands on the data link, and whether it is a broadcast.
+    """Return the address for commands on the data link, and whether it is for broadcasts.
 
     The address is None if it is unknown until the sensor sends data.
     """

@@ -174,7 +174,7 @@ class CellGrid:
         return ["".join(map(chr, row)) for row in self.codes.tolist()]
 
     def text(self) -> Text:
-        """Return the picture as coloured text for rich."""
+        """Return the picture as a coloured text of the library rich."""
         text = Text(no_wrap=True)
         for number, (line, inks) in enumerate(zip(self.lines(), self.inks.tolist(), strict=True)):
             start = 0

@@ -190,9 +190,9 @@ class RateMeter:
         """Count a batch of packets."""
         arrivals = packets.host_ns[packets.host_ns > 0]
         if len(arrivals):
-            self._add(len(packets), arrivals, by_host=True)
+            self._count_packets(len(packets), arrivals, by_host=True)
         else:
-            self._add(len(packets), packets.time_ns, by_host=False)
+            self._count_packets(len(packets), packets.time_ns, by_host=False)
 
     def add_frames(self, count: int, arrivals: NDArray[np.int64]) -> None:
         """Count frames of several types.
@@ -201,9 +201,9 @@ class RateMeter:
             count: number of frames.
             arrivals: their arrival times, ascending, (n,) ns.
         """
-        self._add(count, arrivals, by_host=True)
+        self._count_packets(count, arrivals, by_host=True)
 
-    def _add(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
+    def _count_packets(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
         """Count packets and the gaps between their times. `times` is ascending, (n,) ns."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
