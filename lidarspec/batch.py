@@ -600,7 +600,7 @@ def _iter_results(
             result = future.result()
         except BrokenProcessPool:
             error = SourceError(
-                "a worker process was killed, possibly because memory ran out; the piece that it"
+                "a worker process was killed, possibly because memory ran out, so the piece that it"
                 " was converting was not written"
             )
             raise suggest(error, "repeat the command: it resumes where this one ended") from None

@@ -90,7 +90,7 @@ class SourceClock:
     default=DRIFT_LIMIT_PPM,
     show_default=True,
     metavar="PPM",
-    help="Drift above which a clock is at fault, in millionths.",
+    help="Maximum drift of a clock without fault, in ppm.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each source.")
 def clock(

@@ -170,7 +170,7 @@ def crc(
         )
         raise click.exceptions.Exit(FINDINGS)
     if matches[0].evidence_bits < WEAK_BITS:
-        note("the match may be coincidence; repeat with more frames")
+        note("the match may be a coincidence: repeat with more frames")
 
 
 def _parse_frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
@@ -245,7 +245,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
     if match.evidence_bits >= WEAK_BITS:
         chance = f"probability of a coincidence: 1 in {match.odds}"
     else:
-        chance = "may be coincidence"
+        chance = "may be a coincidence"
     lines = [
         (
             f"{match.algorithm.describe()}{name}: correct in {match.right} of {match.total} frames;"

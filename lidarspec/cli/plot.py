@@ -145,10 +145,12 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
     if chosen is None:
         raise no_scan_error(device, source)
     if not whole_count:
-        note(f"{source} has no complete scan; an incomplete scan is drawn")
+        note(f"{source} has no complete scan, so an incomplete scan is drawn")
     elif whole_count < number:
         plural = "" if whole_count == 1 else "s"
-        note(f"{source} has only {whole_count} complete scan{plural}; scan {whole_count} is drawn")
+        note(
+            f"{source} has only {whole_count} complete scan{plural}, so scan {whole_count} is drawn"
+        )
     return chosen
 
 

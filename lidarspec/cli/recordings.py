@@ -133,14 +133,14 @@ def _make_slice_error(source: str, target: str, times: str) -> UsageError:
     """Return the error for `record --slice`, which suggests a command that works."""
     if is_live(source):
         return suggest(
-            UsageError("--slice requires a recording; for a live source, use -t"),
+            UsageError("--slice requires a recording: use -t for a live source"),
             "lidarspec record --help",
         )
     command = (
         f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice"
         f" {shlex.quote(times)}"
     )
-    return suggest(UsageError("record copies only whole files; use replay to copy a part"), command)
+    return suggest(UsageError("record copies only whole files: use replay to copy a part"), command)
 
 
 def _print_recording(task: SourceRecording) -> None:
@@ -394,7 +394,7 @@ def _print_summary(
     if len(played.senders) > 1 and not is_file:
         note(
             f"the recording has the datagrams of {len(played.senders)} senders, but all were sent"
-            f" from one address; select one sender with '{file}?src=ADDRESS'"
+            f" from one address: select one sender with '{file}?src=ADDRESS'"
         )
     if is_file:
         note(f"next: lidarspec {_make_view_words(sensor, target)}")

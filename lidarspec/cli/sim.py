@@ -117,7 +117,7 @@ PLACES = (
 @click.option(
     "--unplug",
     type=DURATION,
-    help="Time for which the sensor stays connected before each disconnection.",
+    help="Disconnect the sensor each time it was connected for this long.",
 )
 @click.option(
     "--shake",

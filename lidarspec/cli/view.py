@@ -118,7 +118,7 @@ def view(
     if (opens or address is not None or control) and not web:
         raise UsageError("--open, --address and --control require --web")
     if output is not None and not in_rerun:
-        raise UsageError("-o requires --rerun; lidarspec plot writes a picture to a file")
+        raise UsageError("-o requires --rerun: use lidarspec plot to write a picture to a file")
     if web:
         _serve(
             source, sensor_id, duration, selection, opens=opens, address=address, control=control
@@ -194,7 +194,7 @@ def _serve(
         with handle_sigterm(), server:
             say(server.link)
             if opens and not _open_in_browser(server):
-                note("no browser found; open the link in a browser")
+                note("no browser found: open the link in a browser")
             server.run(duration)
             conclude(server.device)
     finally:

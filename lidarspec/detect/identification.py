@@ -714,7 +714,7 @@ def detect(source: str | Path) -> Sensor:
     if fitting[0].sensor is None:
         example = format_sensor_options(fitting[0].candidates[0].sensor)
         raise UsageError(
-            f"{source}: {', '.join(list_candidates(fitting[0]))} send the same frames; choose one,"
+            f"{source}: {', '.join(list_candidates(fitting[0]))} send the same frames: choose one,"
             f" such as {example}"
         )
     return fitting[0].sensor

@@ -103,7 +103,7 @@ def read_samples(
         if not rates:
             example = with_option(text, "baud", ANY_BAUD)
             raise SourceError(
-                f"{text}: no installed sensor declares a baud rate; add the rate to the source:"
+                f"{text}: no installed sensor declares a baud rate. Add the rate to the source:"
                 f" {example}"
             )
         first_rates = list(dict.fromkeys([rates[0], min(rates), max(rates)]))
@@ -126,7 +126,7 @@ def read_samples(
         if not ports:
             example = with_option(text, "port", EXAMPLE_PORT)
             raise SourceError(
-                f"{text}: no installed sensor declares a port; add a port to the source: {example}"
+                f"{text}: no installed sensor declares a port. Add a port to the source: {example}"
             )
         yield from _read_sample(with_option(text, "port", ports), seconds, None, text)
     else:

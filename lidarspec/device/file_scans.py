@@ -253,7 +253,7 @@ class _StatePickler(pickle.Pickler):
         if isinstance(obj, Packets):
             if AROUND in obj.state:
                 raise pickle.PicklingError(
-                    "the parts of a frame cannot be pickled alone; pickle the packets of the frame"
+                    "the parts of a frame cannot be pickled alone: pickle the packets of the frame"
                 )
             state = {name: _take_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}

@@ -84,7 +84,7 @@ class SenderCheck:
         )
         chosen = with_option(self._source, "src", one)
         error = UsageError(
-            f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one"
+            f"{self._source}: {one} and {two} both send frames of {self._sensor.id}: choose one"
             f" sender, for example with {chosen}"
         )
         return suggest(error, f"repeat with {quote(chosen)}")

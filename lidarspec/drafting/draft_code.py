@@ -381,7 +381,7 @@ def _make_length_field_name(draft: Draft) -> str:
 
 def _make_checksum_field(draft: Draft, checksum: ChecksumMatch, start: int) -> DraftField:
     if checksum.evidence_bits < WEAK_EVIDENCE_BITS:
-        chance = "may be coincidence: check with more frames"
+        chance = "may be a coincidence: check with more frames"
     else:
         chance = f"probability of a coincidence: 1 in {checksum.odds}"
     evidence = [

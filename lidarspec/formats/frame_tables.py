@@ -115,7 +115,7 @@ def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
     suffixes = [suffix for suffix in WRITERS if name.endswith(suffix)]
     if not suffixes:
         raise UsageError(
-            f"{path}: frames cannot be written to this format; use {', '.join(WRITERS)}"
+            f"{path}: frames cannot be written to this format: use {', '.join(WRITERS)}"
         )
     with replace_file(path) as part:
         return WRITERS[max(suffixes, key=len)](part, batches)

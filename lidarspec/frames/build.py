@@ -201,7 +201,7 @@ class _ValueChecker:
             not np.isfinite(value) or (not self._units and value != int(value))
         ):
             raise UsageError(
-                f"{self._place}: {shown} = {value} is not a raw integer; pass units=True for"
+                f"{self._place}: {shown} = {value} is not a raw integer: pass units=True for"
                 " physical values"
             )
         if self._units:

@@ -291,7 +291,7 @@ def open_recorder(
     if suffix in WRITINGS and not datagrams:
         if not sensor:
             raise UsageError(
-                f"{path}: to record a byte stream as a capture, name the sensor with -s; or record"
+                f"{path}: to record a byte stream as a capture, name the sensor with -s, or record"
                 " to an .lsr file"
             )
         return FrameRecorder(

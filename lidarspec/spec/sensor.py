@@ -616,7 +616,7 @@ def _refuse_pipe(path: str | PathLike[str]) -> None:
     """Raise `UsageError` for a pipe or device, because it may never end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise UsageError(
-            f"{path!s}: expected a regular file, not a pipe or device; write its content to a"
+            f"{path!s}: expected a regular file, not a pipe or device: write its content to a"
             " file first"
         )
 

@@ -237,7 +237,7 @@ class Clock:
             )
         if self.wraps_at >= MAX_CLOCK_S:
             raise SpecError(
-                f"{self.wraps_at:.4g} s is longer than 292 years; leave wraps_at out, as this clock"
+                f"{self.wraps_at:.4g} s is longer than 292 years: leave wraps_at out, as this clock"
                 " never wraps",
                 path="clock.wraps_at",
             )

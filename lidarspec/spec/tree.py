@@ -1270,7 +1270,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
             outcome = "never" if symbol == "==" else "always"
             raise UntraceableExpressionError(
                 f"{known.path} {symbol} {pair[one]} is {outcome} true, because"
-                f" {NAME_IS_COMPARED}; write {known.path} {symbol} {name!r}"
+                f" {NAME_IS_COMPARED}: write {known.path} {symbol} {name!r}"
             )
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
     wrong = next((part for part in pair if not isinstance(part, int | float | Ref | Op)), None)

@@ -143,7 +143,7 @@ class HexText:
         bus = " ".join((groups.get("bus") or "").split())
         if self._bus and bus != self._bus:
             raise ValueError(
-                f"the CAN frames come from {self._bus} and {bus}; select one interface with grep"
+                f"the CAN frames come from {self._bus} and {bus}: select one interface with grep"
             )
         self._bus = bus
         if len(data) != int(groups.get("size") or len(data)) and "remote" not in text:
@@ -255,7 +255,7 @@ def _split_time(text: str) -> tuple[int | None, str]:
         return None, text
     if not (match["bracket"] or match["date"] or match["fraction"]):
         raise ValueError(
-            f"{match['clock']} may be a time of day or three bytes; write [{match['clock']}]"
+            f"{match['clock']} may be a time of day or three bytes: write [{match['clock']}]"
             " for a time"
         )
     if match["date"]:

@@ -71,7 +71,7 @@ def test_an_unnamed_checksum_is_printed_as_a_class() -> None:
 @pytest.mark.slow
 def test_few_frames_are_weak() -> None:
     assert (
-        "the match may be coincidence; repeat with more frames"
+        "the match may be a coincidence: repeat with more frames"
         in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
     )
 

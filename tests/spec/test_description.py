@@ -24,7 +24,7 @@ BYTE = Struct("value" / Int8ub)
     [
         (
             lambda: Clock("time", wraps_at=2**64 / 1e6),
-            "clock.wraps_at: 1.845e+13 s is longer than 292 years; leave wraps_at out",
+            "clock.wraps_at: 1.845e+13 s is longer than 292 years: leave wraps_at out",
         ),
         (
             lambda: Clock("time", wraps_at=0),

@@ -250,6 +250,6 @@ def test_the_command_line_takes_text_in_every_place(tmp_path: Path) -> None:
         code=4,
     ).stderr
     assert (
-        "standard input, line 7: not hexadecimal: the CAN frames come from can0 003 and can0 004;"
+        "standard input, line 7: not hexadecimal: the CAN frames come from can0 003 and can0 004:"
         " select one interface with grep"
     ) in said

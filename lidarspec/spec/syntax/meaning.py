@@ -453,7 +453,7 @@ class _Builder:
         if (named or odd) and not isinstance(key, tree.Untraced):
             if named:
                 reason = (
-                    f"the case {named[0]} is never selected, because {tree.NAME_IS_COMPARED};"
+                    f"the case {named[0]} is never selected, because {tree.NAME_IS_COMPARED}:"
                     f" write {labels[named[0]]!r}"
                 )
             elif isinstance(key, tree.Ref) and isinstance(odd[0], str):

@@ -69,7 +69,7 @@ SPEED_STRUCT = Checksummed(
         "type" / Const(0x61, Int8ub),
         "command" / Const(0xAE, Int8ub) * "AE: the packet contains only the speed",
         "size" / Const(1, Int16ub),
-        "speed" / SPEED * "while the motor starts",
+        "speed" / SPEED * "sent while the motor starts",
         "sum" / Int16ub,
     ),
     field="sum",

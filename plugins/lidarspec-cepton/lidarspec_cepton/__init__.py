@@ -78,7 +78,7 @@ DATA = Struct(
                 "no_return" / BitsInteger(1),
                 "second" / BitsInteger(1) * "1: second return",
                 "boundary" / BitsInteger(1) * "1: first point of an image",
-                "parity" / BitsInteger(1) * "changes from image to image",
+                "parity" / BitsInteger(1) * "changes with each image",
                 "weak" / BitsInteger(1),
                 "saturated" / BitsInteger(1),
             ),

@@ -90,7 +90,7 @@ THREE_RETURNS = Struct(
         ),
     ),
     "body_seconds" / Int32ub * "the same time as in the header",
-    "body_nanoseconds" / Int32ub * "as in the header",
+    "body_nanoseconds" / Int32ub * "the same time as in the header",
     "api" / Int16ub * "packet version",
     "status" / STATUS,
 )

@@ -102,7 +102,7 @@ BLOCKS_AND_TAIL: tuple[Construct, ...] = (
     / Array(
         BLOCKS,
         Struct(
-            "time_offset" / Scaled(Int8ub, 1e-6, "s") * "added to the time of the packet",
+            "time_offset" / Scaled(Int8ub, 1e-6, "s") * "relative to the time of the packet",
             "return_seq" / Enum(Int8ub, **RETURN_NUMBERS) * "the first return is the nearer one",
             "channels"
             / Array(

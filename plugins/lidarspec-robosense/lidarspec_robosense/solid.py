@@ -95,7 +95,7 @@ def make_packet(
         channel: the fields of a channel.
         tail: the fields after the blocks.
     """
-    time = "time_offset" / Scaled(offset, 1e-6, "s") * "added to the time of the packet"
+    time = "time_offset" / Scaled(offset, 1e-6, "s") * "relative to the time of the packet"
     return Struct(
         *HEADER,
         "blocks"

@@ -211,7 +211,7 @@ class Topics:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise UsageError(
-                f"publish_tf requires tf2_msgs, which is not installed ({error}); install it, or"
+                f"publish_tf requires tf2_msgs, which is not installed ({error}): install it, or"
                 " use static_transform_publisher"
             ) from None
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -185,7 +185,7 @@ class PageSite:
         self._opened_count += 1
         number = self._opened_count
         client = "an unknown address" if socket.client is None else socket.client.host
-        self._report(f"page {number} opened by {client}; {len(self._open_pages)} open")
+        self._report(f"page {number} opened by {client}; open pages: {len(self._open_pages)}")
         ending = "closed"
         try:
             ending = await page.serve()
@@ -193,7 +193,7 @@ class PageSite:
             ending = f"closed: {describe_bug(error)}"
         finally:
             self._open_pages.discard(page)
-            self._report(f"page {number} {ending}; {len(self._open_pages)} open")
+            self._report(f"page {number} {ending}; open pages: {len(self._open_pages)}")
 
     async def _save_scan(self, request: Request) -> Response:
         """Send a scan as a file, by its number."""

@@ -68,7 +68,11 @@ def test_it_prints_its_link_and_ends_on_a_signal(tmp_path: Path, by: signal.Sign
         page.scan()
         code, out, lines = wait_until_end(running, by)
     assert (code, out) == (130, "")
-    assert lines == ["page 1 opened by 127.0.0.1; 1 open", "page 1 closed; 0 open", "interrupted"]
+    assert lines == [
+        "page 1 opened by 127.0.0.1; open pages: 1",
+        "page 1 closed; open pages: 0",
+        "interrupted",
+    ]
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", urlsplit(link).port), 1)
