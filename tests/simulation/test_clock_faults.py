@@ -344,7 +344,7 @@ def test_a_frame_without_points_cannot_lose_a_lock_that_it_does_not_report() -> 
     states = {0: ClockState("no fix", False), 3: ClockState("fix", True)}
     for sensor, reason in (
         (make_receiver(ClockStatus("rate", states, frame="rate_reply")), "does not send"),
-        (make_receiver(ClockStatus("quality", {3: ClockState("fix", True)})), "distinguish"),
+        (make_receiver(ClockStatus("quality", {3: ClockState("fix", True)})), "needs a value"),
         (RECEIVER, "does not declare the status"),
     ):
         with pytest.raises(UsageError, match=reason):
