@@ -103,7 +103,7 @@ def test_little_shared_memory_is_a_warning_with_a_remedy(monkeypatch: pytest.Mon
     assert (memory.segment_bytes, memory.notice) == (0, "")
     for part in (
         "2.5 MB",
-        "only 21 MB of the required 22 MB free",
+        "has only 21 MB free, but 22 MB are required",
         "--shm-size",
         "--ipc=host",
         "qos:=reliable",
