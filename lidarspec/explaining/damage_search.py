@@ -194,8 +194,8 @@ def describe_damage(
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
-    If there are more than `MAX_DESCRIBED_CHANGES`, one sentence with their kind and number is
-    yielded.
+    If there are more than `MAX_DESCRIBED_CHANGES`, one sentence with their kind and the number of
+    their offsets is yielded.
 
     Args:
         frame: the frame type.
@@ -204,7 +204,9 @@ def describe_damage(
     """
     matching = find_changes(frame, data)
     if len(matching) > MAX_DESCRIBED_CHANGES:
-        yield f"one {matching[0].kind} explains the damage; {len(matching)} offsets are possible"
+        count = len({change.offset for change in matching})
+        possible = "1 offset is possible" if count == 1 else f"{count} offsets are possible"
+        yield f"one {matching[0].kind} explains the damage; {possible}"
         return
     before = values(data) if matching else {}
     for change in matching:

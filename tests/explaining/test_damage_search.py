@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 
 import pytest
+from construct import Array, Const, Int8ul, Struct
 
 import lidarspec as ls
 from lidarspec import explain
-from lidarspec.explaining.damage_search import FrameChange, find_changes
+from lidarspec.explaining.damage_search import FrameChange, describe_damage, find_changes
+from lidarspec.spec import Frame
 from tests.cli.running import EXAMPLE
 from tests.shapes import SHAPES
 
@@ -65,6 +67,13 @@ def test_a_lost_byte_and_an_inserted_byte_are_reported() -> None:
     assert "byte 20, 0x9b" in " ".join(explain(EXAMPLE[:20] + b"\x9b" + EXAMPLE[20:], STL).notes)
     assert explain(EXAMPLE[:20] + EXAMPLE[23:], STL).notes == ()
     assert explain(EXAMPLE + b"abc", STL).notes == ()
+
+
+def test_possible_offsets_are_counted_once() -> None:
+    """Any value of a lost byte is possible in a struct without a checksum."""
+    frame = Frame(Struct("header" / Const(b"\xaa"), "bytes" / Array(5, Int8ul)), data=True)
+    (note,) = describe_damage(frame, bytes.fromhex("aa 01 02 03 04"), lambda _: {})
+    assert note == "one lost byte explains the damage; 6 offsets are possible"
 
 
 @pytest.mark.parametrize("name", SHORT_SHAPES)
