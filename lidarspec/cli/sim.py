@@ -294,7 +294,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
         emit_json(_result_to_dict(result, whole), None)
     else:
         say(
-            "\n".join([render(_draw_picture(whole[-1])), *_summarize(result, whole, errors)]),
+            "\n".join([render(_draw_picture(whole[-1])), *_summarize(result, whole)]),
             colour=True,
         )
     if result.digest != result.recorded_digest:
@@ -310,7 +310,7 @@ def _draw_picture(scan: Scan) -> Text:
     ).text()
 
 
-def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[str]:
+def _summarize(result: Demonstration, whole: list[Scan]) -> list[str]:
     stats = result.stats
     name = result.sensor.id
     frames = sum(stats.frames.values())
@@ -323,7 +323,7 @@ def _summarize(result: Demonstration, whole: list[Scan], errors: float) -> list[
         where = f"{result.address} (this system has no pseudo-terminals)"
     else:
         where = result.address
-    passed = f"{errors:.1%} {harm}, {result.intact} packets arrived undamaged"
+    passed = f"{result.error_share:.2%} {harm}, {result.intact} packets arrived undamaged"
     lines = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
         *(str(reply) for reply in result.replies if reply.confirmed),

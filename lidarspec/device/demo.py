@@ -45,6 +45,7 @@ class Demonstration:
     Attributes:
         sensor: the sensor.
         address: the SOURCE of the simulated sensor.
+        error_share: the simulated share of lost datagrams, or of damaged bytes in a stream.
         replies: the replies to the commands that started the sensor.
         scans: the received scans; the last scan is complete.
         stats: the decoder's counters.
@@ -57,6 +58,7 @@ class Demonstration:
 
     sensor: Sensor
     address: str
+    error_share: float
     replies: tuple[Reply, ...]
     scans: tuple[Scan, ...]
     stats: Counters
@@ -83,11 +85,12 @@ def demonstrate(
             time.
         PluginError: if a function of the plugin raises.
     """
-    longest = sensor.frames[sensor.data_frame].max_length
     if sensor.datagrams:
-        faults = Faults(loss=errors)
+        error_share = errors
+        faults = Faults(loss=error_share)
     else:
-        faults = Faults(errors=min(errors, 1 / longest))
+        error_share = min(errors, 1 / sensor.frames[sensor.data_frame].max_length)
+        faults = Faults(errors=error_share)
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
@@ -100,6 +103,7 @@ def demonstrate(
     return Demonstration(
         sensor,
         address,
+        error_share,
         replies,
         scans,
         stats,

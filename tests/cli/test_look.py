@@ -124,6 +124,7 @@ def test_demo_draws_and_sums_up() -> None:
     assert sum("⠀" < character <= "⣿" for character in text) > 60
     lines = text.splitlines()
     assert any(line.startswith("cspc-m1c1-mini, simulated on ") for line in lines)
+    assert "frames sent, 0.13% of the bytes were damaged, " in text
     assert any(line.startswith("Reply(start, ack: ") for line in lines)
     assert any(re.match(r"\d+ complete scans?( at|,) ", line) for line in lines)
     assert "read again: the same points, SHA-256 " in text
