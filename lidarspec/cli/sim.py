@@ -272,7 +272,7 @@ def _format_sent(device: SimulatedDevice) -> str:
     type=SHARE,
     default="1%",
     show_default=True,
-    help="Share of bytes to corrupt.",
+    help="Share of bytes to corrupt, or of datagrams to drop.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
