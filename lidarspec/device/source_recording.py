@@ -157,7 +157,7 @@ class SourceRecording:
         packets: number of data packets so far, or of datagrams if the sensor is unknown; at the
             end, the number in the file.
         elapsed: seconds since the source was opened; at the end, the seconds between the first and
-            the last arrival in the file.
+            the last arrival in the file, if it contains arrival times.
     """
 
     def __init__(
@@ -313,16 +313,19 @@ class SourceRecording:
         """Copy a file. Data from standard input is recorded with its time of arrival."""
         clock = HostClock()
         assert self.recorder is not None
-        for chunk in source.chunks():
-            if self._is_finished(log, is_timed=False):
-                return
-            yield ""
-            self.recorder.wait_for_room()
-            is_undated = chunk.at is None and self._source == "-"
-            log.write(replace(chunk, at=clock.now()) if is_undated else chunk)
-            if log.is_over:
-                return
-            self.packets += source.datagrams
+        try:
+            for chunk in source.chunks():
+                if self._is_finished(log, is_timed=False):
+                    return
+                yield ""
+                self.recorder.wait_for_room()
+                is_undated = chunk.at is None and self._source == "-"
+                log.write(replace(chunk, at=clock.now()) if is_undated else chunk)
+                if log.is_over:
+                    return
+                self.packets += source.datagrams
+        finally:
+            self._end(log)
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
         """Create the file to which an open source is recorded."""

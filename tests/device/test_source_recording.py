@@ -26,6 +26,7 @@ from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import open_live
+from lidarspec.transports.protocol import Chunk
 from tests.lines import free_port, send_paced, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -87,6 +88,22 @@ def test_a_recording_ends_in_time_and_reports_its_content(tmp_path: Path, knows:
         times = [record.at for record in recording if record.direction == "in" and record.data]
     assert task.packets == len(times) > 0
     assert task.elapsed == (times[-1] - times[0]) / 1e9 < 0.3
+
+
+@pytest.mark.parametrize("seconds", [None, 1.0])
+def test_the_duration_of_a_copy_is_that_of_its_arrivals(
+    tmp_path: Path, seconds: float | None
+) -> None:
+    sensor = SHAPES["shape-datagrams"]
+    with Recorder(tmp_path / "all.lsr", sensor) as recorder:
+        for number, frame in enumerate(turning(sensor, 8)):
+            recorder.write(Chunk(frame, 10**18 + number * 250_000_000))
+    task = SourceRecording(
+        str(tmp_path / "all.lsr"), str(tmp_path / "copy.lsr"), sensor, seconds=seconds
+    )
+    assert list(task.run())
+    assert task.packets == (8 if seconds is None else 4)
+    assert task.elapsed == (task.packets - 1) / 4
 
 
 def test_other_senders_are_reported_once_while_recording(tmp_path: Path) -> None:
