@@ -114,15 +114,22 @@ class TimedLog:
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record a sent chunk, or a received chunk if it arrived before the time limit."""
-        if direction == "in" and chunk.at is not None:
-            if self.first is None:
-                self.first = chunk.at
-            if chunk.at - self.first >= self._limit_ns:
-                self.is_over = True
+        if direction == "in":
+            self._check_limit(chunk)
             if self.is_over:
                 return
-            self.last = chunk.at
+            if chunk.at is not None:
+                self.last = chunk.at
         self._recorder.write(chunk, direction)
+
+    def _check_limit(self, chunk: Chunk) -> None:
+        """End the recording if a chunk arrived after the time limit."""
+        if chunk.at is None:
+            return
+        if self.first is None:
+            self.first = chunk.at
+        if chunk.at - self.first >= self._limit_ns:
+            self.is_over = True
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
         """Record an event of the link."""

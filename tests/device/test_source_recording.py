@@ -20,9 +20,9 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.device.capture_thread import BoundedQueue, CaptureThread
-from lidarspec.device.source_recording import SourceRecording
+from lidarspec.device.source_recording import SourceRecording, TimedLog
 from lidarspec.recording.format import Recording
-from lidarspec.recording.recorders import Recorder
+from lidarspec.recording.recorders import Recorder, open_recorder
 from lidarspec.spec import Fields
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import open_live
@@ -104,6 +104,18 @@ def test_the_duration_of_a_copy_is_that_of_its_arrivals(
     assert list(task.run())
     assert task.packets == (8 if seconds is None else 4)
     assert task.elapsed == (task.packets - 1) / 4
+
+
+@pytest.mark.parametrize("at", [None, 10**18 + 1])
+def test_an_ended_recording_ignores_arrivals(tmp_path: Path, at: int | None) -> None:
+    writer = open_recorder(tmp_path / "ended.lsr", datagrams=True)
+    with contextlib.closing(TimedLog(writer, None)) as log:
+        log.write(Chunk(b"before", 10**18))
+        log.end()
+        log.write(Chunk(b"after", at))
+        log.write(Chunk(b"command", at), "out")
+    with Recording(tmp_path / "ended.lsr") as recording:
+        assert [record.data for record in recording] == [b"before", b"command"]
 
 
 def test_other_senders_are_reported_once_while_recording(tmp_path: Path) -> None:
