@@ -1,10 +1,10 @@
 """The exceptions of lidarspec: one class for each party that may be at fault.
 
-``SpecError`` reports a mistake of a plugin's author, and ``UsageError`` a mistake of the caller.
-``WireError`` reports bytes that are not the expected frame, ``SourceError`` a failure of the
-system, and ``CommandError`` a failure of the device. Noise in a stream is not an error: decoders
-count it. Each exception builds its message from typed arguments, so that programs can read the
-details from its attributes.
+``SpecError`` reports a mistake of a plugin's author, and its subclass ``PluginError`` a function
+of a plugin that fails. ``UsageError`` reports a mistake of the caller. ``WireError`` reports bytes
+that are not the expected frame, ``SourceError`` a failure of the system, and ``CommandError`` a
+failure of the device. Noise in a stream is not an error: decoders count it. If an error has
+details, such as an offset, programs can read them from the attributes of the exception.
 """
 
 from __future__ import annotations
