@@ -17,7 +17,8 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
 
-#: The search for a frame that provides a date for the clock ends after this number of bytes.
+#: If no frame of the type that provides a date for the clock arrives within this number of bytes,
+#: the search for it ends. If such frames arrive, but without a valid date, the search continues.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
