@@ -44,9 +44,11 @@ MAX_MATCHES = 8
 SCREENING_FRAMES = 16
 #: The minimum share of valid frames for a checksum whose constant is fitted to the frames.
 MIN_VALID_SHARE = 0.95
-#: The number of combinations of an offset and covered bytes that are tried for a checksum in
-#: nibbles.
-NIBBLE_TRIALS = 8
+#: A checksum in nibbles is searched at offsets less than this.
+NIBBLE_SEARCH_BYTES = 3
+#: The number of checksums in nibbles that are tried: one at offset 0, where no byte precedes the
+#: checksum, and two at each other offset.
+NIBBLE_TRIALS = 2 * NIBBLE_SEARCH_BYTES - 1
 ANYWHERE_NOTE = (
     "an XOR over the whole frame fits at several offsets: the byte that varies most was chosen"
 )
@@ -221,7 +223,7 @@ def iter_plain_matches(
                 return
         if has_sure:
             return
-    yield from _iter_nibble_matches(samples)
+    yield from _iter_nibble_matches(samples, is_possible_place)
 
 
 def _iter_matches(
@@ -319,18 +321,22 @@ def _find_constant(values: NDArray[np.uint64]) -> list[int]:
     return []
 
 
-def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
+def _iter_nibble_matches(
+    samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool]
+) -> Iterator[ChecksumMatch]:
     """Yield the match of an XOR that is stored in the low nibbles of two bytes."""
-    for offset in range(min(3, samples.shortest - 4)):
-        place = ChecksumPlace(offset, 2)
-        stored = samples.read_field(place, "little")
-        halves = (stored & np.uint64(15)) | (stored >> np.uint64(4)) & np.uint64(0xF0)
+    offsets = range(min(NIBBLE_SEARCH_BYTES, samples.shortest - 4))
+    for place in filter(is_possible_place, (ChecksumPlace(offset, 2) for offset in offsets)):
+        both_bytes = samples.read_field(place, "little")
+        low_half = both_bytes & np.uint64(0x0F)
+        high_half = (both_bytes >> np.uint64(4)) & np.uint64(0xF0)
+        stored = low_half | high_half
         spans = [CoveredSpan("behind")]
-        if offset > 0:
+        if place.offset > 0:
             spans.append(CoveredSpan("all"))
         for span in spans:
-            right = int((samples.compute_checksums(Xor(), place, span) == halves).sum())
-            evidence_bits = weigh_evidence(8, halves, 0, NIBBLE_TRIALS)
+            right = int((samples.compute_checksums(Xor(), place, span) == stored).sum())
+            evidence_bits = weigh_evidence(8, stored, 0, NIBBLE_TRIALS)
             if are_enough(right, len(samples)) and evidence_bits > 0:
                 note = (
                     "the checksum is stored in the low nibbles of two bytes, low half first:"

@@ -228,6 +228,23 @@ def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
     )
 
 
+def test_an_xor_in_two_nibbles_is_searched_only_at_possible_places() -> None:
+    source = random.Random(1)
+    frames = []
+    for _ in range(20):
+        content = source.randbytes(10)
+        checksum = Xor()(content)
+        frames.append(bytes([0xA0 | checksum & 15, 0x50 | checksum >> 4]) + content)
+    match = find_best(frames)
+    assert (match.algorithm, match.place) == (Xor(), ChecksumPlace(0, 2))
+    assert match.is_in_nibbles
+    number_of_checksums = len({frame[:2] for frame in frames})
+    trials = 1 + 2 + 2  # at the offsets 0, 1 and 2
+    assert match.evidence_bits == 8 * number_of_checksums - np.log2(trials)
+    assert search(frames, is_possible_place=lambda place: place.offset == 0) == [match]
+    assert search(frames, is_possible_place=lambda place: place.offset == 1) == []
+
+
 @pytest.mark.slow
 def test_an_xor_in_two_nibbles() -> None:
     match = find_best(
