@@ -65,7 +65,7 @@ def _shared_numbers() -> NDArray[np.int64]:
 
 
 def broadcast_value(values: NDArray[np.int64]) -> int | None:
-    """Return the value of a zero-stride array, such as from `repeat`; None for others."""
+    """Return the value that a zero-stride array repeats; None for all other arrays."""
     if values.strides == (0,) and len(values):
         return values.item(0)
     return None
@@ -76,8 +76,8 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 
     Args:
         values: the values.
-        few: if there are at most this many distinct values, each of them is searched for, because
-            this is faster than sorting.
+        few: up to this number of distinct values, the values are searched one by one, which is
+            faster than sorting.
     """
     values_found = list[int]()
     left = values

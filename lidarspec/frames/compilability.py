@@ -23,9 +23,10 @@ class NotCompilableError(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilableError` if a tree has a part without a computable offset.
+    """Raise `NotCompilableError` if the frames of a tree cannot have layouts.
 
-    It is also raised for values that no column can represent.
+    This is the case if the offset of a part cannot be computed, or if no column can represent the
+    values of a field.
     """
     _check(root, "", is_in_array=False)
     _check_columns(root)
@@ -72,13 +73,12 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
 
 
 def _check_alternatives(node: tree.When | tree.Select) -> None:
-    """Check the names in alternatives that contain a part of measured size.
+    """Check that alternatives do not share the name of a part of measured size.
 
-    `build` measures such a part before it selects an alternative. Therefore, a different field in
-    another alternative must not have the same name.
+    `build` finds the value of such a part by its name, before it selects an alternative.
 
     Raises:
-        NotCompilableError: if a different field has the same name.
+        NotCompilableError: if another alternative has a field with the same name.
     """
     alternatives = tree.children(node)
     for alternative in alternatives:

@@ -174,7 +174,7 @@ def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
 
 
 def _describe_misfit(part: ExaminedFrame) -> Fault:
-    """Return the fault of the part at which a sequence of parts is invalid."""
+    """Return the fault of an invalid part: it is truncated or has a wrong size."""
     shortage = find_shortage(part)
     if shortage is not None:
         return shortage

@@ -248,7 +248,7 @@ class _Encoder:
         return encoded
 
     def _collect(self, node: Node, value: Any, path: str, shown: str, layout: Layout) -> None:
-        """Add the values of a node to the values of their fields.
+        """Collect the values of all fields in a node.
 
         Args:
             value: the given value; None if it is missing.
@@ -335,8 +335,8 @@ class _Encoder:
         """Add one value to the values of its field.
 
         Args:
-            shown: the path for error messages.
-            size: the size of a field of bytes, in bytes.
+            shown: the path with indices, for error messages.
+            size: the size of the field in bytes.
         """
         column = self._columns.setdefault(path, [])
         if info.is_enforced and info.rebuilt is not None:
@@ -582,9 +582,7 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Return the value of a count field for which a formula results in a given length.
-
-    The function tries one value after another.
+    """Find the value of a count field with which a formula results in `length`.
 
     Args:
         count: the formula.
@@ -622,9 +620,9 @@ def _find_count(
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part, given its values.
 
-    The kind has to have all given fields, and its constants have to agree with their values. If
-    several kinds fit, the kind with the fewest fields that are not given is returned. If no kind
-    fits, the first of all kinds is returned.
+    A kind fits if it has all given fields, and if the given values agree with its constants. Of the
+    kinds that fit, the one with the fewest missing values is returned. If no kind fits, the first
+    kind is returned.
     """
     possible = list[tuple[int, Kind]]()
     for kind in node.kinds:

@@ -186,7 +186,7 @@ class CompiledTable:
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
 
     def _get_elements(self, axis: str) -> _Elements:
-        """Return the elements of an array that differ in size. The result is cached."""
+        """Return the elements of an array with elements of different sizes; cached."""
         if axis not in self._arrays:
             table, owners = self.parts(axis)
             counts = np.bincount(owners, minlength=len(self)).astype(np.intp)
@@ -196,7 +196,7 @@ class CompiledTable:
         return self._arrays[axis]
 
     def _load_elements(self, axis: str, path: str) -> NDArray[Any]:
-        """Return the raw values of a field in an array of elements that differ in size."""
+        """Return the raw values of a field in an array with elements of different sizes."""
         base, indices = without_indices(path)
         if indices:
             return _take_element(self, self.raw(base), base, indices)[0]
@@ -209,11 +209,11 @@ class CompiledTable:
         return column
 
     def _find_present_elements(self, axis: str, path: str) -> NDArray[np.bool_]:
-        """Return which frames have a field in an array of elements that differ in size.
+        """Return where a field exists in an array with elements of different sizes.
 
-        The result is (n,) if each frame has the field in all of its elements or in none. A frame
-        with an empty array counts as having the field. Otherwise the result has a value for each
-        element, (n, *lengths).
+        The result has a value for each frame, (n,). If some elements of a frame have the field and
+        others do not, the result has a value for each element, (n, *lengths). A frame with an empty
+        array counts as having the field.
         """
         base, indices = without_indices(path)
         if indices:
@@ -246,7 +246,7 @@ class CompiledTable:
         """Return the length of an array in each frame, (n,).
 
         Args:
-            axis: the path of an array of elements that differ in size.
+            axis: the path of an array with elements of different sizes.
             path: the path of the same array, or of an array in its elements.
         """
         elements = self._get_elements(axis)
@@ -370,7 +370,7 @@ class CompiledTable:
 
 @dataclass(frozen=True, eq=False)
 class _Elements:
-    """The elements of an array that differ in size, as a table of parts.
+    """The elements of an array, which have different sizes, as a table of parts.
 
     Attributes:
         table: the elements of all frames, in stream order.
@@ -698,9 +698,9 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether a value exists.
+    """Return whether a value is not None.
 
-    If some elements of nested lists are missing, the result is nested lists of booleans.
+    For nested lists, the result is True if no element is None, else nested lists of booleans.
     """
     if not isinstance(value, list):
         return value is not None

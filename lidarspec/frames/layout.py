@@ -71,7 +71,7 @@ def view_span(rows: Bytes2D) -> NDArray[np.uint8]:
 def gather_rows(
     buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
 ) -> NDArray[np.uint8]:
-    """Return `size` bytes from each of these offsets on, (n, size).
+    """Return rows of `size` bytes, one for each start offset, (n, size).
 
     Nothing is copied if each row follows the previous one in the buffer.
 
@@ -125,7 +125,7 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return the raw values in frames given as rows of bytes.
+        """Return the raw values of the field in each frame, given the frames as rows.
 
         Returns:
             An array (n, *shape) in native byte order.
@@ -456,7 +456,7 @@ class Seal:
         return total
 
     def _list_byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """Return for each byte of a field the position of its lowest bit in the value."""
+        """Return how far each byte of a field is shifted in the value, in bits."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
@@ -630,8 +630,8 @@ class LayoutRefusal:
         error: the error of a plugin expression that failed.
         has_wrong_constant: whether a constant is wrong. If this is False and `error` is None, the
             frame is too long.
-        constants: if the frame is too long, the constants before the part that is too long. If one
-            of them is wrong in a candidate, this constant is the fault of the candidate.
+        constants: if the frame is too long, the constants before the part that is too long.
+            A candidate in which one of these constants is wrong gets the status `CONSTANT`.
     """
 
     error: PluginError | None = None
@@ -650,10 +650,10 @@ class Layout:
         seals: the checksums, inner checksums first.
         places: the byte range of each named part outside arrays.
         branches: the branch that each `When` and `Select` takes.
-        following: pairs of a field and its value, if the value follows from the header. The values
-            are written when a frame is built, and not checked when it is parsed.
-        lengths: the length of each array, by its axis; 0 for an array inside an empty array.
-        regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
+        following: the fields whose values follow from the header, each with its value. The values
+            are written when a frame is built, and not checked when a frame is parsed.
+        lengths: the length of each array, by path; 0 for an array inside an empty array.
+        regions: the `Region` of each sequence of parts (frames within the frame), by path.
         held: the bits of the fields that declare the sizes of parts, as (mask, value) by offset.
         conditions: the conditions that the values of fields have to meet.
         derived: the `Derivation` of each value without bytes of its own, by path; the `Leaf` of
@@ -677,9 +677,9 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits that all frames of this layout have, as (mask, value) by offset.
+        """The bits in `constants` and in `held`, as (mask, value) by offset.
 
-        They are the bits of `constants` and of `held`.
+        These bits are the same in all frames of this layout.
         """
         both = dict(self.constants)
         for offset, (mask, value) in self.held.items():

@@ -507,7 +507,7 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _iter_following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield pairs of a field and its value, if the value follows from the header."""
+        """Yield each field whose value follows from the header, with the value."""
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.is_enforced and not leaf.shape:
                 # construct evaluates other fields when a frame is built.
@@ -540,9 +540,10 @@ def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> Non
 
 
 def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
-    """Yield checksums, each before the checksums that cover its field.
+    """Yield checksums in the order in which they can be computed.
 
-    If neither of two checksums covers the field of the other, the inner one is first.
+    A checksum comes after all checksums whose fields it covers. Otherwise, inner checksums come
+    before outer checksums.
     """
     left = list(seals)
     while left:
@@ -697,9 +698,10 @@ class _ValueClasses:
         return cls(info.limits, low, high)
 
     def limit_to(self, value: int) -> _ValueClasses:
-        """Return classes that map all larger values to `value`, which is too large itself.
+        """Return classes that map all larger values to `value`.
 
-        If a larger value may make the frame shorter, the classes are not changed.
+        `value` makes the frame too long. If a larger value may make the frame shorter, the classes
+        are not changed.
         """
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
@@ -743,7 +745,7 @@ def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
 
 
 def _is_increasing(formula: tree.Formula) -> bool:
-    """Return whether a formula of a single field never decreases if the field grows."""
+    """Return whether a formula never decreases while its only field increases."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
@@ -798,7 +800,7 @@ class _CandidateSet:
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
         """Read the field of a node in the candidates that contain it.
 
-        Candidates that end before the field, and have a wrong constant, are added to `refuted`.
+        If a candidate ends before the field and has a wrong constant, it is added to `refuted`.
 
         Returns:
             The indices of the candidates with the field (None for all candidates), and the values
@@ -813,7 +815,7 @@ class _CandidateSet:
         return there, values
 
     def add_refuted(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
-        """Add the candidates with a wrong constant before this node to `refuted`."""
+        """Add the candidates to `refuted` in which a constant of the node is wrong."""
         if node.constants:
             self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
 
@@ -903,7 +905,7 @@ class HeaderTree:
         Args:
             number: the number of candidates.
             read: a function that reads the field of a node for some candidates.
-            places: the candidates with their bytes; None if only `read` can read the bytes.
+            places: the bytes of the candidates; None if the bytes are available only to `read`.
         """
         self._limit_cache()
         groups: list[Group] = []
@@ -979,13 +981,13 @@ class HeaderTree:
     def find_node(
         self, frame: bytes, *, since: HeaderNode | None = None, is_whole_frame: bool = False
     ) -> HeaderNode:
-        """Return the last node that the available bytes of a header determine.
+        """Return the node to which the available bytes of a frame lead.
 
-        The node has a result, or a header field that is not completely available.
+        If the bytes do not determine the layout, the node has no result.
 
         Args:
             frame: the available bytes.
-            since: the node for fewer bytes of the same header, to continue from.
+            since: the node that was returned for fewer bytes of this frame, to continue from.
             is_whole_frame: whether no bytes of the frame follow.
         """
         if since is None:
@@ -1047,8 +1049,7 @@ class HeaderTree:
             is_whole_frame: whether no bytes of the frame follow.
 
         Returns:
-            The last node. It has a result, or a header field that the available bytes do not
-            contain, or neither if the frame is longer than the available bytes.
+            The last node. If the bytes do not determine the layout, the node has no result.
         """
 
         def read_selector(leaf: Leaf | MeasuredSize, walk: HeaderWalk) -> int:

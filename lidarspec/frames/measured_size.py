@@ -167,9 +167,9 @@ class TextSize(MeasuredSize):
     def _find_sizes_together(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find_sizes` for texts with equally aligned end marks.
+        """Return the result of `_find_sizes` for texts at offsets in equal steps.
 
-        The offsets of these texts differ by multiples of the size of the mark.
+        The offsets of the texts differ by multiples of the size of the end mark.
         """
         step = len(self.ending.mark)
         begin = int(starts.min())
@@ -181,10 +181,10 @@ class TextSize(MeasuredSize):
         return np.where(found + step <= ends, sizes, -1)
 
     def _match(self, units: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return whether each unit is the end mark, (...).
+        """Return whether each unit is equal to the end mark, (...).
 
         Args:
-            units: groups of as many bytes as the mark has, (..., size).
+            units: groups of bytes, (..., size). A group has the size of the mark.
         """
         mark = np.frombuffer(self.ending.mark, np.uint8)
         mask = np.frombuffer(self.ending.mask, np.uint8)

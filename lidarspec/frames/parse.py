@@ -215,7 +215,7 @@ def _run_search(
     find: Callable[[ExaminedFrame], diagnose.Fault | None],
     examined: ExaminedFrame,
 ) -> diagnose.Fault | None:
-    """Run a search for a fault and return its result.
+    """Return the fault that `find` finds.
 
     Raises:
         SpecError: if an expression or a checksum of the struct raises.
@@ -505,8 +505,8 @@ def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequen
 def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
     """Return a reader of bit blocks.
 
-    Each block is read as one number, in the byte order in which the values consist of fewer runs of
-    bits.
+    Each block is read as one number. The byte order is the one that splits the values into fewer
+    runs of bits.
     """
     leaf = _find_leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
@@ -539,9 +539,9 @@ def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[A
 def _find_bit_runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """Return the runs of consecutive bits that a value has in its bit block.
+    """Return the runs of consecutive bits of a bit block from which a value is joined.
 
-    The block is read as one number. Each run is (lowest bit in the block, mask, lowest bit of the
+    The block is read as one number. A run is (lowest bit in the block, mask, lowest bit in the
     value).
     """
     runs = list[tuple[int, int, int]]()
@@ -595,7 +595,7 @@ def _combine_readers(parts: Sequence[tuple[tuple[str | int, ...], Reader]], coun
     """Combine the readers of the numbers of a bit block into one reader.
 
     Args:
-        parts: for each number, its names and indices in the block, and its reader.
+        parts: a pair for each number of the block: its path (names and indices), and its reader.
         count: the number of blocks in a frame.
     """
     if not parts[0][0]:
@@ -629,8 +629,7 @@ def find_frame_layout(
 def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
     """Return a sort key, which is higher for a fault that is later in the frame.
 
-    The highest keys are those of trailing bytes, and of a wrong checksum in an otherwise complete
-    frame.
+    Trailing bytes, and a wrong checksum of a complete frame, have the highest keys.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset

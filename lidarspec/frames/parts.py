@@ -347,7 +347,10 @@ class _PartWalk:
     def _match_constants(
         self, which: Offsets, constants: tuple[Word, ...]
     ) -> NDArray[np.bool_] | None:
-        """Return whether the next part of each frame has these constants; None if all have."""
+        """Return whether the next part of each frame has these constants, (k,).
+
+        Returns None if all of the parts have the constants.
+        """
         if constants:
             return match_constants_at(
                 self._buffer, self._ends[which], constants, self._select_stops(which)
@@ -364,9 +367,9 @@ class _PartWalk:
         self._errors += [refused.error] if refused.error else []
 
     def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
-        """Return the frames in which the next part has the sizes that it declares.
+        """Return the frames in which the sizes in the next part agree with its layout.
 
-        Sets the status of all other frames.
+        All other frames get the status `LENGTH`.
         """
         if not layout.held:
             return which
@@ -467,7 +470,7 @@ def match_constants_at(
     constants: tuple[Word, ...],
     stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
-    """Return whether each candidate has some constants, (n,); None if all have them.
+    """Return whether each candidate has these constants, (n,); None if all have them.
 
     In a truncated candidate, only the available bytes are compared.
 

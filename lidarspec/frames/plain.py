@@ -136,10 +136,10 @@ def _iter_fields(
 
 
 def _has_spans(value: Any, start: int, end: int) -> bool:
-    """Return whether a value is a struct with spans of its members in the frame.
+    """Return whether a value is a struct that knows the offsets of its members.
 
-    False if the bytes of the struct were decoded first, because the spans are then offsets in the
-    decoded bytes.
+    Returns False if construct has decoded the bytes of the struct first, because the offsets then
+    refer to the decoded bytes.
     """
     if not isinstance(value, dict) or not value.get("_spans"):
         return False

@@ -107,7 +107,7 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Return whether computing the rows one by one is faster than all at once."""
+    """Return whether it is faster to compute the rows one by one than together."""
     if not isinstance(algorithm, Crc):
         return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
@@ -169,13 +169,13 @@ def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans)
 def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return the masks of the low and the high bytes of each word.
+    """Return masks that select the low and the high bytes in each word of a row.
 
     Args:
         number: the number of words, as returned by `load_words`.
 
     Returns:
-        Pairs of the indices of the words with equal masks, and these masks (low, high).
+        Pairs of the indices of some words, and the two masks of these words (low, high).
     """
     masks = np.zeros((2, 8 * number), np.uint8)
     for mask, half in zip(masks, algorithm.halves, strict=True):
@@ -445,9 +445,9 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Reduce each row to one word with the same register, (n,).
+    """Return a word for each row, from which the register is the same as from the row.
 
-    The polynomial `poly` must have eight bits.
+    The result is (n,). The polynomial `poly` must have eight bits.
     """
     shares = _assign_sums(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
@@ -467,7 +467,7 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word a mask of the sums that it is XORed into.
+    """Return a mask for each word, which selects the sums that the word is XORed onto.
 
     Bit n of the mask, from 0 to 7, stands for the sum that `_sum_words` advances by n bytes.
     """

@@ -171,7 +171,10 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The sequences of parts by path, without arrays of elements that differ in size."""
+        """The sequences of parts by path, without those that are arrays.
+
+        The elements of such an array differ in size (`PartSequence.is_array`).
+        """
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 
     @cached_property
@@ -436,7 +439,7 @@ def _add_count(
 ) -> None:
     """Store the declared count of an array.
 
-    If several branches declare the array, the count is a number only if all of them agree.
+    If two branches of the struct declare different numbers, None is stored.
     """
     if optional and isinstance(count, int):
         count = Op("+", (count, 0))  # not a number, because only some frames have the array

@@ -80,7 +80,7 @@ class Coder:
         return struct
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
-        """Add the encoded frame to parsed values, if `encode` cannot restore it.
+        """Add the encoded frame to parsed values if `encode` would return other bytes.
 
         Args:
             values: the parsed values; the frame is added under the name `SPELLING`.
@@ -92,7 +92,8 @@ class Coder:
     def find_size(self, data: bytes) -> int | None:
         """Return the size of the frame at the start of some bytes.
 
-        Returns None if the header determines the size, or if the end is missing.
+        Returns None if the size has to be found by the layout, or if the end of the frame is
+        missing.
         """
         return None
 
@@ -119,7 +120,7 @@ class _FieldFinder:
 
 
 def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
-    """Return the fields that a header determines, and the offset after the last one."""
+    """Return the fields with known offsets at a node, and the offset after them."""
     if isinstance(node.result, Layout):
         return tuple(node.result.leaves.values()), node.result.size
     if isinstance(node.leaf, Leaf):
@@ -133,8 +134,7 @@ class FormCoder(Coder):
     Attributes:
         form: the wire form.
         tree: the layouts of the struct.
-        prefix: the bytes that are the same in all frames and are before the first number, by
-            offset.
+        prefix: the bytes before the first number that are the same in all frames, by offset.
 
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
@@ -373,9 +373,10 @@ def _find_element_types(
 
 @functools.lru_cache(maxsize=256)
 def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the offset of each element of all fields, and the element's field index.
+    """Return the offset of each element, ascending, and the index of its field.
 
-    The offsets are ascending. All fields of a bit block have the index of the first of them.
+    The elements are those of all fields. A bit block is one element, with the index of its first
+    field.
     """
     offsets = [np.zeros(0, np.intp)]
     owners = [np.zeros(0, np.intp)]

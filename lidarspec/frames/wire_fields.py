@@ -89,7 +89,10 @@ class PlacedSeal:
 
 @dataclass(frozen=True)
 class ExaminedParts:
-    """The parts of a frame at a path. Unless `is_whole`, the last part is invalid."""
+    """The parts of a frame at one path.
+
+    If `is_whole` is False, the last part is invalid.
+    """
 
     parts: list[ExaminedFrame]
     is_whole: bool
@@ -388,7 +391,7 @@ class _Cursor:
 
 
 def _decode_bytes(info: tree.FieldInfo, data: bytes) -> Any:
-    """Return the value of bytes, or the bytes if a function of the field cannot decode them."""
+    """Return the value of a field; if its adapter fails, return the bytes."""
     if info.adapter is None:
         return data
     try:

@@ -142,8 +142,8 @@ def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
     """Return a size as `SizeFormula`.
 
     Args:
-        size: the declared size; None if it is unknown, which is written as "size(...)".
-        shown: the path between these parentheses.
+        size: the declared size; None if it is unknown.
+        shown: the path of the part. An unknown size is written as "size(PATH)".
     """
     if isinstance(size, int):
         return SizeFormula(size)
