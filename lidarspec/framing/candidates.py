@@ -3,15 +3,15 @@
 A candidate is an offset at which the constants of a frame type match.
 
 A frame type with `after` becomes active when a frame of the type named in its `after` arrives. It
-stays active until a frame arrives whose type is named in another `after`. The active types can
-therefore change with every frame. To keep this fast, all candidates of one type in a piece are
+stays active until a frame of another type that is named in some `after` arrives. The active types
+can therefore change with every frame. To keep this fast, all candidates of one type in a piece are
 checked together when the type first becomes active.
 
 Weak types (`confirm` > 1) are checked in the same way, but of each run, only the first frame is
 used as a candidate (`weak_frames`).
 
-If the constants of a candidate have not all arrived, it is not checked yet, unless its type is
-weak. Such candidates are only at the end of the piece, but may be of many types.
+At the end of a piece, some of the constants of a candidate may not have arrived yet. The candidate
+is then checked with the next piece. Candidates of weak types are checked at once.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class SearchState:
     """The state of the search that is kept between the pieces of a stream.
 
     Attributes:
-        after: of all frame types that are named in any `after`, the name of the one that arrived
-            last; None before the first such frame.
+        after: the name of the last frame type that arrived and is named in the `after` of a type;
+            None before the first such frame.
         changed: the stream offset at which the active types last changed.
         run: the name of the weak type of the last accepted run.
         run_end: the stream offset of the end of this run.
@@ -74,7 +74,7 @@ class PieceResult:
         frames: the accepted frames; their offsets count from the start of the piece.
         end: the offset of the first byte that must be searched again.
         is_waiting: whether more bytes are required to decide about the candidate at `end`.
-        need: the number of bytes from `end` on that the next search requires; 0 if unknown.
+        need: how many bytes, counted from `end`, the next search requires; 0 if unknown.
         rejected: the number of rejected candidates, by the name of the counter.
         errors: the exceptions that plugin code has raised.
     """
@@ -145,7 +145,10 @@ class Framing:
         return active
 
     def filter(self, kinds: Sequence[int]) -> ConstantFilter:
-        """Return a filter for some types, by their constants from the third one on."""
+        """Return a filter by the constants of some types.
+
+        The first two constants of each type are compared before filtering.
+        """
         key = tuple(kinds)
         if key not in self._filters:
             self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
@@ -270,8 +273,8 @@ class LiveCandidates:
     """The candidates of a piece that may be accepted under the same active types.
 
     Attributes:
-        frames: the valid and incomplete candidates, sorted by offset. At each offset there is at
-            most one candidate, of the first type in declaration order. For a weak type, only the
+        frames: the valid and incomplete candidates, sorted by offset. If several types match at one
+            offset, the candidate has the type that is declared first. For a weak type, only the
             first frame of each run is included.
         ends: the end offset of each candidate, (n,); for the first frame of a run, the end of the
             run.
@@ -373,7 +376,7 @@ class Candidates:
     def _find_waiting(self, kinds: Sequence[int]) -> list[Frames]:
         """Return the candidates of these types whose last constant has not arrived yet.
 
-        At each offset, only the candidate of the first type is returned.
+        If several of the types match at one offset, the first of these types is used.
         """
         first_kinds: dict[int, int] = {}
         for kind in reversed(kinds):
@@ -457,7 +460,7 @@ def select_live(candidates: Frames, *, final: bool) -> Frames:
 def merge_by_offset(candidates: Sequence[Frames]) -> Frames:
     """Merge the valid and incomplete candidates of several types, sorted by offset.
 
-    At each offset, only the candidate of the first type is kept.
+    If there are several candidates at one offset, the type that is declared first is kept.
     """
     parts = [own for own in candidates if len(own)]
     if not parts:

@@ -47,8 +47,8 @@ class _PartialMessage:
 
     Attributes:
         count: the declared number of fragments, or the declared size of the message in bytes.
-        place: the offset in the input of the fragment that arrived first.
-        at: the arrival time of this fragment, ns.
+        place: the offset in the input of the first received fragment.
+        at: the arrival time of the first received fragment, ns.
         parts: the payloads of the fragments by index.
         size: the total size of the payloads in bytes.
     """
@@ -75,7 +75,7 @@ class JoinedMessages:
         at: the arrival time of each message, ns.
         places: the offset of each message in the input.
         dropped: the number of bytes that were dropped before each message, and after the last one.
-        heads: the number of bytes in fragments outside of their payloads.
+        heads: the number of bytes of the fragments that are not payload.
     """
 
     buffer: NDArray[np.uint8]

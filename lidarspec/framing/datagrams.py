@@ -94,7 +94,7 @@ class _DatagramBatch:
         return self._piece
 
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
-        """Find the types of the datagrams from index `position` on.
+        """Find the types of the datagrams, beginning with index `position`.
 
         The result ends with the first frame that changes the active types, or with the last
         datagram.
@@ -132,9 +132,9 @@ class _DatagramBatch:
             mode: the search state, which determines the active types.
 
         Returns:
-            The datagrams as frames, and the reason why each invalid datagram is not a frame. The
-            reason is a status, 0 if the datagram has the constants of no type, or `PLUGIN` if it
-            must be checked alone.
+            The datagrams as frames, and a status for each datagram. For an invalid datagram, the
+            status is the reason: 0 if the datagram has the constants of no type, and `PLUGIN` if
+            the datagram must be checked alone.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -206,7 +206,9 @@ class _DatagramBatch:
     def _count_rejected(
         self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
     ) -> Frames:
-        """Count invalid datagrams; if the plugin failed for a datagram, check it again.
+        """Count invalid datagrams by reason.
+
+        A datagram for which the plugin failed is checked again, alone.
 
         Returns:
             The datagrams up to the first frame that changes the active types.

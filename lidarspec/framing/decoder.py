@@ -198,7 +198,7 @@ class Decoder:
         return parts
 
     def take_pending(self) -> list[Frames]:
-        """Reject incomplete candidates; return frames found in their bytes, as arrays."""
+        """Reject incomplete candidates, and return the frames found in their bytes."""
         parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:
@@ -305,7 +305,7 @@ class Decoder:
         good: NDArray[np.bool_],
         joined: JoinedMessages | None,
     ) -> NDArray[np.int64]:
-        """Count the skipped bytes in datagrams, and return their number before each frame.
+        """Count the skipped bytes in a batch of datagrams.
 
         Args:
             good: whether each datagram is a frame.
@@ -366,10 +366,10 @@ class Decoder:
         return start
 
     def _decode_piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
-        """Return the frames of a piece of a stream.
+        """Find the frames in a piece of a stream.
 
-        Frames at equal distances are checked as the rows of an array. All other pieces are
-        searched.
+        If the piece begins with frames at equal distances, these frames are checked as the rows of
+        an array. Otherwise the piece is searched.
         """
         piece = None
         if not final:
@@ -397,7 +397,7 @@ class Decoder:
         )
 
     def _count_gaps(self, buffer: NDArray[np.uint8], frames: Frames, end: int) -> NDArray[np.int64]:
-        """Count skipped bytes in a piece; return their number before each frame.
+        """Count the skipped bytes in a piece.
 
         Args:
             end: the offset of the end of the piece.

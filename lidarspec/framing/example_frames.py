@@ -108,7 +108,8 @@ def draw_row(
     Args:
         frame: the name of a frame type with layouts and without parts.
         drawn: functions that draw the raw values of certain fields, by path.
-        tries: the number of attempts with random frames, and then with frames of the `sweep`.
+        tries: the maximum number of attempts with random frames. If all of them fail, frames with
+            the values of the `sweep` are tried as often.
 
     Raises:
         SpecError: if none of the frames is plausible.
@@ -208,10 +209,7 @@ LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 def _make_random_rows(
     engine: Codec, layout: Layout, number: int, source: random.Random
 ) -> NDArray[np.uint8]:
-    """Return structs of random bytes with allowed values, (number, size).
-
-    All values can be encoded by the wire form.
-    """
+    """Return random structs that have allowed values and can be encoded, (number, size)."""
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
         .reshape(number, layout.size)
@@ -420,7 +418,9 @@ def _store_drawn(
 
 
 def _make_sweep_draws(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """Return the raw values of the header fields of a sweep as functions, by path.
+    """Return functions that return the raw values of a sweep, by path.
+
+    Arrays and bytes are left out.
 
     Args:
         values: the values of the sweep in units, by path.

@@ -71,7 +71,7 @@ class Codec:
     def survey_rows(
         self, rows: NDArray[np.uint8], *, sums: Sums | None = None
     ) -> tuple[Layout, Status, tuple[PluginError, ...]] | None:
-        """Check candidates of one size that may have a common layout.
+        """Check candidates of one size, if they have a common layout.
 
         Args:
             rows: the candidates, (n, size).

@@ -134,7 +134,7 @@ class CandidateChecker:
         """Set the status of candidates that have a wrong constant or a wrong length.
 
         Args:
-            status: the status of each candidate, `VALID` before the call; it is updated.
+            status: the status of each candidate, which is updated. It is `VALID` before the call.
         """
         held = match_constants(self._constants, rows) if len(rows) else None
         if held is not None:
@@ -422,7 +422,9 @@ class LookupCondition:
         return np.asarray(held.all(axis=tuple(range(1, held.ndim))))
 
     def holds_within(self, rows: Bytes2D, lengths: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether the condition is true in each frame, (n,), for arrays of varying length.
+        """Return whether the condition is true in each frame, (n,).
+
+        The frames may have arrays of different lengths.
 
         Args:
             rows: the frames, (n, size), padded to one size.
@@ -467,15 +469,14 @@ def _make_table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _Look
 
 
 def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
-    """Return the bits on which a lookup table depends, and their allowed values.
-
-    Returns None unless one or two values are allowed.
+    """Return the bits on which a condition depends, and the values that make it true.
 
     Args:
-        listed: whether each value of the table is allowed.
+        listed: for each value of the table, whether the condition is true.
 
     Returns:
-        A mask of the bits, and the allowed values of the masked bits.
+        A mask of the bits, and one or two values of the masked bits. None if there are more than
+        two such values, or none.
     """
     values = np.arange(len(listed))
     mask = sum(

@@ -146,9 +146,9 @@ def find_common_step(starts: Indices) -> int:
 
 
 def _make_result(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
-    """Return the result for a piece that begins with some frames.
+    """Return the result for a piece, given the frames at the start of the piece.
 
-    The bytes after these frames may be the start of a further frame.
+    All bytes after these frames have to be searched again.
     """
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
@@ -181,7 +181,7 @@ def _count_needed(
 
 
 def _begins_with(marks: Marks, data: bytes) -> bool:
-    """Return whether bytes have some constants; constants beyond their end are ignored."""
+    """Return whether the given bytes of a frame agree with the constants of a type."""
     return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
 
@@ -224,11 +224,11 @@ def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | Non
 
 
 def _may_have_constants(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
-    """Return whether any row has the constants of a frame type.
+    """Return whether a row has the constants of the type `kind`.
 
     Args:
-        kind: the index of this type.
-        other: the index of the type that the first row matches.
+        kind: the index of the type.
+        other: the index of the type whose constants are in the first row.
     """
     if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False

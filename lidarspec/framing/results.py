@@ -214,7 +214,7 @@ class Frames:
             joined.
         places: the same offsets, as a range if the frames have one size and follow one another.
         rows: the bytes of each frame as a row, if all have one layout and the rows were gathered.
-            For candidates, only the first complete ones have rows.
+            Incomplete candidates, which are the last candidates, have no rows.
         errors: the errors of the plugin.
     """
 

@@ -1,15 +1,15 @@
 """Find frames in a byte stream by a rule that is the same for every sensor.
 
 The leftmost valid candidate is accepted, and the search continues after its last byte. After an
-invalid candidate, the search continues at the next byte. At one offset, the first type in order
-that matches is used. A type with `after` is active only if its `after` names the type of the last
-frame that changed the active types. Frames of a type that no `after` names do not change the active
-types. Frames of a type with `confirm` are accepted only in runs without gaps
+invalid candidate, the search continues at the next byte. If several types match at one offset, the
+type that is declared first is used. A type with `after` is active only if its `after` names the
+type of the last frame that changed the active types. Frames of a type that no `after` names do not
+change the active types. Frames of a type with `confirm` are accepted only in runs without gaps
 (`lidarspec.framing.weak_frames`).
 
-All candidates of a piece are checked together, and accepted together up to the next conflict or
-frame that changes the active types. The time is therefore linear in the size of the input for any
-input, and the result is the same as that of a search byte by byte.
+All candidates of a piece are checked together. They are accepted together up to the next overlap of
+two candidates, or up to the next frame that changes the active types. The time is therefore linear
+in the size of the input. The result is the same as that of a search byte by byte.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def find_frames(
 
 
 class _FrameWalk:
-    """Accepts the candidates of a piece for one set of active types.
+    """Accepts the candidates of a piece while one set of frame types is active.
 
     Args:
         live: the valid and incomplete candidates.
@@ -177,7 +177,7 @@ class _FrameWalk:
         return [part for part in parts if len(part)]
 
     def _accept_rows(self, first: int, last: int) -> None:
-        """Accept the candidates of consecutive rows."""
+        """Accept the candidates from row `first` to row `last`."""
         self._taken.append((first, last))
         if self._runs and last >= first:
             kind = self._frames.kinds.item(last)
@@ -186,7 +186,10 @@ class _FrameWalk:
                 self._mode.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
-        """Extend a run that ended at `position`, and return the new end of the run."""
+        """Extend the last accepted run, and return the new end of the run.
+
+        If the run did not end at `position`, nothing changes, and `position` is returned.
+        """
         if self._mode.run_end != self._base + position:
             return position
         for kind, runs in self._runs.items():
@@ -240,14 +243,14 @@ def count_rejected(
     candidates: Candidates,
     stays: list[tuple[int, str | None]],
 ) -> None:
-    """Count the rejected candidates outside of the accepted frames.
+    """Count the rejected candidates of a piece.
 
-    At the first byte of an accepted frame, rejected candidates of types that are declared earlier
-    count as well.
+    Candidates inside accepted frames are not counted. A candidate at the first byte of a frame is
+    counted if its type is declared before the type of the frame.
 
     Args:
-        stays: for each stretch with the same active types, its offset and the value of
-            `SearchState.after`.
+        stays: pairs of an offset and the value of `SearchState.after` that applies after this
+            offset, in order.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])

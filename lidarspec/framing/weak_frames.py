@@ -87,10 +87,10 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """The rows that are 1, 2, 4, 8 ... frames further in a run, each (n,).
+        """For each row, the rows that are 1, 2, 4, 8 ... frames later in its run, (n,) each.
 
-        If the run ends earlier, this is its last row. In the last array, all rows are the last of
-        their run.
+        If the run ends before, the array has the last row of the run. The last array has the last
+        row of every run.
         """
         count = len(self.frames)
         rows = np.arange(count)
