@@ -68,8 +68,8 @@ class Batch:
         state: for each other frame type, a table of its frames, and an array (n,) with the row of
             the last frame before each packet; -1 for a packet before the first frame.
         defaults: the declared defaults of state columns, by frame type and path.
-        carry: for each call of `previous` or `last`, by its number, the values from the previous
-            batch.
+        carry: the values from the previous batch, by the number of the call of `previous` or
+            `last`.
         nominal: whether a declared default of a state column was used.
         left: for each call of `previous` or `last`, a function that returns the values for the next
             batch.
@@ -108,10 +108,10 @@ class Column(NDArrayOperatorsMixin):
         axes: the names of the axes after the first; None for an axis of length 1. A name with "?"
             is not the axis of a field: "name?" was given by `along`, "?name" was guessed for a
             plain array.
-        ready: the number of packets at the start of the batch with values that do not depend on
-            later packets.
+        ready: how many packets, counted from the start of the batch, have final values. The values
+            of all later packets depend on the next batch.
         source: the path of the field, if the column is an unchanged field, else "".
-        frame: the other frame type that the field belongs to; "" for the packets themselves.
+        frame: the frame type that contains the field; "" if it is the type of the packets.
     """
 
     #: A column cannot be iterated.
@@ -200,10 +200,13 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """Return the same values on other axes, which are named after arrays of the frame.
+        """Return the same values along other arrays of the frame.
 
-        The arrays of the column become the last of the named arrays. If a named array is longer
-        than the column, the missing elements are nan.
+        If more arrays are named than the column has, the column uses the innermost of them. If a
+        named array is longer than the column, the missing elements are nan.
+
+        Args:
+            axes: the paths or the last names of the arrays.
 
         Raises:
             SpecError: if the column has more axes than are named, or if an array is unknown.
@@ -249,9 +252,9 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """Return 0, 1, 2 ... up to the largest value minus 1, (m,).
+        """Return the numbers from 0 to m - 1, (m,). m is the largest value of the column.
 
-        If this column is the length of an array, these are the indices of the array.
+        If the column is the length of an array, the numbers are the indices of this array.
         """
         schema = self.batch.table.schema
         most = int(np.nanmax(self.array, initial=0))
@@ -271,13 +274,12 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """Return a row of a table for each value, which is the index of the row.
+        """Return a row of a table for each value. The value is the index of the row.
 
-        The k numbers of a row are on an additional axis: the axis of the array in the frame that
-        has k elements.
+        The k numbers of a row are along an array of the frame with k elements.
 
         Args:
-            table: (m + 1, k); the last row is nan, and is used for values outside of 0 to m - 1.
+            table: (m + 1, k). The last row is nan; values outside of 0 to m - 1 select this row.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -498,8 +500,8 @@ def align(
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """Cut each axis of the arrays to its shortest length, so that they broadcast.
 
-    Without packets, a column of variable length is empty, but a table of the plugin for this column
-    is not. Axes of length 1 are not changed.
+    Axes of length 1 are not changed. The lengths differ if there are no packets: a column of
+    variable length is then empty, but a table of the plugin is not.
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
@@ -520,7 +522,7 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
         name: the name of the axis in the second value; None without a name.
 
     Raises:
-        SpecError: if the names belong to different arrays, and neither was guessed.
+        SpecError: if two names that were not guessed belong to different arrays.
     """
     if first is None or name is None:
         return first or name
@@ -585,14 +587,17 @@ def _find_axis(
     table: Table,
     without: Sequence[int] = (),
 ) -> int:
-    """Return the index in `axes` of the axis that the first axis of a plain array belongs to.
+    """Return the index in `axes` at which the axes of a plain array begin.
 
-    The axis is found by its length. First, the length is compared with the axes of the columns that
-    are combined with the array, which `axes` and `lengths` describe. Then it is compared with all
-    arrays of the frame.
+    The index is found by the lengths of the plain array. They are first compared with the columns
+    that are combined with the array, and then with the arrays of the frame.
 
     Args:
-        without: positions in `axes` that are not considered.
+        shape: the lengths of the plain array.
+        axes: the names of the axes of the columns.
+        lengths: the lengths of the axes of the columns.
+        table: the table of the packets.
+        without: indices in `axes`. Arrays of the frame at these indices are ignored.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
@@ -681,8 +686,8 @@ def align_points(
 def _find_extent(table: Table, axis: str, length: int) -> int:
     """Return the length to use for values along an array.
 
-    This is `length`. If outer arrays are empty in some frame, it is at most the maximum length of
-    the array.
+    If an outer array is empty in some frame, `length` is limited to the maximum length of the
+    array. Otherwise `length` is returned.
 
     Args:
         axis: the path of the array.
@@ -758,8 +763,8 @@ def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray
 def remainder(values: Any, full: Any) -> NDArray[Any]:
     """Return exactly the same values as ``np.remainder``.
 
-    For values less than one turn outside of [0, full), such as nearly all angles, this function is
-    four times as fast.
+    This function is four times as fast for values from -full to 2 * full, such as nearly all
+    angles.
     """
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
@@ -774,7 +779,7 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
 def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
-    """Return the last values before index `end`, without a loss between them.
+    """Return the last values before index `end`, beginning after the last loss.
 
     Args:
         values: the values in stream order.
@@ -834,7 +839,11 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
 
 
 def _name_axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
-    """Return the name of an axis; None if every packet has exactly one element."""
+    """Return `name`; None if the array has exactly one element in every packet.
+
+    Args:
+        known: whether the lengths of the array in `table` are those in the packets.
+    """
     if length != 1 or (
         known
         and not isinstance(table.schema.arrays.get(name), int)
@@ -872,7 +881,7 @@ class Fields:
 
     Args:
         prefix: the names of the enclosing structs, each followed by a dot.
-        frame: the other frame type that the fields belong to; "" for the packets themselves.
+        frame: the frame type that contains the fields; "" if it is the type of the packets.
     """
 
     def __init__(self, batch: Batch, prefix: str = "", frame: str = "") -> None:
@@ -932,7 +941,10 @@ def _list_paths(batch: Batch, frame: str) -> Iterable[str]:
 
 
 class _States:
-    """``f.state``: the fields of the last frame of each other type before each packet."""
+    """``f.state``: the fields of other frame types.
+
+    For each packet, a field has its value in the last frame of its type before the packet.
+    """
 
     def __init__(self, batch: Batch) -> None:
         self._batch = batch

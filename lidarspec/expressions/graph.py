@@ -9,9 +9,9 @@ reason.
 
 `traverse` iterates over the nodes of a graph, and `compute` evaluates it for given values of the
 fields. The compilers of points (`points.numpy_plan`, `points.numba_kernels`) translate a graph.
-They use the functions in this module that split conditions and sums. For these functions, an
-expression is *full* if each point has its own value. Otherwise, it is *low*, and the reference
-evaluator computes it once for each packet or block.
+They split conditions and sums by functions of this module. In these functions, an expression is
+*full* if each point has its own value. Otherwise, it is *low*, and the reference evaluator computes
+it once for each packet or block.
 
 Operands that are not nodes (`vocabulary.AlongAxis`, plain arrays) are aligned when they are
 recorded, so that evaluating the graph only broadcasts arrays.
@@ -109,8 +109,8 @@ class Node:
     def _operands(self) -> list[tuple[bool, Any]]:
         """A pair for each argument.
 
-        For a node, it is True and the lengths of the axes that the node lacks. For a constant, it
-        is False and the constant as an array.
+        For a node, the pair is True and a tuple of 1s, one for each axis that the node lacks. For a
+        constant, the pair is False and the constant as an array.
         """
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
@@ -145,8 +145,8 @@ class Trace:
 
     Attributes:
         nodes: the nodes in the order in which they were made.
-        steps: (node, number of indices) for each call of `steps`. The trace is valid only for
-            packets for which `steps` returns these numbers of indices.
+        steps: for each call of `Column.steps`, the node and the length of the result. The trace is
+            valid for packets for which all results have the same lengths.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -427,7 +427,7 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
 
 
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
-    """Return a batch for tracing, with the first frame of a group as two packets.
+    """Return a batch for tracing, which has the first frame of a group twice.
 
     With two packets, values that all packets share can be distinguished from values of each packet.
     """
@@ -461,8 +461,8 @@ def compute(
     Args:
         results: the known values of nodes, as columns or as arrays with one row for each packet.
             New values are added, so that each node is computed once.
-        source: a function that returns the value of a node that is not computed from others, such
-            as a field, and None for all other nodes.
+        source: a function that returns the value of a node, such as a field. If the function
+            returns None, the node is computed from its arguments.
 
     Returns:
         A column if the values of the fields are columns, otherwise an array.
@@ -630,7 +630,7 @@ class _ResultPart:
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _get_cached(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-        """Return the integer for one packet, (1,), from the cache if it is there.
+        """Return the integer for one packet, (1,); compute it if the cache lacks it.
 
         Args:
             columns: the raw values of the fields, (1,) each.
@@ -702,10 +702,10 @@ def is_full(value: Any, width: int) -> bool:
 
 
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
-    """Return the condition and the two options of a ``np.where``.
+    """Return the condition and the two options of a simple ``np.where``.
 
-    Returns None if each point has its own condition. Also returns None if an option is neither a
-    number nor an expression of one field with a value for each point.
+    The condition has one value for each packet or block. Each option is a number, or an expression
+    of one field with a value for each point. Returns None for all other nodes.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
@@ -773,11 +773,13 @@ def split_sum(value: Any, width: int) -> list[Term]:
 
 
 def _scale_terms(value: Node, parts: list[Term], factor: Any) -> list[Term]:
-    """Multiply the terms of a sum by a factor.
+    """Return the terms of the product of a sum and a factor.
+
+    If the factor is a row of numbers, and a term of the sum has a value for each point, the product
+    is a single term.
 
     Args:
-        value: the product of the sum and the factor. It is the only term of the result if the
-            factor is a row of numbers and a term of the sum has a value for each point.
+        value: the product.
         parts: the terms of the sum.
         factor: a number, or a row of numbers that all packets share.
     """
