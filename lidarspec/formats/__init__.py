@@ -209,9 +209,12 @@ def write(
 
 
 def require_feature(path: str | Path, feature: str) -> None:
-    """Raise UsageError if the format of a path lacks a feature of `Format.holds`.
+    """Raise UsageError if the format of a path does not support a feature.
 
-    The error lists the formats that have the feature.
+    The error lists the formats that support the feature.
+
+    Args:
+        feature: a name in `Format.holds`.
     """
     if feature not in format_of(path).holds:
         having = ", ".join(

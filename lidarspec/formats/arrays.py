@@ -110,7 +110,7 @@ def write_npy(
     """Write one structured array with PCL's layout, like `PointCloud.to_structured`.
 
     Missing columns are 0. If there are several scans, the column `scan` has the number of each
-    point's scan. With `organized`, the file has a single scan, and the array has its shape, (rows,
+    point's scan. With `organized`, there is a single scan, and the array has the shape (rows,
     columns). ``np.load(path, mmap_mode="r")`` maps the file into memory.
     """
     write_rows(

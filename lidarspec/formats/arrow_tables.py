@@ -59,8 +59,8 @@ def iter_tables(
 
     Args:
         scans: the scans.
-        path: the path of the file. If a folder of the path gives the value of a column, for example
-            scan=7, the column is omitted, as in Hive.
+        path: the path of the file. If a folder of the path has a name such as scan=7, the column
+            `scan` is left out, as in Hive.
         every_point: whether to include points without a valid return.
     """
     arrow = import_library("pyarrow", "arrow")
@@ -93,7 +93,7 @@ def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 def _make_scan_fields(path: Path | None) -> list[Any]:
     """Return the schema fields with facts about scans.
 
-    A field that a folder of the path gives, such as scan=7, is left out.
+    If a folder of the path has a name such as scan=7, the field `scan` is left out.
     """
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()

@@ -49,7 +49,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
     Raises:
         SourceError: if the file cannot be written.
-        UsageError: if the path is a folder with files that its format does not write.
+        UsageError: if the path is a folder that contains other files than those of an export.
     """
     refuse_foreign_files(path)
     remove_abandoned(path)
@@ -70,7 +70,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign_files(folder: Path) -> None:
-    """Raise UsageError if a folder contains files that its format does not write.
+    """Raise UsageError if a folder contains other files than those of an export.
 
     Replacing the folder would delete these files.
     """
@@ -88,10 +88,10 @@ def refuse_foreign_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
-    """Yield a function that writes a piece in a thread while the next piece is made.
+    """Yield a function that writes a piece in a thread.
 
-    All pieces are written when the block ends. An error in the thread is raised by the next call,
-    or at the end of the block.
+    The caller can make the next piece meanwhile. All pieces are written when the block ends. An
+    error in the thread is raised by the next call, or at the end of the block.
     """
     with ThreadPoolExecutor(1) as thread:
         last: Future[object] = thread.submit(lambda: None)

@@ -142,12 +142,12 @@ def _make_header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the least and the largest value of columns, for the header of a scan.
+    """Return the minimum and the maximum of the columns, for the header of a scan.
 
-    Only valid points count.
+    Points without a valid return are ignored.
 
     Returns:
-        For each group of limits of E57, the limits by name.
+        The minima and maxima by name, for each group of limits in E57.
     """
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():

@@ -42,22 +42,23 @@ WITHHELD_FLAG = 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
-    """Write the coordinates, intensity, return and GPS time, and extra dimensions.
+    """Write a LAS or LAZ file.
 
-    The ring, the column, the number of the scan and the additional columns are extra dimensions.
-    The description of an additional column is its unit. "_" is appended to a name that LAS already
+    A point has coordinates, an intensity, a return number, a GPS time and extra dimensions. The
+    ring, the column, the number of the scan and the additional columns are extra dimensions. The
+    description of an additional column is its unit. "_" is appended to a name that LAS already
     uses. If a later scan lacks a column, its values are nan, or 0 for integers.
 
     `intensity` is the raw value, rounded and limited to 65535. The stamp is interpreted as a time
     since 1970. It is written as adjusted standard GPS time with 18 leap seconds, exact to 0.1
     microseconds. `number_of_returns` of each point is the largest number of returns in the scan.
-    With `every_point`, a point without a return has the flag "withheld" and the coordinates of the
-    file's offset, because LAS has no nan. Range and angles are omitted, because they follow from
-    the coordinates.
+    With `every_point`, a point without a return has the flag "withheld", and its coordinates are
+    the offsets in the header, because LAS has no nan. Range and angles are omitted, because they
+    follow from the coordinates.
 
     Raises:
-        UsageError: if a coordinate is more than 214 km from the offset, which 32-bit steps cannot
-            represent.
+        UsageError: if a coordinate is more than 214 km from the offset in the header. Larger
+            distances do not fit into 32 bits.
     """
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
@@ -189,9 +190,9 @@ def _fill_records(
 
 
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a compressed file.
+    """Write a LAZ file, which is a compressed LAS file.
 
-    Compared with a LAS file, it has 1/6 to 1/2 of the size, and takes seven times as long to write.
+    The LAZ file has 1/6 to 1/2 of the size of the LAS file. Writing takes seven times as long.
     """
     lazrs = import_library("lazrs", "las")
     try:
