@@ -44,9 +44,10 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Count the points of some frames, and return a kernel if it saves time.
+    """Return a kernel if it saves time, given the number of points so far.
 
-    Returns None if a kernel saves no time, or if Numba is missing or fails.
+    The points of `frames` are counted first. Returns None if a kernel saves no time, or if Numba is
+    missing or fails.
     """
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width

@@ -145,7 +145,9 @@ class BatchColumns(ColumnSource):
     def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Compute columns of the points from `start` to `stop`.
 
-        If `names` has one of the columns that are compiled together, it has all of them.
+        Args:
+            names: the names of the columns. If one of the columns that are compiled together is
+                requested, all of them have to be requested.
         """
         main = [name for name in names if name in self._main_columns]
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
@@ -214,8 +216,8 @@ class BatchColumns(ColumnSource):
     def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
         """Return the range of packets that contain the points from `start` to `stop`.
 
-        The range is the first packet and the packet after the last one. If the batch has several
-        layouts, it is (0, None), which means all packets.
+        The range is the index of the first packet, and the index after the last packet. If the
+        batch has several layouts, the range is (0, None), which means all packets.
         """
         if not self._is_regular:
             return 0, None

@@ -411,7 +411,7 @@ class LazyCloud(PointCloud):
     """A cloud with columns that are computed when they are first read.
 
     Attributes:
-        lazy: the columns, which the cloud and its `extra` share. `extra` does not refer to the
+        lazy: the columns, to which the cloud and `extra` refer. `extra` does not refer to the
             cloud, because a reference cycle would keep the columns in memory until the next garbage
             collection.
     """

@@ -202,8 +202,8 @@ class Grids(NamedTuple):
     def grid_between(self, start: int, stop: int) -> Grid:
         """Return how the points from `start` to `stop` are organised.
 
-        The points are not organised if their packets are organised differently, or if the points
-        are not whole columns.
+        The result is an empty `Grid` if the packets of the points are organised differently, or if
+        the points are not whole columns.
         """
         first = self.ends.searchsorted(start, side="right")
         last = self.ends.searchsorted(stop)
@@ -219,7 +219,7 @@ class Grids(NamedTuple):
 def slice_grid(grid: Grid, first: int, number: int) -> Grid:
     """Return how a slice of organised points is organised.
 
-    The slice is not organised unless it consists of whole columns.
+    The result is an empty `Grid` if the slice contains a part of a column.
 
     Args:
         grid: how all points are organised.

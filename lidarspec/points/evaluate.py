@@ -214,7 +214,7 @@ def evaluate_guarded(
 ) -> EvaluatedPoints | None:
     """Return the points of a batch of a stream; None if the plugin fails.
 
-    An error is counted in the `Counters` of the packets.
+    The failure is counted in the `Counters` of the packets.
 
     Args:
         carry: the state left by the previous batch.

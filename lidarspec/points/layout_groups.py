@@ -185,7 +185,9 @@ class GroupPoints:
         return share
 
     def take(self, which: NDArray[np.intp]) -> GroupPoints:
-        """Return a group for some of the packets, with the values that are already computed.
+        """Return a group with some of the packets of this group.
+
+        The values of nodes that depend on earlier packets are not computed again.
 
         Args:
             which: the indices of the packets.

@@ -199,7 +199,7 @@ class Plan:
         return self.exact or name == "intensity" or name in self.extra
 
     def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """Return the field with exactly the values of a column in `extra`.
+        """Return the field whose raw integers are the values of a column in `extra`.
 
         Returns None if the column has to be computed.
 
@@ -284,8 +284,8 @@ class Plan:
     def _mark_distance(self, measured: TracedColumn) -> Any:
         """Return the distance of points, nan without a return.
 
-        If the distance is a product of a field and a factor for each packet or block, the factor is
-        added to `positive`.
+        If the distance is the product of a field and a factor for each packet or block, the factor
+        has to be positive. It is added to `positive`.
         """
         node = measured.node
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
@@ -323,9 +323,9 @@ class Plan:
 
     @cached_property
     def _may_have_finite_directions(self) -> bool:
-        """Whether the parts of azimuth and elevation that are known in advance are finite.
+        """Whether azimuth and elevation are finite, as far as this is known without a batch.
 
-        `has_finite_directions` checks the parts that are known only with a batch.
+        `has_finite_directions` checks the values of a batch.
         """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
@@ -371,7 +371,7 @@ _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDic
 def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
     """Return the plan for a group of frames, or the reason why it has none.
 
-    The layout keeps the result.
+    The layout caches the result.
     """
     notes = group.layout.notes
     if function not in notes:

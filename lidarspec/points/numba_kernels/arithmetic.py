@@ -280,9 +280,9 @@ def look_up(table, index):
 
 @njit(forceinline=True)
 def row_at(index, rows):
-    """Return the number of the table row for an index.
+    """Return `index`, or the index of the last row if `index` is out of range.
 
-    If the index is out of range, this is the last row, which contains nan.
+    The last row contains nan.
     """
     if 0 <= index < rows - 1:
         return np.int64(index)

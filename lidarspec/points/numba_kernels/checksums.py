@@ -73,7 +73,7 @@ _REGISTERS = "abcd"
 
 
 def _write_slice(name: str) -> str:
-    """Return the source of an expression: the CRC register after eight more bytes.
+    """Return the source that computes the CRC register after eight more bytes.
 
     Args:
         name: the name of the register. Its value has already been XORed with the bytes.
@@ -84,7 +84,7 @@ def _write_slice(name: str) -> str:
 
 
 def _write_single(name: str) -> str:
-    """Return the source of an expression: the CRC register after one more byte."""
+    """Return the source that computes the CRC register after one more byte."""
     return (
         f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
         f" {(1 << 56) - 1})"

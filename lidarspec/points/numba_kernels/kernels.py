@@ -128,7 +128,7 @@ def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.fl
 
 
 def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """Return the kernel that computes columns of a plan; the plan keeps it.
+    """Return the kernel that computes columns of a plan; the plan caches it.
 
     The first layout of a `points` function has its own kernel. All other layouts share kernels that
     accept arrays of any length.

@@ -65,8 +65,8 @@ class Beam(NamedTuple):
 
     Attributes:
         distance: the raw distance; nan without a return.
-        direction: the row of the table of directions.
-        start: the row of the table of starting points.
+        direction: the lookup in the table of directions.
+        start: the lookup in the table of starting points.
         step: the distance of a raw value of 1, metres.
     """
 
@@ -141,7 +141,7 @@ class Expressions(KernelWriter):
     """Writes traced expressions into the loops of a kernel."""
 
     def write_double(self, value: Any, depth: int = 0) -> KernelValue:
-        """Write an expression in float64, or a condition, and return its value."""
+        """Return the code of an expression in float64, or of a condition."""
         if not isinstance(value, Node):
             return self.write_constant(value, depth)
         return self.get_or_make(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
@@ -282,7 +282,9 @@ class Expressions(KernelWriter):
         )
 
     def write_single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
-        """Return an expression in float32: a `KernelValue`, or a `DeferredFloat`.
+        """Return the code of an expression in float32.
+
+        The result is a `KernelValue` or a `DeferredFloat`.
 
         Args:
             exact: whether the value is computed in float64 and rounded once, as in the reference
@@ -321,10 +323,10 @@ class Expressions(KernelWriter):
         )
 
     def _write_along_beam(self, beam: Beam) -> KernelValue | None:
-        """Return a coordinate of points on a beam, rounded once.
+        """Return the code that computes a coordinate of points on a beam, rounded once.
 
-        The direction is split into two float32 numbers for more precision. Returns None if NumPy
-        has to compute values of the beam.
+        The direction is split into two float32 numbers for more precision. Returns None if the
+        distance requires float64, or if NumPy computes the indices of the tables.
         """
         sent = self._write_distance(beam.distance, raw=True)
         table = beam.direction.args[1]
@@ -345,13 +347,13 @@ class Expressions(KernelWriter):
         )
 
     def _write_distance(self, node: Node, *, raw: bool = False) -> KernelValue | None:
-        """Return a distance in float32.
+        """Return the code of a distance in float32.
 
         The distance is nan without a return, or if a condition marks the point as invalid. Returns
         None if the expression is not a distance, or if it requires float64.
 
         Args:
-            raw: whether to return the raw value, not metres.
+            raw: True for the raw value, False for metres.
         """
         if not is_full(node, self.width):
             return None
@@ -391,13 +393,16 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """Return a product or sum; a `DeferredFloat` if an operand is a `DeferredFloat`."""
+        """Return the code of a product or sum.
+
+        The result is a `DeferredFloat` if an operand is a `DeferredFloat`.
+        """
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
 
     def _write_field(self, node: Node, *, exact: bool) -> KernelValue | None:
-        """Return an expression of one field: a linear function or a table lookup.
+        """Return the code of an expression of one field, a linear function or a lookup.
 
         Returns None if points share a value of the field, or if `find_window` has no result for it.
         """
@@ -428,7 +433,7 @@ class Expressions(KernelWriter):
         return int(self.get_or_make(("angle", node), make))
 
     def write_angle(self, value: Any, factor: float, depth: int) -> KernelValue:
-        """Return an angle in half turns, in float64.
+        """Return the code of an angle in half turns, in float64.
 
         Args:
             factor: a number by which the angle is multiplied to get half turns.
@@ -478,7 +483,7 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return a lookup of an angle that depends on one field; None without a table.
+        """Return the code that looks up an angle of one field; None without a table.
 
         The table is float32 if this is precise enough.
         """

@@ -155,14 +155,14 @@ class LinearTable:
 
 
 def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
-    """Return the linear function that equals a table of a field, as float32.
+    """Return the linear function with the values of a table of a field.
 
     Returns None if the table is not linear.
 
     Args:
         values: the values of the table.
-        exact: whether the values of the function have to be the same as in the table. If not, they
-            may differ by a unit in the last place.
+        exact: whether the function has to return the same float32 values as the table. If False,
+            they may differ by a unit in the last place.
     """
     field_window = find_window(leaf)
     assert field_window is not None
@@ -375,10 +375,10 @@ class KernelWriter:
         return element
 
     def add_argument(self, node: Node) -> KernelValue:
-        """Add the values of a node, computed by NumPy, to the arguments.
+        """Add an argument with the values of a node, which NumPy computes.
 
         Returns:
-            The text of the element in the current loop.
+            The text that reads the value for the current point.
         """
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)

@@ -19,7 +19,7 @@ from lidarspec.points.plan import ColumnMaker, Plan
 
 
 def compile(plan: Plan, names: tuple[str, ...]) -> ColumnMaker:
-    """Return a program that computes columns of a plan; the plan keeps it."""
+    """Return the program that computes columns of a plan; the plan caches it."""
     if names not in plan.programs:
         plan.programs[names] = _compile(plan, names, plan.tables).program
     return plan.programs[names]

@@ -48,7 +48,7 @@ class Compiler:
 
     Attributes:
         program: the program, with an output for each column that was added.
-        low: the nodes with one value for each packet or block that are inputs of the program.
+        low: the inputs of the program, which are nodes with one value for each packet or block.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -129,7 +129,7 @@ class Compiler:
         return None
 
     def _compile_factor(self, value: Any) -> Callable[[ProgramRun], Any]:
-        """Return a function that reads a factor of a float32 product."""
+        """Compile a factor of a float32 product; return a function that reads it."""
         if not isinstance(value, Node) and np.size(value) == 1:
             return _make_constant(np.float32(np.asarray(value).reshape(())))
         if is_full(value, self._width):
@@ -151,7 +151,7 @@ class Compiler:
         """Compile the cosine or sine of a sum of angles.
 
         Each angle is a constant, or has one value for each packet or block. By the angle addition
-        theorem, only the cosines and sines of these values are computed, and none for each point.
+        theorem, no cosine or sine has to be computed for each point.
         """
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
@@ -336,10 +336,10 @@ class Compiler:
         return self.program.add_step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
     def _compile_sum(self, node: Node) -> int | None:
-        """Compile a sum of which some terms have one value for each packet or block.
+        """Compile a sum; terms with one value for each packet or block are added first.
 
-        These terms are added first. Returns None if there are none, or if a term with a value for
-        each point is multiplied by an array.
+        Returns None if there are no such terms, or if a term with a value for each point is
+        multiplied by an array.
         """
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]

@@ -65,13 +65,13 @@ class ProgramRun:
 
 @dataclass(frozen=True, eq=False)
 class ProgramStep:
-    """One call, `run(execution, output)`, and the registers that it reads.
+    """A call that fills one register.
 
     Attributes:
         text: a description of the call.
-        run: the function to call.
-        output: the register that it fills.
-        reads: the registers that it reads.
+        run: the function to call, with the `ProgramRun` and the array of the register.
+        output: the register that the function fills.
+        reads: the registers that the function reads.
     """
 
     text: str
@@ -95,9 +95,9 @@ class Program(ColumnMaker):
 
     Args:
         width: the number of points of a packet.
-        safe: a function that returns whether the coordinates of each point are either all nan or
-            all finite, given the values of nodes. If not, the program sets all coordinates of a
-            point to nan if one is nan.
+        safe: a function that returns whether each point has either three finite coordinates or
+            three that are nan. Its argument returns the value of a node. If the result is False,
+            the program sets all coordinates of a point to nan if one is nan.
 
     Attributes:
         chunk: the number of packets of a chunk.
