@@ -33,8 +33,10 @@ class ImuSamples:
 
     Attributes:
         time_ns: (N,) int64, by the same clock as the times of the packets.
-        angular_velocity: (N, 3) float64 rad/s about x, y and z; nan if a frame lacks it.
+        angular_velocity: (N, 3) float64 rad/s about x, y and z.
         linear_acceleration: (N, 3) float64 m/s2 along x, y and z, including gravity.
+
+    A value is nan if the frame does not contain it.
     """
 
     time_ns: NDArray[np.int64]
@@ -79,12 +81,15 @@ class ImuSamples:
 
 def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Return the samples of several batches as one batch, which may be empty."""
-    if len(parts) != 1:
-        parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
-    names = ("time_ns", "angular_velocity", "linear_acceleration")
     if len(parts) == 1:
         return parts[0]
-    return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    empty = ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
+    parts = [empty, *parts]
+    return ImuSamples(
+        np.concatenate([part.time_ns for part in parts]),
+        np.concatenate([part.angular_velocity for part in parts]),
+        np.concatenate([part.linear_acceleration for part in parts]),
+    )
 
 
 def read_samples(
@@ -93,10 +98,9 @@ def read_samples(
     """Return the IMU samples of packets, in the axes of the points.
 
     Args:
-        frame: the frame type of the packets; if the packets are parts of frames, the name of the
-            parts.
+        frame: the name of a frame type, or "name.path" for the parts of a frame.
         batch: the packets.
-        time_ns: the time of each packet, (n,).
+        time_ns: the time of each packet, (n,). A sample whose `Imu.time` is nan has this time.
 
     Raises:
         SpecError: if the frame type has no IMU data.
@@ -104,42 +108,39 @@ def read_samples(
             is chained.
     """
     function = sensor.imu_of(frame)
+    # The padding of arrays and damaged packets may contain any values.
     with plugin_errors(f"imu of {frame}", sensor.id, function), np.errstate(all="ignore"):
         result = function(Fields(batch))
         if not isinstance(result, Imu):
             raise TypeError(f"the function must return Imu, got {type(result).__name__}")
-        values = dict(
-            zip(
-                [*UNITS, "time"],
-                (*result.angular_velocity, *result.linear_acceleration, result.time),
-                strict=True,
-            )
-        )
-        arrays, axes, _, shape = align_points(values, batch)
-        mask = padding_mask(axes, shape, batch)
-        after = np.rint(np.nan_to_num(np.asarray(arrays.pop(), np.float64)) * 1e9).astype(np.int64)
-        time = flatten_valid(
-            time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch)
-        )
-        values_of = np.stack(
+        columns = (*result.angular_velocity, *result.linear_acceleration, result.time)
+        names = (*UNITS, "time")
+        arrays, array_axes, _, shape = align_points(dict(zip(names, columns, strict=True)), batch)
+        *components, offsets_s = arrays
+        mask = padding_mask(array_axes, shape, batch)
+        offsets_ns = np.rint(np.nan_to_num(np.asarray(offsets_s, np.float64)) * 1e9)
+        packet_ns = time_ns.reshape(-1, *[1] * len(array_axes))  # as many axes as the arrays
+        sample_ns = flatten_valid(packet_ns + offsets_ns.astype(np.int64), shape, mask, len(batch))
+        values = np.stack(
             [
-                np.asarray(flatten_valid(array, shape, mask, len(batch)), np.float64)
-                for array in arrays
+                np.asarray(flatten_valid(component, shape, mask, len(batch)), np.float64)
+                for component in components
             ],
             axis=1,
         )
-    own_samples = ImuSamples(time, values_of[:, :3], values_of[:, 3:])
+    samples = ImuSamples(sample_ns, values[:, :3], values[:, 3:])
+    # The function returns REP-103 axes. The points may be configured to have the vendor's axes.
     turn = vendor_turn(sensor)
     if turn is None:
-        return own_samples
-    return own_samples.turn(turn)
+        return samples
+    return samples.turn(turn)
 
 
 class WaitingSamples:
     """A buffer that keeps IMU samples until their scan has ended.
 
-    A scan has the samples from its first point to the first point of the next scan. The first scan
-    has all earlier samples as well.
+    `ScanStream` takes the samples when a scan ends. A scan has the samples from its first point to
+    the first point of the next scan. The first scan has all earlier samples as well.
     """
 
     def __init__(self) -> None:
@@ -151,7 +152,7 @@ class WaitingSamples:
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Keep only the newest samples, so that memory is limited if no scan ends.
+        """Keep only the samples that were added last, so that memory is limited if no scan ends.
 
         Nothing is dropped until twice as many samples are stored.
 
