@@ -49,10 +49,12 @@ if TYPE_CHECKING:
 
 #: Default duration of a file, in seconds.
 FILE_DURATION_S = 10.0
-#: Maximum width of the picture in characters. The next constants are the maximum height of the
-#: picture, and the number of lines that are kept free for the summary.
+#: Maximum width of the picture, in characters.
 MAX_PICTURE_COLUMNS = 100
+#: Minimum and maximum height of the picture, in lines.
+MIN_PICTURE_LINES = 12
 MAX_PICTURE_LINES = 42
+#: Number of lines of the terminal that are kept free for the summary.
 SUMMARY_LINES = 8
 #: Help text of --to.
 PLACES = (
@@ -171,31 +173,61 @@ def sim(
     """
     sensor = named_sensor(sensor_id)
     clock_faults = ClockFaults() if clock is None else parse_clock_faults(clock)
-    faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake, clock_faults)
+    faults = Faults(
+        errors=errors,
+        loss=loss,
+        reorder=reorder,
+        unplug=unplug or 0.0,
+        absent=absent,
+        rotor=rotor or "",
+        shake=shake,
+        clock=clock_faults,
+    )
     simulated_scene = read_scene(scene) if scene is not None else None
     device = SimulatedDevice(
         sensor, scene=simulated_scene, seed=seed, rate=parse_rate(rate), faults=faults
     )
     target = to or ("udp://" if sensor.datagrams else "pty")
-    if target != "pty" and "://" not in target:
-        if link is not None:
-            raise UsageError("--link requires --to pty")
-        if Path(target).suffix.lower() not in SUFFIXES:
-            raise UsageError(
-                f"--to {target}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
-                f" ({', '.join(SUFFIXES)})"
-            )
-        written = write_file(device, target, duration or FILE_DURATION_S, overwrite=force)
-        _announce(sensor, target, target, {}, as_json=as_json)
-        note(f"{_format_sent(device)}, {format_size(written)}")
+    if target == "pty" or "://" in target:
+        _serve(device, target, link, duration, as_json=as_json)
         return
+    if link is not None:
+        raise UsageError("--link requires --to pty")
+    if Path(target).suffix.lower() not in SUFFIXES:
+        raise UsageError(
+            f"--to {target}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
+            f" ({', '.join(SUFFIXES)})"
+        )
+    written = write_file(device, target, duration or FILE_DURATION_S, overwrite=force)
+    _announce(sensor, target, target, {}, as_json=as_json)
+    note(f"{_format_sent(device)}, {format_size(written)}")
+
+
+def _serve(
+    device: SimulatedDevice,
+    target: str,
+    link: str | None,
+    duration: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Run a simulated sensor on a port until it is stopped.
+
+    Args:
+        target: "pty" or a URL.
+        link: the path of a symbolic link to the pty; None for no link.
+        duration: time in seconds after which the sensor stops; None if it does not stop by itself.
+        as_json: whether the address is printed as JSON.
+
+    Raises:
+        UsageError: if the port is invalid, or there is a link to a port that is no pty.
+    """
+    sensor = device.sensor
     try:
         opened = make_simulated_outlet(sensor, target, link)
     except UsageError as error:
-        raise suggest(
-            error,
-            f"lidarspec sim {sensor.id} --to {'udp://' + LOCALHOST if sensor.datagrams else 'pty'}",
-        ) from None
+        usual_target = f"udp://{LOCALHOST}" if sensor.datagrams else "pty"
+        raise suggest(error, f"lidarspec sim {sensor.id} --to {usual_target}") from None
     try:
         controls = {name: control.local_source for name, control in opened.controls.items()}
         _announce(sensor, opened.local_source, opened.source, controls, as_json=as_json)
@@ -211,16 +243,22 @@ def sim(
 
 
 def _announce(
-    sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
+    sensor: Sensor, local_source: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
-    """Print the address of the sensor, its other links, and the next command."""
+    """Print the address of the sensor, its other links, and the next command.
+
+    Args:
+        local_source: see `Outlet.local_source`; for a file, its path.
+        source: see `Outlet.source`; for a file, its path.
+        controls: the addresses of the links for commands, by name.
+    """
     verb = verb_to_show(sensor)
     following = f"lidarspec {verb} {shlex.quote(source)} {format_sensor_options(sensor)}"
     if as_json:
         emit_json(
             {
                 "sensor": sensor.id,
-                "place": where,
+                "place": local_source,
                 "source": source,
                 **({"controls": controls} if controls else {}),
                 "next": following,
@@ -228,7 +266,7 @@ def _announce(
             None,
         )
         return
-    say(where)
+    say(local_source)
     control_lines = "".join(
         f"\n  commands over {name}: {address}" for name, address in controls.items()
     )
@@ -238,25 +276,25 @@ def _announce(
 def _make_watcher(
     device: SimulatedDevice, opened: Outlet, progress: Progress
 ) -> Callable[[], None]:
-    """Return a callback that prints received commands and disconnections."""
+    """Return a callback that prints received commands, disconnections and the progress."""
     began = time.monotonic()
     printed = 0
-    present = True
+    was_present = True
 
-    def turn() -> None:
-        nonlocal printed, present
+    def report() -> None:
+        nonlocal printed, was_present
         events = device.commands_received[printed:]
-        if device.present != present:
+        if device.present != was_present:
             events += [
                 f"connected again at {opened.local_source}" if device.present else "disconnected"
             ]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
         printed = len(device.commands_received)
-        present = device.present
+        was_present = device.present
         progress(lambda: f"{time.monotonic() - began:.0f} s, {_format_sent(device)}")
 
-    return turn
+    return report
 
 
 def _format_sent(device: SimulatedDevice) -> str:
@@ -277,19 +315,12 @@ def _format_sent(device: SimulatedDevice) -> str:
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
     """Simulate a sensor on a port, read it over a noisy line, record it and draw it."""
-    simulated = (
-        sensor
-        for sensor in registry().sensors().values()
-        if any(sensor.simulation_of(name).sweep for name in sensor.data_frames)
-    )
-    sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
-    if sensor is None:
-        raise UsageError(no_sensors_text())
+    sensor = named_sensor(sensor_id) if sensor_id else _find_default_sensor()
     if not sensor.has_points:
         error = UsageError(f"{sensor.id} measures no points, so demo cannot draw a scan")
         raise suggest(error, f"lidarspec stats sim:{sensor.id} -t 5s")
-    result = demonstrate(sensor, turns=count, errors=errors)
-    whole = [scan for scan in result.scans if scan.whole]
+    result = demonstrate(sensor, scan_count=count, errors=errors)
+    whole = [scan for scan in result.scans if scan.whole]  # at least one
     if as_json:
         emit_json(_result_to_dict(result, whole), None)
     else:
@@ -297,35 +328,55 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
             "\n".join([render(_draw_picture(whole[-1])), *_summarize(result, whole)]),
             colour=True,
         )
+    # the recording gave other points than the sensor
     if result.digest != result.recorded_digest:
         click.get_current_context().exit(FINDINGS)
+
+
+def _find_default_sensor() -> Sensor:
+    """Return the first installed sensor that declares a `sweep` for its data frames.
+
+    Raises:
+        UsageError: if there is none.
+    """
+    for sensor in registry().sensors().values():
+        if any(sensor.simulation_of(name).sweep for name in sensor.data_frames):
+            return sensor
+    raise UsageError(no_sensors_text())
 
 
 def _draw_picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, MAX_PICTURE_LINES))
     width = min(columns, MAX_PICTURE_COLUMNS)
-    height = max(min(lines - SUMMARY_LINES, MAX_PICTURE_LINES), 12)
+    height = max(min(lines - SUMMARY_LINES, MAX_PICTURE_LINES), MIN_PICTURE_LINES)
     return draw_cloud(
         scan.points, width=width, height=height, look=choose_appearance(scan.points)
     ).text()
 
 
 def _summarize(result: Demonstration, whole: list[Scan]) -> list[str]:
+    """Return the lines of the summary.
+
+    Args:
+        whole: the complete scans.
+    """
     stats = result.stats
     name = result.sensor.id
     frames = sum(stats.frames.values())
     if result.sensor.datagrams:
-        harm = "of the datagrams were lost"
+        errors = f"{result.error_share:.2%} of the datagrams were lost"
     else:
-        harm = "of the bytes were damaged"
+        errors = f"{result.error_share:.2%} of the bytes were damaged"
     lacks_pty = find_data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
         where = f"{result.address} (this system has no pseudo-terminals)"
     else:
         where = result.address
-    passed = f"{result.error_share:.2%} {harm}, {result.intact} packets arrived undamaged"
     lines = [
-        f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
+        (
+            f"{name}, simulated on {where}: {result.sent} frames sent, {errors}, {result.intact}"
+            " packets arrived undamaged"
+        ),
         *(str(reply) for reply in result.replies if reply.confirmed),
         (
             f"{frames} frames decoded, {stats.bad_checksum} checksum errors, {stats.bytes_skipped}"

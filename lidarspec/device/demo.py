@@ -70,12 +70,12 @@ class Demonstration:
 
 
 def demonstrate(
-    sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1
+    sensor: Sensor, *, scan_count: int = 5, errors: float = 0.01, seed: int = 1
 ) -> Demonstration:
     """Run a simulated sensor until a number of complete scans has arrived.
 
     Args:
-        turns: the number of complete scans.
+        scan_count: the number of complete scans.
         errors: the share of lost datagrams, or of damaged bytes in a stream. In a stream, at most
             one byte per frame is damaged on average.
         seed: the seed of the errors and the scene.
@@ -94,12 +94,12 @@ def demonstrate(
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
-        address, replies, scans, stats = _run_live(sensor, simulated, path, turns)
+        address, replies, scans, stats = _run_live(sensor, simulated, path, scan_count)
         line = simulated.lines["data"]
         recorded_bytes = path.stat().st_size
         with open_device(path, sensor) as recording:
             whole_scans = (scan for scan in recording.scans() if scan.whole)
-            recorded_digest = hash_points(list(itertools.islice(whole_scans, turns)))
+            recorded_digest = hash_points(list(itertools.islice(whole_scans, scan_count)))
     return Demonstration(
         sensor,
         address,
@@ -126,7 +126,7 @@ def hash_points(scans: Sequence[Scan]) -> str:
 
 
 def _run_live(
-    sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int
+    sensor: Sensor, simulated: SimulatedDevice, path: Path, scan_count: int
 ) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """Run a live session and record it; return address, replies, scans and counters."""
     if sensor.datagrams:
@@ -137,7 +137,7 @@ def _run_live(
                 open_device(outlet.source, sensor, start=False, record=path)
             )
             served = stack.enter_context(Served(simulated, outlet))
-            return outlet.source, *_read(device, served, turns)
+            return outlet.source, *_read(device, served, scan_count)
     if has_terminals() and find_data_link(sensor, Serial):
         destination = "pty"
     else:
@@ -149,18 +149,18 @@ def _run_live(
         Served(simulated, make_simulated_outlet(sensor, destination), patient=patient) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
-        return served.path, *_read(device, served, turns)
+        return served.path, *_read(device, served, scan_count)
 
 
 def _read(
-    device: Device, served: Served, turns: int
+    device: Device, served: Served, scan_count: int
 ) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
     replies = tuple(device.send(name) for name in device.sensor.on_open)
-    limit = time.monotonic() + EXTRA_TIMEOUT_S + turns
+    limit = time.monotonic() + EXTRA_TIMEOUT_S + scan_count
     scans: list[Scan] = []
     for scan in device.scans(wait=0.1):
         scans += [scan] if scan is not None else []
-        if sum(one.whole for one in scans) >= turns:
+        if sum(one.whole for one in scans) >= scan_count:
             served.stop_sending()
             while device.newest(DRAINED_AFTER_S) is not None:
                 pass  # `sent` counts the data that is still on the way, so that it has to be read
@@ -169,9 +169,11 @@ def _read(
             break
     if (failure := device.stats.failure(device.sensor.id)) is not None:
         raise failure
-    if sum(one.whole for one in scans) >= turns:
+    if sum(one.whole for one in scans) >= scan_count:
         return replies, tuple(scans), device.stats
-    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, but {turns} were expected"
+    number = (
+        f"{len(scans)} scans in {EXTRA_TIMEOUT_S + scan_count:g} s, but {scan_count} were expected"
+    )
     raise SourceError(f"the simulated {device.sensor.id} sent {number}: {device.stats}")
 
 

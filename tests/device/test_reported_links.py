@@ -144,7 +144,7 @@ def test_a_reported_port_that_refuses_the_connection_is_an_error() -> None:
 
 @pytest.mark.parametrize("sensor", [HANDLES, REPORTED], ids=lambda sensor: sensor.model)
 def test_the_demonstration_starts_the_sensor(sensor: Sensor) -> None:
-    result = demonstrate(on_free_port(sensor), turns=1)
+    result = demonstrate(on_free_port(sensor), scan_count=1)
     assert [reply.command for reply in result.replies] == ["request_handle", "start"]
     assert result.digest == result.recorded_digest
 
@@ -155,7 +155,7 @@ def test_the_demonstration_starts_the_sensor(sensor: Sensor) -> None:
 def test_the_demonstration_finds_a_sensor_without_a_broadcast() -> None:
     links = {"data": Udp(free_port()), "control": Udp(broadcast=free_port())}
     sensor = dataclasses.replace(SENSOR, links=links, on_open=("hello",))
-    assert [reply.command for reply in demonstrate(sensor, turns=1).replies] == ["hello"]
+    assert [reply.command for reply in demonstrate(sensor, scan_count=1).replies] == ["hello"]
 
 
 def test_a_simulated_source_needs_no_ports() -> None:
