@@ -14,7 +14,7 @@ import contextlib
 import math
 import re
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -33,9 +33,9 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
-#: time between two checks of the limits and of the disk.
+#: Time between two checks of the limits and of the disk.
 CHECK_PERIOD_S = 0.1
-#: Matches the numbers in a warning. Warnings that differ only in numbers are reported once.
+#: Matches the numbers in a warning. A warning is not reported again if only its numbers change.
 _NUMBERS = re.compile(r"[\d.]+")
 
 
@@ -71,7 +71,7 @@ def make_recorder(
     )
 
 
-class TimedLog:
+class LimitedRecorder:
     """A recorder with a time limit, which is counted from the first arrival.
 
     Sent data is recorded without limit.
@@ -110,7 +110,9 @@ class TimedLog:
 
     def contains(self, chunk: Chunk) -> bool:
         """Return whether a received chunk is in the file."""
-        return chunk.at is None or (self.last is not None and chunk.at <= self.last)
+        if chunk.at is None:
+            return True  # the time limit does not apply
+        return self.last is not None and chunk.at <= self.last
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
         """Record a sent chunk, or a received chunk if it arrived before the time limit."""
@@ -148,10 +150,11 @@ class SourceRecording:
     """Records everything that a source sends to one file.
 
     Args:
-        source: any SOURCE.
+        source: the path or URL of the source, as for `lidarspec.open`.
         target: an .lsr, .pcap, .pcapng or .bin file.
         sensor: the sensor; None to record raw bytes.
-        seconds: the time limit; None for no limit.
+        seconds: the time limit, counted from the opening of a live source, or from the first
+            arrival in a file; None for no limit.
         count: the maximum number of data packets, or of datagrams if the sensor is unknown; None
             for no limit.
         start: whether to send the sensor's commands for opening and closing.
@@ -189,13 +192,17 @@ class SourceRecording:
         self._salvage = salvage
         self.recorder: BackgroundWriter | None = None
         self.device: Device | None = None
-        self._log: TimedLog | None = None
+        self._log: LimitedRecorder | None = None
         self.packets = 0
         self.elapsed = 0.0
         self._began = 0.0
+        self._reported = set[str]()  # the present warnings, without numbers
 
     def run(self) -> Generator[str, None, None]:
-        """Record until the end or a limit; yield messages, and "" at regular intervals.
+        """Record until the end or a limit; yield messages.
+
+        If there is no message, "" is yielded, so that the caller can show the progress: every
+        `CHECK_PERIOD_S` for a live source, and after each chunk of a file.
 
         Raises:
             UsageError: if the file exists, or its format cannot contain the data of the source.
@@ -203,21 +210,20 @@ class SourceRecording:
         """
         if self._sensor is not None and is_live(self._source):
             return self._record_device(self._sensor)
-        return self._record_bytes()
+        return self._record_undecoded()
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
         """Record the data of a sensor, and decode it to count packets.
 
         A thread records, so that errors of decoding do not stop the recording.
         """
-        device_warnings = list[str]()
-        failures = dict[str, None]()
-        printed = set[str]()
+        device_warnings = list[str]()  # kept for the case that decoding fails
+        failures = list[str]()
         with Device(
             self._source, sensor, start=self._start, record=RecorderFactory(self._open_log)
         ) as self.device:
             log = self._log
-            assert log is not None
+            assert log is not None  # the device has called `_open_log`
             try:
                 while not self._is_finished(log):
                     try:
@@ -225,28 +231,37 @@ class SourceRecording:
                         device_warnings = self.device.warnings
                     except SourceError:
                         raise
-                    except (Exception, SystemExit) as error:
-                        failures[
+                    except (Exception, SystemExit) as error:  # a plugin may call sys.exit
+                        failure = (
                             f"{sensor.id}: decoding failed ({type(error).__name__}: {error});"
                             " the recording continues"
-                        ] = None
+                        )
+                        if failure not in failures:
+                            failures.append(failure)
                         time.sleep(CHECK_PERIOD_S)
-                    current = {
-                        _NUMBERS.sub("", text): text for text in [*device_warnings, *failures]
-                    }
-                    yield "\n".join(text for key, text in current.items() if key not in printed)
-                    printed = set(current)
+                    yield "\n".join(self._take_new_warnings([*device_warnings, *failures]))
             finally:
                 self._end(log)
                 with contextlib.suppress(Exception, SystemExit):
-                    while self._count_next(self.device, log):
-                        pass
+                    self._count_remaining(self.device, log)
 
-    def _count_next(self, device: Device, log: TimedLog) -> bool:
+    def _take_new_warnings(self, warnings: Iterable[str]) -> list[str]:
+        """Return the warnings that were not among those of the previous call."""
+        by_text = {_NUMBERS.sub("", warning): warning for warning in warnings}
+        new_warnings = [warning for text, warning in by_text.items() if text not in self._reported]
+        self._reported = set(by_text)
+        return new_warnings
+
+    def _count_remaining(self, device: Device, log: LimitedRecorder) -> None:
+        """Count the packets that arrived before the end, but are not decoded yet."""
+        while self._count_next(device, log):
+            pass
+
+    def _count_next(self, device: Device, log: LimitedRecorder) -> bool:
         """Count the next packets that are in the file.
 
         Returns:
-            Whether the file may contain more packets.
+            False if no packet arrived in time, or if some arrived after the end.
         """
         arrived = _read_arrival_times(device)
         if len(arrived) == 0:
@@ -255,30 +270,32 @@ class SourceRecording:
         self.packets += count
         return count == len(arrived)
 
-    def _end(self, log: TimedLog) -> None:
+    def _end(self, log: LimitedRecorder) -> None:
         """Ignore further arrivals, and set `elapsed` to the duration of the file."""
         log.end()
         if log.seconds is not None:
             self.elapsed = log.seconds
 
-    def _record_bytes(self) -> Generator[str, None, None]:
-        source = (
-            RecordingTransport(self._source, salvage=True)
-            if self._salvage
-            else open_transport(self._source, self._sensor)
-        )
+    def _record_undecoded(self) -> Generator[str, None, None]:
+        """Record a live source whose sensor is unknown, or copy a file."""
+        source: Transport
+        if self._salvage:
+            source = RecordingTransport(self._source, salvage=True)
+        else:
+            source = open_transport(self._source, self._sensor)
         with (
             contextlib.closing(source),
             contextlib.closing(self._open_log(source, self._sensor)) as log,
         ):
-            yield from (
-                self._record_live(source, log)
-                if isinstance(source, LiveTransport)
-                else self._copy(source, log)
-            )
+            if isinstance(source, LiveTransport):
+                yield from self._record_live(source, log)
+            else:
+                yield from self._copy(source, log)
             yield from source.warnings
 
-    def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
+    def _record_live(
+        self, source: LiveTransport, log: LimitedRecorder
+    ) -> Generator[str, None, None]:
         """Record in a separate thread, and count the recorded datagrams."""
         queue = BoundedQueue()
         with contextlib.closing(CaptureThread(source, queue, log=log)) as capture:
@@ -295,11 +312,11 @@ class SourceRecording:
                             yield f"{self._source}: the device has returned"
             finally:
                 self._end(log)
-                self._count_queued(source, queue, log, 0.0)
+                self._count_queued(source, queue, log, 0.0)  # arrived before the end
             yield from capture.warnings
 
     def _count_queued(
-        self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float
+        self, source: LiveTransport, queue: BoundedQueue, log: LimitedRecorder, wait: float
     ) -> list[LinkEvent]:
         """Take everything from the queue, and count the recorded datagrams.
 
@@ -316,7 +333,7 @@ class SourceRecording:
                 self.packets += 1
         return events
 
-    def _copy(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
+    def _copy(self, source: Transport, log: LimitedRecorder) -> Generator[str, None, None]:
         """Copy a file. Data from standard input is recorded with its time of arrival."""
         clock = HostClock()
         assert self.recorder is not None
@@ -326,20 +343,26 @@ class SourceRecording:
                     return
                 yield ""
                 self.recorder.wait_for_room()
-                is_undated = chunk.at is None and self._source == "-"
-                log.write(replace(chunk, at=clock.now()) if is_undated else chunk)
+                needs_time = chunk.at is None and self._source == "-"
+                log.write(replace(chunk, at=clock.now()) if needs_time else chunk)
                 if log.is_over:
                     return
-                self.packets += source.datagrams
+                if source.datagrams:
+                    self.packets += 1
         finally:
             self._end(log)
 
-    def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
-        """Create the file to which an open source is recorded."""
-        counts = source.datagrams or (
-            self._sensor is not None and isinstance(source, LiveTransport)
-        )
-        if self._count is not None and not counts:
+    def _open_log(self, source: Transport, sensor: Sensor | str | None) -> LimitedRecorder:
+        """Create the recorder of an open source, and start to measure `elapsed`.
+
+        Raises:
+            UsageError: if the packets of the source cannot be counted, but `count` is given, and
+                for the errors of `make_recorder`.
+            SourceError: if the file cannot be created.
+        """
+        is_decoded = sensor is not None and isinstance(source, LiveTransport)
+        can_count = source.datagrams or is_decoded
+        if self._count is not None and not can_count:
             raise UsageError(
                 f"-n counts packets, but {self._source} is a byte stream: name the sensor with"
                 " -s, or limit the time with -t"
@@ -347,11 +370,11 @@ class SourceRecording:
         self.recorder = make_recorder(
             source, self._source, self._target, sensor, overwrite=self._overwrite
         )
-        self._log = TimedLog(self.recorder, self._seconds)
+        self._log = LimitedRecorder(self.recorder, self._seconds)
         self._began = time.monotonic()
         return self._log
 
-    def _is_finished(self, log: TimedLog, *, is_timed: bool = True) -> bool:
+    def _is_finished(self, log: LimitedRecorder, *, is_timed: bool = True) -> bool:
         """Update `elapsed`, and return whether a limit is reached.
 
         Args:

@@ -20,7 +20,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.device.capture_thread import BoundedQueue, CaptureThread
-from lidarspec.device.source_recording import SourceRecording, TimedLog
+from lidarspec.device.source_recording import LimitedRecorder, SourceRecording
 from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder, open_recorder
 from lidarspec.spec import Fields
@@ -109,7 +109,7 @@ def test_the_duration_of_a_copy_is_that_of_its_arrivals(
 @pytest.mark.parametrize("at", [None, 10**18 + 1])
 def test_an_ended_recording_ignores_arrivals(tmp_path: Path, at: int | None) -> None:
     writer = open_recorder(tmp_path / "ended.lsr", datagrams=True)
-    with contextlib.closing(TimedLog(writer, None)) as log:
+    with contextlib.closing(LimitedRecorder(writer, None)) as log:
         log.write(Chunk(b"before", 10**18))
         log.end()
         log.write(Chunk(b"after", at))
