@@ -264,7 +264,7 @@ def iter_crc_matches(
             tried += 1
             at_end = place.offset == -place.size
             by_catalogue = samples.shortest > MAX_DIVIDED_BYTES and (quick or not at_end)
-            chosen = picks if at_end and span == CoveredSpan() else picks[:1]
+            chosen = picks if at_end and span.covers_all else picks[:1]
             work_left -= sum(
                 _estimate_cost(pick, reading, by_catalogue=by_catalogue) for pick in chosen
             )

@@ -20,11 +20,13 @@ from lidarspec.drafting.periods import (
     FEW_FRAMES,
     HEAD_SEARCH_BYTES,
     MIN_CONSTANT_SHARE,
+    FrameStructure,
     LengthField,
     RisingField,
     find_rising_fields,
     find_structure,
     find_usual_bytes,
+    split_frames,
 )
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import WireError
@@ -33,11 +35,11 @@ from lidarspec.errors import WireError
 MAX_CHECKSUM_FRAMES = 256
 #: The maximum number of sync bytes.
 MAX_SYNC_BYTES = 4
-#: The maximum number of sync bytes if there are fewer than `MANY_FRAMES` frames, because further
-#: constant bytes may be coincidence.
-MAX_SHORT_SYNC_BYTES = 2
+#: The maximum number of sync bytes if there are fewer than `MIN_FRAMES_FOR_LONG_SYNC` frames,
+#: because further constant bytes may be coincidence.
+MAX_SYNC_BYTES_OF_FEW_FRAMES = 2
 #: From this number of frames on, constant bytes are probably not coincidence.
-MANY_FRAMES = 12
+MIN_FRAMES_FOR_LONG_SYNC = 12
 #: The smallest number of blocks in a frame.
 MIN_BLOCKS = 3
 #: The smallest share of a frame that its blocks fill.
@@ -49,7 +51,7 @@ MIN_ELEMENT_BYTES = 2
 MAX_ELEMENT_BYTES = 16
 #: The width of the widest checksum, in bytes.
 MAX_CHECKSUM_BYTES = 4
-#: In at least this number of frames, most bits of a checksum change.
+#: From this number of frames on, most bits of a real checksum have changed.
 MIN_FRAMES_FOR_CHANGE = 16
 
 
@@ -62,14 +64,14 @@ class RepeatedBlocks:
         size: size of a block, in bytes.
         count: number of blocks.
         flag: the constant first bytes of each block; b"" if there are none.
-        candidates: the fields with rising values in a block.
+        rising_fields: the fields with rising values in a block.
     """
 
     start: int
     size: int
     count: int
     flag: bytes
-    candidates: tuple[RisingField, ...] = ()
+    rising_fields: tuple[RisingField, ...] = ()
 
     @property
     def end(self) -> int:
@@ -88,12 +90,12 @@ class Draft:
         length: the length field; None if all frames have one length.
         frames: the offset and the bytes of each frame that has all known properties, in order.
         bytes_in: number of input bytes.
-        candidates: the fields with rising values outside the blocks.
+        rising_fields: the fields with rising values outside the blocks.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
         others: other checksums that match.
-        common_bytes: if the length field counts bytes, the number of bytes at the start of nearly
-            all frames in which fields are searched; otherwise 0.
+        common_bytes: if the length field counts bytes, the number of first bytes that nearly all
+            frames have; fields are searched only there. Otherwise 0.
     """
 
     datagrams: bool
@@ -102,7 +104,7 @@ class Draft:
     length: LengthField | None
     frames: tuple[tuple[int, bytes], ...]
     bytes_in: int
-    candidates: tuple[RisingField, ...] = ()
+    rising_fields: tuple[RisingField, ...] = ()
     blocks: RepeatedBlocks | None = None
     checksum: ChecksumMatch | None = None
     others: tuple[ChecksumMatch, ...] = ()
@@ -126,8 +128,10 @@ class Draft:
 
         It is the length of the frame if all frames have the same length.
         """
-        if self.size is not None or self.length is None:
-            return self.size or 0
+        if self.size is not None:
+            return self.size
+        if self.length is None:
+            return 0
         return max(self.length.rest - self.tail_size, self.length.end, self.common_bytes)
 
     @property
@@ -154,45 +158,56 @@ def make_draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
             "these bytes have no repeated frame structure", data=b"".join(chunks[:1])[:16]
         )
     parts = chunks if datagrams else [b"".join(chunks)]
-    size = sum(map(len, chunks))
-    if datagrams or structure.period is None or size % structure.period == 0:
-        start = 0
-    else:
-        start = max(parts[0].find(structure.sync), 0)
-    first = Draft(datagrams, b"", structure.period, structure.length, (), size)
-    first = (
-        _find_sync(first, parts, start)
-        or _find_sync(first, parts, max(parts[0].find(structure.sync), 0))
-        or replace(first, sync=structure.sync)
+    draft = Draft(
+        datagrams=datagrams,
+        sync=_find_sync(structure, parts, datagrams=datagrams),
+        size=structure.period,
+        length=structure.length,
+        frames=(),
+        bytes_in=sum(map(len, chunks)),
     )
-    result = _find_count(replace(first, frames=tuple(_iter_frames(first, parts))), parts[-1])
-    result = _find_common_bytes(result, parts)
-    result = replace(result, candidates=tuple(find_rising_fields(result.rows)))
-    checksums = _find_checksums(result)
+    draft = replace(draft, frames=tuple(_iter_frames(draft, parts)))
+    draft = _find_count(draft, parts[0])
+    draft = _find_common_bytes(draft, parts)
+    draft = replace(draft, rising_fields=tuple(find_rising_fields(draft.rows)))
+    checksums = _find_checksums(draft)
     if checksums:
-        result = replace(result, checksum=checksums[0], others=tuple(checksums[1:]))
-    return _find_blocks(replace(result, frames=tuple(_iter_frames(result, parts))))
+        draft = replace(draft, checksum=checksums[0], others=tuple(checksums[1:]))
+    return _find_blocks(replace(draft, frames=tuple(_iter_frames(draft, parts))))
 
 
-def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
-    """Return the draft with its sync bytes; None if none are found.
+def _find_sync(structure: FrameStructure, parts: Sequence[bytes], *, datagrams: bool) -> bytes:
+    """Return the first bytes of every frame.
 
-    Sync bytes are searched only if all frames have the same length.
+    These are `structure.sync`, unless all frames have the same length and other constant bytes are
+    found at their start.
 
     Args:
-        first: the draft without sync bytes.
+        structure: the structure of the frames.
         parts: the datagrams, or the whole stream.
-        start: offset of the first frame in a stream.
+        datagrams: whether each frame is a datagram.
     """
-    if first.datagrams:
-        frames = [part for part in parts if len(part) == first.size]
-    elif first.size is not None:
-        frames = [
-            parts[0][offset : offset + first.size]
-            for offset in range(start, len(parts[0]) - first.size + 1, first.size)
-        ]
-    else:
-        return None
+    if structure.period is None:
+        return structure.sync
+    if datagrams:
+        frames = [part for part in parts if len(part) == structure.period]
+        return _find_constant_start(frames) or structure.sync
+    stream = parts[0]
+    if len(stream) % structure.period == 0:
+        # The stream probably consists of whole frames.
+        sync = _find_constant_start(split_frames(stream, structure.period))
+        if sync:
+            return sync
+    start = max(stream.find(structure.sync), 0)  # 0 if no frame has all of them
+    frames = split_frames(stream, structure.period, start)
+    return _find_constant_start(frames) or structure.sync
+
+
+def _find_constant_start(frames: Sequence[bytes]) -> bytes:
+    """Return the constant bytes at the start of frames of the same length; b"" if there are none.
+
+    Bytes that are all zero are not returned, because unused fields are often zero.
+    """
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
     usual = find_usual_bytes(rows[:, :MAX_SYNC_BYTES])
     min_share = MIN_CONSTANT_SHARE if len(rows) >= FEW_FRAMES else 1
@@ -200,13 +215,13 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
     if is_constant.all():
         length = len(is_constant)
     else:
-        length = int(np.argmin(is_constant))
-    if len(rows) < MANY_FRAMES:
-        length = min(length, MAX_SHORT_SYNC_BYTES)
+        length = int(np.argmin(is_constant))  # the offset of the first byte that varies
+    if len(rows) < MIN_FRAMES_FOR_LONG_SYNC:
+        length = min(length, MAX_SYNC_BYTES_OF_FEW_FRAMES)
     sync = usual[:length].tobytes()
     if any(sync):
-        return replace(first, sync=sync)
-    return None
+        return sync
+    return b""
 
 
 def _iter_frames(draft: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
@@ -253,7 +268,7 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
     return checksum.algorithm(covered) == stored
 
 
-def _find_count(draft: Draft, data: bytes) -> Draft:
+def _find_count(draft: Draft, stream: bytes) -> Draft:
     """Search for a length field with the help of an incomplete frame at the end.
 
     A byte that is equal in all other frames, but not in the incomplete frame, is probably a number
@@ -261,31 +276,43 @@ def _find_count(draft: Draft, data: bytes) -> Draft:
 
     Args:
         draft: the draft.
-        data: the last datagram, or the whole stream.
+        stream: all bytes; not used for datagrams.
     """
     if draft.size is None or draft.datagrams or not draft.frames:
         return draft
-    offset, last = draft.frames[-1]
-    rest = data[offset + len(last) :]
+    last_start, last_whole = draft.frames[-1]
+    incomplete = stream[last_start + len(last_whole) :]
     for offset in range(len(draft.sync), MAX_COUNT_OFFSET):
-        is_constant = len({frame[: offset + 1] for _, frame in draft.frames}) == 1
+        is_prefix_constant = len({frame[: offset + 1] for _, frame in draft.frames}) == 1
         if (
-            not is_constant
-            or len(rest) <= offset
-            or rest[:offset] != last[:offset]
-            or rest[offset] == last[offset]
+            not is_prefix_constant
+            or len(incomplete) <= offset
+            or incomplete[:offset] != last_whole[:offset]
+            or incomplete[offset] == last_whole[offset]
         ):
             continue
         lengths = [
-            LengthField(offset, 1, "little", unit, draft.size - unit * last[offset])
+            LengthField(
+                offset=offset,
+                size=1,
+                order="little",
+                unit=unit,
+                rest=draft.size - unit * last_whole[offset],
+            )
             for unit in range(MIN_ELEMENT_BYTES, MAX_ELEMENT_BYTES + 1)
         ]
-        # The last frame is incomplete, so its length must be more than the rest of the data.
         fitting = [
-            length for length in lengths if length.rest > offset and length.read(rest) > len(rest)
+            length
+            for length in lengths
+            # the elements follow the field
+            if length.rest > offset
+            # the frame has bytes after the end of the stream
+            and length.read(incomplete) > len(incomplete)
         ]
         if fitting:
-            return replace(draft, size=None, length=min(fitting, key=lambda length: length.rest))
+            # the largest elements
+            length = min(fitting, key=lambda length: length.rest)
+            return replace(draft, size=None, length=length)
     return draft
 
 
@@ -294,16 +321,23 @@ def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
 
     Shorter frames are probably of another type.
     """
-    if draft.length is None or draft.length.unit > 1 or not draft.frames:
+    if draft.length is None or not draft.frames:
         return draft
+    if draft.length.unit > 1:
+        return draft  # the field counts elements, not bytes
     lengths = sorted(len(frame) for _, frame in draft.frames)
     short_length = lengths[int(len(lengths) * (1 - MIN_CONSTANT_SHARE))]
-    draft = replace(draft, common_bytes=min(HEAD_SEARCH_BYTES, short_length - MAX_CHECKSUM_BYTES))
+    # A checksum at the end of a short frame is not among the common bytes.
+    common_bytes = min(HEAD_SEARCH_BYTES, short_length - MAX_CHECKSUM_BYTES)
+    draft = replace(draft, common_bytes=common_bytes)
     return replace(draft, frames=tuple(_iter_frames(draft, parts)))
 
 
 def _find_checksums(draft: Draft) -> list[ChecksumMatch]:
-    """Return the matching checksums, except at rising or nearly constant bytes."""
+    """Return the matching checksums that a struct can declare.
+
+    Checksums at rising or nearly constant bytes are omitted.
+    """
     frames = [frame for _, frame in draft.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
     shortest = min(map(len, frames), default=0)
@@ -311,7 +345,7 @@ def _find_checksums(draft: Draft) -> list[ChecksumMatch]:
     return [
         match
         for match in search(searched)
-        if not any(_overlaps(match.place, field, shortest) for field in draft.candidates)
+        if not any(_overlaps(match.place, field, shortest) for field in draft.rising_fields)
         and _is_declarable(draft, match)
         and _varies_enough(match, searched)
     ]
@@ -339,54 +373,67 @@ def _overlaps(place: ChecksumPlace, field: RisingField, length: int) -> bool:
 def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
     """Return whether a struct can declare the checksum.
 
-    The checksum must cover one range. It must not be in the part of varying length, or stored in
-    nibbles.
+    The checksum must cover all other bytes, or one range. It must not be in the part of varying
+    length, or stored in nibbles.
     """
     if match.is_in_nibbles:
         return False
-    place, span = match.place, match.span
-    whole = (span.part, span.head, span.tail) == ("all", 0, 0) or (span.part, span.tail) == (
-        "before",
-        0,
-    )
-    at_end = place.offset == -place.size
-    if draft.size is None and not at_end:
-        return 0 <= place.offset <= draft.head_size - place.size and whole
-    return whole or at_end or span.part == "behind"
+    place = match.place
+    span = match.span
+    if place.offset == -place.size:
+        return True  # no byte follows the checksum, so the covered bytes are one range
+    covers_bytes_before = span.part == "before" and span.tail == 0
+    if draft.size is None:
+        is_in_head = 0 <= place.offset <= draft.head_size - place.size
+        return is_in_head and (span.covers_all or covers_bytes_before)
+    return span.covers_all or covers_bytes_before or span.part == "behind"
 
 
 def _find_blocks(draft: Draft) -> Draft:
-    """Return the draft with blocks.
+    """Return the draft with blocks, which are searched only in frames of the same length.
 
-    Rising fields in the blocks, or in the checksum, are removed from the draft's candidates.
+    Rising fields in the blocks, the checksum or the sync bytes are removed from the draft.
     """
     if not draft.frames:
         return draft
-    rows = draft.rows
-    rising = draft.candidates
+    blocks = None
     if draft.size is not None:
-        blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(rising, rows.shape[1])
-    else:
-        blocks = None
-    if blocks is not None:
-        block_rows = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
-        block_fields = tuple(
-            field for field in find_rising_fields(block_rows) if field.offset >= len(blocks.flag)
-        )
-        if blocks.flag or any(field.offset == 0 for field in block_fields):
-            blocks = replace(blocks, candidates=block_fields)
-        else:
-            blocks = None
-    if blocks is not None:
-        rising = tuple(
-            field for field in rising if field.end <= blocks.start or field.offset >= blocks.end
-        )
+        blocks = _choose_blocks(draft.rows, draft.rising_fields)
     shortest = min(len(frame) for _, frame in draft.frames)
-    if draft.checksum is not None:
-        place = draft.checksum.place
-        rising = tuple(field for field in rising if not _overlaps(place, field, shortest))
-    rising = tuple(field for field in rising if field.offset >= len(draft.sync))
-    return replace(draft, candidates=rising, blocks=blocks)
+    rising_fields = []
+    for field in draft.rising_fields:
+        if field.offset < len(draft.sync):
+            continue
+        if blocks is not None and blocks.start < field.end and field.offset < blocks.end:
+            continue
+        if draft.checksum is not None and _overlaps(draft.checksum.place, field, shortest):
+            continue
+        rising_fields.append(field)
+    return replace(draft, rising_fields=tuple(rising_fields), blocks=blocks)
+
+
+def _choose_blocks(
+    rows: NDArray[np.uint8], rising_fields: Sequence[RisingField]
+) -> RepeatedBlocks | None:
+    """Return the blocks of frames with their rising fields; None if no blocks are found.
+
+    Args:
+        rows: the frames, (n, length).
+        rising_fields: the rising fields of the frames.
+    """
+    blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(rising_fields, rows.shape[1])
+    if blocks is None:
+        return None
+    block_rows = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
+    block_fields = tuple(
+        field for field in find_rising_fields(block_rows) if field.offset >= len(blocks.flag)
+    )
+    begins_with_field = any(field.offset == 0 for field in block_fields)
+    # Without a flag, blocks were assumed because of similar rising fields in the frame. If they
+    # are blocks, the values rise from block to block too.
+    if not blocks.flag and not begins_with_field:
+        return None
+    return replace(blocks, rising_fields=block_fields)
 
 
 def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
@@ -416,6 +463,16 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
     return max(found_blocks, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
+def _are_similar(first: RisingField, second: RisingField) -> bool:
+    """Return whether two fields have the same type and the same kind of values."""
+    return (first.size, first.order, first.kind, first.circle) == (
+        second.size,
+        second.order,
+        second.kind,
+        second.circle,
+    )
+
+
 def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
     """Return blocks at equal distances, each of which begins with a similar rising field.
 
@@ -424,12 +481,10 @@ def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> Repeat
     """
     found_blocks = []
     for field in fields:
-        kind = (field.size, field.order, field.kind, field.circle)
         offsets = [
             other.offset
             for other in fields
-            if (other.size, other.order, other.kind, other.circle) == kind
-            and other.offset >= field.offset
+            if other.offset >= field.offset and _are_similar(other, field)
         ]
         for step in {offset - field.offset for offset in offsets[1:]}:
             count = next(

@@ -120,7 +120,7 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
         frame_arguments.append("confirm=2")
     counters = [
         field
-        for field in draft.candidates
+        for field in draft.rising_fields
         if field.kind == "counter" and field.offset < draft.head_size
     ]
     # The most regular counter is used; the others are alternatives.
@@ -197,7 +197,7 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
         fields.append(_make_checksum_field(draft, draft.checksum, start))
     if draft.blocks is not None:
         fields.append(_make_block_field(draft, draft.blocks))
-    fields += [_make_rising_field(draft, field) for field in draft.candidates]
+    fields += [_make_rising_field(draft, field) for field in draft.rising_fields]
     chosen: list[DraftField] = []
     for field in fields:
         if all(
@@ -303,7 +303,7 @@ def _find_start_field(draft: Draft, end_field: RisingField) -> RisingField | Non
     """
     if end_field.kind == "counter":
         return None
-    for field in draft.candidates:
+    for field in draft.rising_fields:
         is_same_kind = field.circle == end_field.circle and field.kind == end_field.kind
         if not is_same_kind or field.offset >= end_field.offset:
             continue
@@ -323,7 +323,7 @@ def _make_block_field(draft: Draft, blocks: RepeatedBlocks) -> DraftField:
         fields.append(DraftField(0, len(blocks.flag), "flag", code))
     offset = len(blocks.flag)
     for field in [
-        *(_make_rising_field(draft, rising, "block") for rising in blocks.candidates),
+        *(_make_rising_field(draft, rising, "block") for rising in blocks.rising_fields),
         DraftField(blocks.size, 0, "", ""),
     ]:
         fields += _iter_unknown_fields(rows, offset, field.start, ())
@@ -443,9 +443,9 @@ def _find_angles(draft: Draft) -> list[str]:
     paths = []
     if draft.blocks:
         paths = [
-            f"blocks.{field.name}" for field in draft.blocks.candidates if field.kind == "angle"
+            f"blocks.{field.name}" for field in draft.blocks.rising_fields if field.kind == "angle"
         ]
-    return paths + [field.name for field in draft.candidates if field.kind == "angle"]
+    return paths + [field.name for field in draft.rising_fields if field.kind == "angle"]
 
 
 def _count_fixed_bits(draft: Draft) -> int:

@@ -73,6 +73,11 @@ class CoveredSpan:
     head: int = 0
     tail: int = 0
 
+    @property
+    def covers_all(self) -> bool:
+        """Whether all bytes except the checksum are covered."""
+        return self.part == "all" and self.head == 0 and self.tail == 0
+
     def ranges(self, place: ChecksumPlace, length: int) -> list[tuple[int, int]]:
         """Return the covered (start, end) offsets in a frame of this length."""
         start = place.start(length)
@@ -84,9 +89,8 @@ class CoveredSpan:
 
     def describe(self, place: ChecksumPlace, length: int) -> str:
         """Describe the covered bytes of a frame of this length as text."""
-        if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
-            b - a for a, b in self.ranges(place, length)
-        ) == length - place.size:
+        covered_bytes = sum(end - start for start, end in self.ranges(place, length))
+        if self.covers_all or covered_bytes == length - place.size:
             return "all other bytes"
         if self.part == "before":
             return f"the bytes from {self.head} up to the checksum"

@@ -49,8 +49,8 @@ def draft_file(name: str) -> Draft:
 
 
 def rising(found: Draft) -> dict[str, tuple[int, str, int]]:
-    inside = found.blocks.candidates if found.blocks else ()
-    return {one.name: (one.size, one.order, one.circle) for one in (*found.candidates, *inside)}
+    inside = found.blocks.rising_fields if found.blocks else ()
+    return {one.name: (one.size, one.order, one.circle) for one in (*found.rising_fields, *inside)}
 
 
 def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
@@ -325,7 +325,7 @@ def test_a_wrapping_index_does_not_make_a_longer_frame(tmp_path: Path) -> None:
     assert found.checksum is not None
     assert (found.checksum.algorithm, found.checksum.place) == (Fold15(), ChecksumPlace(-2, 2))
     assert [
-        (one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"
+        (one.name, one.first, one.circle) for one in found.rising_fields if one.kind == "counter"
     ] == [("counter_1", 0xA0, 0xFA)]
 
 
