@@ -7,7 +7,7 @@ are calculated from the frames (`crc_search`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +43,7 @@ MAX_MATCHES = 8
 #: The number of frames on which a checksum is tried before all frames are used.
 SCREENING_FRAMES = 16
 #: The minimum share of valid frames for a checksum whose constant is fitted to the frames.
-MIN_VALID_SHARE = 0.95
+MIN_VALID_SHARE_WITH_CONSTANT = 0.95
 #: A checksum in nibbles is searched at offsets less than this.
 NIBBLE_SEARCH_BYTES = 3
 #: The number of checksums in nibbles that are tried: one at offset 0, where no byte precedes the
@@ -52,11 +52,13 @@ NIBBLE_TRIALS = 2 * NIBBLE_SEARCH_BYTES - 1
 ANYWHERE_NOTE = (
     "an XOR over the whole frame fits at several offsets: the byte that varies most was chosen"
 )
-#: Values of `WordXor.head` to try. The next constant contains the values of `WordXor.groups` to
-#: try.
+#: Values of `WordXor.head` to try.
 WORD_XOR_HEADS = (0, 2, 4, 6, 8, 10, 12)
+#: Values of `WordXor.groups` to try.
 WORD_XOR_GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
-_PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
+#: Python source that appends the missing low byte of the last word, by the byte order of the words.
+#: A little-endian word has its missing byte at the top, where it is zero anyway.
+_PADDING_SOURCE = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,32 @@ class WordSum(Checksum):
         total: NDArray[np.uint64] = low.sum(axis=1, dtype=np.uint64) + (
             high.sum(axis=1, dtype=np.uint64) << np.uint64(8)
         )
-        for _ in range(2 if self.carry else 0):
-            total = (total & np.uint64(0xFFFF)) + (total >> np.uint64(16))
+        if self.carry:
+            total = _add_carry(_add_carry(total))  # the first addition may have a carry too
         return total & np.uint64(0xFFFF)
 
 
+def _add_carry(total: Values) -> Values:
+    """Return the low 16 bits of sums plus their higher bits."""
+    return (total & np.uint64(0xFFFF)) + (total >> np.uint64(16))
+
+
+#: Checksums of two bytes to try. With groups of one word, `WordXor.head` has no effect.
+_TWO_BYTE_CHECKSUMS: tuple[Checksum, ...] = (
+    Sum(16),
+    *(WordSum(order, carry) for order in ("little", "big") for carry in (False, True)),
+    *(
+        WordXor(head, groups)
+        for groups in WORD_XOR_GROUPS
+        for head in (WORD_XOR_HEADS if groups != (2,) else (0,))
+    ),
+    Fletcher(),
+    Fold15(),
+)
+
+
 @dataclass(frozen=True)
-class OffsetChecksum(Checksum):
+class ChecksumWithConstant(Checksum):
     """A checksum that combines the value of another checksum with a constant.
 
     The result is ``constant ^ value`` for XORs, ``constant - value`` if `negative` is set, and
@@ -113,13 +134,13 @@ class OffsetChecksum(Checksum):
     base: Checksum
     constant: int
     negative: bool = False
-    width = 8
+    width = 8  # replaced by the width of `base`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "width", self.base.width)
 
     def __call__(self, data: Bytes) -> int:
-        return int(self._add_constant(np.array([self.base(data)], np.uint64))[0])
+        return int(self._combine(np.array([self.base(data)], np.uint64))[0])
 
     def describe(self) -> str:
         digits = self.width // 4
@@ -134,19 +155,22 @@ class OffsetChecksum(Checksum):
         return f"{self.base.describe()}, {operation} 0x{self.constant:0{digits}x}"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self._add_constant(compute_checksums(self.base, rows))
+        return self._combine(compute_checksums(self.base, rows))
 
     @property
     def _mask(self) -> int:
         return (1 << self.width) - 1
 
-    def _add_constant(self, values: Values) -> Values:
+    def _combine(self, values: Values) -> Values:
+        """Return values of the other checksum combined with the constant."""
         constant = np.uint64(self.constant)
         if isinstance(self.base, Xor | WordXor):
             return values ^ constant
-        return ((constant - values) if self.negative else (constant + values)) & np.uint64(
-            self._mask
-        )
+        if self.negative:
+            result = constant - values
+        else:
+            result = constant + values
+        return result & np.uint64(self._mask)
 
 
 def search(
@@ -165,12 +189,14 @@ def search(
         is_possible_place: a function that returns whether a checksum may be at a place.
     """
     samples = SampleFrames(frames)
-    if samples.shortest < 3 or not any(map(any, samples.frames)):
+    has_content = any(any(frame) for frame in samples.frames)  # a byte that is not zero
+    if samples.shortest < 3 or not has_content:
         return []
     matches = list(iter_plain_matches(samples, is_possible_place))
     if not any(match.is_sure for match in matches):
         matches += iter_crc_matches(samples, quick=quick, is_possible_place=is_possible_place)
     if not matches and not quick:
+        # CRCs with different `refin` and `refout` are rare
         matches += iter_crc_matches(samples, mixed=True, is_possible_place=is_possible_place)
     return sort_matches(matches)[:MAX_MATCHES]
 
@@ -191,7 +217,7 @@ def needs_class(algorithm: Checksum) -> bool:
 
     A plugin must then contain the class.
     """
-    return isinstance(algorithm, OffsetChecksum | WordSum)
+    return isinstance(algorithm, ChecksumWithConstant | WordSum)
 
 
 def iter_plain_matches(
@@ -201,29 +227,42 @@ def iter_plain_matches(
     few = samples.take_spread(SCREENING_FRAMES)
     tried = 0
     has_sure = False
-    has_sure_sum = False
-    longest = len(few.frames[-1])  # the frames are sorted by length
-    for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
+    for size, algorithms in ((4, (Sum(32),)), (2, _TWO_BYTE_CHECKSUMS), (1, (Xor(), Sum(8)))):
         for place in filter(is_possible_place, few.iter_places(size)):
-            for span in iter_spans(place, few):
-                if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
-                    continue
-                for algorithm in algorithms:
-                    if isinstance(algorithm, WordXor) and (span.head or span.tail):
-                        continue
-                    tried += 1
-                    for match in _iter_matches(samples, few, algorithm, place, span, tried):
-                        has_sure = has_sure or match.is_sure
-                        has_sure_sum = has_sure_sum or (
-                            match.is_sure and not isinstance(match.algorithm, Xor | WordXor)
-                        )
-                        yield match
-            # An XOR may fit at several offsets, so all offsets are searched.
+            has_sure_sum = False
+            for algorithm, span in _iter_checksums(few, place, algorithms):
+                tried += 1
+                for match in _iter_matches(samples, few, algorithm, place, span, tried):
+                    if match.is_sure:
+                        has_sure = True
+                        if not isinstance(match.algorithm, Xor | WordXor):
+                            has_sure_sum = True
+                    yield match
+            # If only XORs match, the search continues: an XOR may fit at several offsets.
             if has_sure_sum:
                 return
         if has_sure:
             return
     yield from _iter_nibble_matches(samples, is_possible_place)
+
+
+def _iter_checksums(
+    samples: SampleFrames, place: ChecksumPlace, algorithms: Sequence[Checksum]
+) -> Iterator[tuple[Checksum, CoveredSpan]]:
+    """Yield the algorithms and covered bytes to try for a place.
+
+    At least half of the bytes of the longest frame are covered.
+    """
+    longest = len(samples.frames[-1])  # the frames are sorted by length
+    for span in iter_spans(place, samples):
+        covered_bytes = sum(end - start for start, end in span.ranges(place, longest))
+        if 2 * covered_bytes < longest - place.size:
+            continue
+        for algorithm in algorithms:
+            # There are many variants of `WordXor`, which are tried only without omitted bytes.
+            if isinstance(algorithm, WordXor) and (span.head or span.tail):
+                continue
+            yield algorithm, span
 
 
 def _iter_matches(
@@ -236,8 +275,6 @@ def _iter_matches(
 ) -> Iterator[ChecksumMatch]:
     """Yield the match of an algorithm, and of its variants with a constant.
 
-    A constant is fitted only if there are several frames that can confirm it.
-
     Args:
         samples: all frames.
         few: some of the frames, on which the algorithm is tried first.
@@ -247,68 +284,83 @@ def _iter_matches(
         tried: number of checksums that were tried so far.
     """
     computed = few.compute_checksums(algorithm, place, span)
-    mask = np.uint64((1 << 8 * place.size) - 1)
     byte_orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
+    max_value = (1 << 8 * place.size) - 1
     for order in byte_orders:
         stored = few.read_field(place, order)
-        algorithms: list[Checksum]
-        if isinstance(algorithm, Fletcher | Fold15):
-            if are_enough(int((stored == computed).sum()), len(few)):
-                algorithms = [algorithm]
-            else:
-                algorithms = []
-        elif isinstance(algorithm, Xor | WordXor):
-            algorithms = [
-                _add_constant(algorithm, constant) for constant in _find_constant(stored ^ computed)
-            ]
-        elif few.is_single:
-            if not stored.any():
-                return
-            algorithms = [algorithm, OffsetChecksum(algorithm, int(mask), negative=True)]
-        else:
-            algorithms = [
-                _add_constant(algorithm, constant)
-                for constant in _find_constant((stored - computed) & mask)
-            ]
-            algorithms += [
-                OffsetChecksum(algorithm, constant, negative=True)
-                for constant in _find_constant((stored + computed) & mask)
-            ]
-        for variant in algorithms:
-            constant = variant.constant if isinstance(variant, OffsetChecksum) else 0
-            has_constant = constant not in (0, int(mask))
-            right = samples.count_valid(variant, place, span, order)
+        for variant in _list_variants(algorithm, computed, stored, max_value):
+            constant = variant.constant if isinstance(variant, ChecksumWithConstant) else 0
+            has_constant = constant not in (0, max_value)
+            valid_count = samples.count_valid(variant, place, span, order)
             evidence_bits = weigh_evidence(variant.width, stored, int(has_constant), tried)
             if has_constant:
-                is_proven = right >= MIN_VALID_SHARE * len(samples) and not few.is_single
+                min_count = MIN_VALID_SHARE_WITH_CONSTANT * len(samples)
+                is_proven = valid_count >= min_count and not few.is_single
             else:
-                is_proven = are_enough(right, len(samples))
+                is_proven = are_enough(valid_count, len(samples))
             if not is_proven or evidence_bits <= 0:
                 continue
             notes: tuple[str, ...] = ()
             variation = 0.0
-            if isinstance(algorithm, Xor | WordXor) and span == CoveredSpan():
+            if isinstance(algorithm, Xor | WordXor) and span.covers_all:
                 notes = (ANYWHERE_NOTE,)
                 variation = samples.measure_variation(place)
             yield ChecksumMatch(
-                variant,
-                place,
-                span,
-                order,
-                right,
-                len(samples),
-                evidence_bits,
-                format_algorithm(variant),
-                notes,
+                algorithm=variant,
+                place=place,
+                span=span,
+                order=order,
+                right=valid_count,
+                total=len(samples),
+                evidence_bits=evidence_bits,
+                source=format_algorithm(variant),
+                notes=notes,
                 is_ambiguous=has_constant,
                 has_constant=has_constant,
                 variation=variation,
             )
 
 
-def _add_constant(algorithm: Checksum, constant: int) -> Checksum:
+def _list_variants(
+    algorithm: Checksum, computed: Values, stored: Values, max_value: int
+) -> list[Checksum]:
+    """Return an algorithm with each constant that makes most frames valid.
+
+    If there is only one frame, it cannot confirm a constant. For a sum, the result is then the sum
+    and its complement.
+
+    Args:
+        algorithm: the algorithm.
+        computed: the result of the algorithm for each frame, (n,).
+        stored: the value at the place of the checksum in each frame, (n,).
+        max_value: the largest value that can be stored.
+    """
+    mask = np.uint64(max_value)
+    if isinstance(algorithm, Fletcher | Fold15):
+        # A start value would change the result by an amount that depends on the length.
+        if are_enough(int((stored == computed).sum()), len(stored)):
+            return [algorithm]
+        return []
+    if isinstance(algorithm, Xor | WordXor):
+        return [
+            _include_constant(algorithm, constant) for constant in _find_constant(stored ^ computed)
+        ]
+    if len(stored) == 1:
+        if not stored.any():
+            return []
+        return [algorithm, ChecksumWithConstant(algorithm, max_value, negative=True)]
+    added = _find_constant((stored - computed) & mask)
+    negated = _find_constant((stored + computed) & mask)
+    return [
+        *(_include_constant(algorithm, constant) for constant in added),
+        *(ChecksumWithConstant(algorithm, constant, negative=True) for constant in negated),
+    ]
+
+
+def _include_constant(algorithm: Checksum, constant: int) -> Checksum:
+    """Return an algorithm with a constant; the algorithm itself if the constant is 0."""
     if constant:
-        return OffsetChecksum(algorithm, constant)
+        return ChecksumWithConstant(algorithm, constant)
     return algorithm
 
 
@@ -335,59 +387,45 @@ def _iter_nibble_matches(
         if place.offset > 0:
             spans.append(CoveredSpan("all"))
         for span in spans:
-            right = int((samples.compute_checksums(Xor(), place, span) == stored).sum())
+            valid_count = int((samples.compute_checksums(Xor(), place, span) == stored).sum())
             evidence_bits = weigh_evidence(8, stored, 0, NIBBLE_TRIALS)
-            if are_enough(right, len(samples)) and evidence_bits > 0:
+            if are_enough(valid_count, len(samples)) and evidence_bits > 0:
                 note = (
                     "the checksum is stored in the low nibbles of two bytes, low half first:"
                     " name both bytes in Checksummed(field=(...))"
                 )
                 yield ChecksumMatch(
-                    Xor(),
-                    place,
-                    span,
-                    "little",
-                    right,
-                    len(samples),
-                    evidence_bits,
-                    "Xor()",
-                    (note,),
+                    algorithm=Xor(),
+                    place=place,
+                    span=span,
+                    order="little",
+                    right=valid_count,
+                    total=len(samples),
+                    evidence_bits=evidence_bits,
+                    source="Xor()",
+                    notes=(note,),
                     is_in_nibbles=True,
                 )
-
-
-#: Checksums of two bytes to try. With groups of one word, `WordXor.head` has no effect.
-_WIDE: tuple[Checksum, ...] = (
-    Sum(16),
-    *(WordSum(order, carry) for order in ("little", "big") for carry in (False, True)),
-    *(
-        WordXor(head, groups)
-        for groups in WORD_XOR_GROUPS
-        for head in (WORD_XOR_HEADS if groups != (2,) else (0,))
-    ),
-    Fletcher(),
-    Fold15(),
-)
 
 
 def format_class(algorithm: Checksum, *, is_typed: bool = False) -> str:
     """Return the Python source of a class `Check` for a checksum.
 
     Args:
-        algorithm: an `OffsetChecksum` or a `WordSum`.
+        algorithm: a `ChecksumWithConstant` or a `WordSum`.
         is_typed: whether the methods have annotations.
     """
-    if isinstance(algorithm, OffsetChecksum):
-        changed = algorithm
+    if isinstance(algorithm, ChecksumWithConstant):
+        with_constant = algorithm
     else:
-        changed = OffsetChecksum(algorithm, 0)
-    base = changed.base
+        with_constant = ChecksumWithConstant(algorithm, 0)
+    base = with_constant.base
     steps = []
     if isinstance(base, Xor | WordXor):
-        value = f"{format_algorithm(base)}(data) ^ 0x{changed.constant:X}"
+        value = f"{format_algorithm(base)}(data) ^ 0x{with_constant.constant:X}"
     elif isinstance(base, WordSum):
         steps = [
-            f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}")'
+            f'words = [int.from_bytes(data[i : i + 2]{_PADDING_SOURCE[base.words]}, "{base.words}")'
             " for i in range(0, len(data), 2)]"
         ]
         value = "sum(words)"
@@ -396,16 +434,18 @@ def format_class(algorithm: Checksum, *, is_typed: bool = False) -> str:
             value = "total"
     else:
         value = "sum(data)"
-    if not isinstance(base, Xor | WordXor) and (changed.constant or changed.negative):
-        value = f"0x{changed.constant:X} {'-' if changed.negative else '+'} {value}"
-    body = "".join(
-        f"        {line}\n"
-        for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}")
-    )
-    call = "self, data: Any) -> int" if is_typed else "self, data)"
-    describe = "self) -> str" if is_typed else "self)"
+    if not isinstance(base, Xor | WordXor) and (with_constant.constant or with_constant.negative):
+        value = f"0x{with_constant.constant:X} {'-' if with_constant.negative else '+'} {value}"
+    max_value = (1 << with_constant.width) - 1
+    body = "".join(f"        {line}\n" for line in (*steps, f"return ({value}) & 0x{max_value:X}"))
+    if is_typed:
+        call = "def __call__(self, data: Any) -> int:"
+        describe = "def describe(self) -> str:"
+    else:
+        call = "def __call__(self, data):"
+        describe = "def describe(self):"
     return (
-        f"class Check(Checksum):\n    width = {changed.width}\n\n"
-        f"    def __call__({call}:\n{body}\n"
-        f'    def describe({describe}:\n        return "{algorithm.describe()}"'
+        f"class Check(Checksum):\n    width = {with_constant.width}\n\n"
+        f"    {call}\n{body}\n"
+        f'    {describe}\n        return "{algorithm.describe()}"'
     )

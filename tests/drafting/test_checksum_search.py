@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec
 import lidarspec.spec
-from lidarspec.drafting.checksum_search import OffsetChecksum, WordSum, search
+from lidarspec.drafting.checksum_search import ChecksumWithConstant, WordSum, search
 from lidarspec.drafting.crc_search import (
     find_common_divisor,
     find_divisors,
@@ -168,7 +168,7 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
         pytest.param(WordXor(), marks=pytest.mark.slow),
         WordSum("little"),
         WordSum("big", carry=True),
-        pytest.param(OffsetChecksum(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
+        pytest.param(ChecksumWithConstant(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
     ],
     ids=lambda checksum: checksum.describe(),
 )
@@ -186,9 +186,9 @@ def test_plain_checksums(checksum: Checksum) -> None:
         *(
             pytest.param(checksum, marks=pytest.mark.slow)
             for checksum in (
-                OffsetChecksum(Sum(8), 0x5A),
-                OffsetChecksum(Sum(16), 0, negative=True),
-                OffsetChecksum(Sum(16), 0x1234),
+                ChecksumWithConstant(Sum(8), 0x5A),
+                ChecksumWithConstant(Sum(16), 0, negative=True),
+                ChecksumWithConstant(Sum(16), 0x1234),
             )
         ),
     ],
@@ -219,9 +219,9 @@ def test_grouped_words_around_a_field(number: int) -> None:
 
 @pytest.mark.slow
 def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
-    frames = make_sealed_frames(OffsetChecksum(Xor(), 0x33), 40, 27)
+    frames = make_sealed_frames(ChecksumWithConstant(Xor(), 0x33), 40, 27)
     matches = search(frames)
-    assert {match.algorithm for match in matches} == {OffsetChecksum(Xor(), 0x33)}
+    assert {match.algorithm for match in matches} == {ChecksumWithConstant(Xor(), 0x33)}
     assert ChecksumPlace(-1, 1) in [match.place for match in matches]
     assert all(
         "at several offsets" in match.remarks[-1] for match in matches if match.span.head == 0
@@ -319,8 +319,8 @@ def test_batches_of_the_checksums_without_a_name() -> None:
     for checksum in (
         WordSum("big"),
         WordSum("little", carry=True),
-        OffsetChecksum(Sum(8), 7, negative=True),
-        OffsetChecksum(Xor(), 9),
+        ChecksumWithConstant(Sum(8), 7, negative=True),
+        ChecksumWithConstant(Xor(), 9),
     ):
         assert checksum.batch(rows).tolist() == [checksum(row.tobytes()) for row in rows]
         assert checksum.describe()

@@ -12,7 +12,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import UsageError, WireError
-from lidarspec.drafting.checksum_search import OffsetChecksum
+from lidarspec.drafting.checksum_search import ChecksumWithConstant
 from lidarspec.drafting.distribution import DistributionNames
 from lidarspec.drafting.draft import Draft, make_draft
 from lidarspec.drafting.draft_code import make_template_values as text_of
@@ -208,7 +208,7 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
         "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
-        "class": make_frames(b"\x5a\xc3", OffsetChecksum(Sum(8), 0x55), skip=1),
+        "class": make_frames(b"\x5a\xc3", ChecksumWithConstant(Sum(8), 0x55), skip=1),
         "over": make_frames(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
         "angles": b"".join(simulate(ls.sensor("ldrobot-ld06"), 300)),
     }
@@ -263,7 +263,7 @@ SEALED = [
     (Sum(16), 0, "big"),
     (Crc(16, 0x1021), 2, "big"),
     (Crc(32, 0x04C11DB7, 0xFFFFFFFF, True, True, 0xFFFFFFFF), 1, "little"),
-    (OffsetChecksum(Sum(8), 0xFF, negative=True), 3, "little"),
+    (ChecksumWithConstant(Sum(8), 0xFF, negative=True), 3, "little"),
 ]
 
 
