@@ -23,7 +23,7 @@ from lidarspec.errors import SpecError
 class Range:
     """A number from `low` to `high`, in the unit of its field.
 
-    In a command, a plugin writes the two numbers without `Range`.
+    A plugin declares it by two numbers: ("motor.speed", 5, 15).
     """
 
     low: float
@@ -141,7 +141,7 @@ class Address:
 
 @dataclass(frozen=True)
 class Octets:
-    """Plain bytes; in a command, a plugin writes `bytes` instead."""
+    """Plain bytes. A plugin declares them by the type: ("key", bytes)."""
 
     def describe(self, field_size: int | None) -> str:
         """Return the accepted values as text, for messages."""
@@ -165,7 +165,7 @@ Taken = Range | Text | Address | Octets
 
 @dataclass(frozen=True)
 class Count:
-    """A running number in `Command.values`; each command that is sent has the next number.
+    """A running number in `Command.values`; every sent command has the next number.
 
     Args:
         bits: the width of the number in bits. After the largest number, the count continues with 0.
@@ -186,7 +186,7 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """Return the number of a command, given its index from 0."""
+        """Return the number of a command; the first command has the index 0."""
         return (self.first + index) % (1 << self.bits)
 
 

@@ -167,10 +167,10 @@ class Sum(Checksum):
 
 @dataclass(frozen=True)
 class WordXor(Checksum):
-    """The XOR of words of one or two bytes, low byte first, zero-extended to 16 bits.
+    """The 16-bit XOR of words of one or two bytes, low byte first.
 
     Args:
-        head: the number of bytes at the start that are always two-byte words.
+        head: the number of bytes at the start that form two-byte words.
         groups: the sizes of the following words, 1 or 2 bytes each. This sequence of sizes is
             repeated. If the data ends after the first byte of a two-byte word, this byte is a word
             of its own.
@@ -312,7 +312,9 @@ def _xor(data: Bytes) -> int:
 
 @lru_cache(maxsize=4096)
 def _list_shifts(bits: int, count: int) -> tuple[int, ...]:
-    """Return the shifts that XOR all parts of an integer into its lowest part.
+    """Return the shifts to combine all parts of an integer by XOR.
+
+    After ``number ^= number >> shift`` for each shift, the lowest part is the XOR of all parts.
 
     Args:
         bits: the size of a part.
@@ -333,7 +335,7 @@ def mirrored_bytes(register: int) -> int:
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """Return the table by which a byte changes the register of a CRC, (256,)."""
+    """Return, for each value of a byte, how it changes the register of a CRC, (256,)."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):
@@ -421,7 +423,7 @@ def make_single(algorithm: Checksum) -> Single:
 
 
 def _make_zlib_crc(algorithm: Crc) -> Single | None:
-    """Return a function that computes a CRC by zlib; None if zlib lacks its polynomial."""
+    """Return a function that computes a CRC by zlib; None if zlib cannot compute it."""
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (
         32,
         0x04C11DB7,

@@ -139,8 +139,8 @@ class Frame:
             fixed.
         plausible: a function of `Fields` that is False for values that no sensor sends. A packet is
             plausible if all values of the result are true.
-        after: the name of another frame type that must precede this frame type. If the `after` of
-            several frame types names different types, only the one that arrived last counts.
+        after: the name of another frame type that announces this frame type. Frames of this type
+            are then accepted until a frame announces another type.
         confirm: the number of consecutive valid frames of this type that must arrive before any of
             them is accepted.
         simulation: facts for the simulation of this frame type. Needed if the sensor has several
@@ -242,7 +242,7 @@ class Frame:
         """The struct of the frame as a tree of nodes; made on first use.
 
         Raises:
-            SpecError: if a constant of an Enum field is none of the names of its Enum.
+            SpecError: if the constant of an Enum field is a name that the Enum does not have.
         """
         return frame_tree(self.prepared)
 
@@ -411,7 +411,7 @@ class Reported:
 
     @classmethod
     def of(cls, declared: str | Reported) -> Reported:
-        """Return an entry of `Sensor.info`; an entry that is only a path is converted."""
+        """Convert an entry of `Sensor.info`, which may be a path, to a `Reported`."""
         if isinstance(declared, str):
             return cls(declared)
         return declared

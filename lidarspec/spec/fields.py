@@ -415,8 +415,8 @@ class Parts(layer.Partition):
         within: the total size of all parts in bytes.
 
     Raises:
-        SpecError: if not exactly one of `count`, `size` with `following`, and `within` is given; or
-            if a part is not a struct.
+        SpecError: if a part is not a struct, or if the arguments do not determine the last part in
+            exactly one way: by `count`, by `within`, or by `size` and `following`.
     """
 
     def __init__(
@@ -486,8 +486,8 @@ class Parts(layer.Partition):
     def _make_size_rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
         """Return a function that calculates the size of the next part.
 
-        Its argument is the parts parsed so far. It returns bytes, or 0 if no part follows, or -1 if
-        the struct of the part determines the size.
+        The argument of the function is the list of the parsed parts. The result is a size in bytes,
+        0 if no part follows, or -1 if the struct of the next part determines the size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
         bounds = (

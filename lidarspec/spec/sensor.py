@@ -177,7 +177,7 @@ class SensorDescription:
 
     @cached_property
     def main_frames(self) -> tuple[str, ...]:
-        """The names of the data frames, or of all incoming frames if the sensor has no points."""
+        """The names of the data frames; without points, of all incoming frames."""
         return self.data_frames or tuple(self.incoming)
 
     @cached_property
@@ -306,8 +306,8 @@ class SensorDescription:
 def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     """Return a copy of a sensor with only these frame types.
 
-    The copy has no commands, no state and no `info` fields, and does not refer to missing frame
-    types.
+    The copy has no commands, no `state` and no `info`. Its clock has no `reference` and no `status`
+    if their frame types are missing.
     """
     clock = sensor.clock
     if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
@@ -343,7 +343,11 @@ def _check_sensor(sensor: SensorDescription) -> None:
 
 
 def _check_reported(sensor: SensorDescription, name: str) -> None:
-    """Raise `SpecError` unless a reply can report a link's port before data is read."""
+    """Raise `SpecError` if the port of a link cannot be a reported port.
+
+    The link must be the data link, and a command in `on_open` over another link must provide the
+    port.
+    """
     if name != "data" or not any(
         sensor.commands[opening].provides and sensor.commands[opening].link != "data"
         for opening in sensor.on_open

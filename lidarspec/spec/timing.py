@@ -200,10 +200,11 @@ class Clock:
             by the pace. With a counter, the pace shows how often the counter has wrapped in a gap,
             and whether a value of the counter is corrupt. The pace must then be correct in every
             mode of the sensor. It is also used to distinguish related models.
-        reference: for a clock that starts again at 0, a pair that gives its date: the name of
-            another frame type that has the same clock, and a function of its `Fields` that returns
-            the date in seconds since 1970, or nan if it is unknown. The first frame with a date is
-            used: in a file for all packets, and in live data for the packets after this frame.
+        reference: the source of the date, for a clock that starts again at 0. It is a pair: the
+            name of another frame type that has the same clock, and a function of its `Fields` that
+            returns the date in seconds since 1970, or nan if it is unknown. The first frame with a
+            date is used: in a file for all packets, and in live data for the packets after this
+            frame.
         epoch: the epoch from which the clock counts, a key of `EPOCHS`: "boot", "utc", "tai", "gps"
             or "hour"; "" if the manual does not specify it. If `status` is given, it is the epoch
             of a locked clock. The option `epoch` of every sensor overrides it.

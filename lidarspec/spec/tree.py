@@ -161,8 +161,8 @@ class FieldInfo:
             ascending order; None for any value.
         rebuilt: the formula of the value in a built frame (construct's Rebuild); None if the caller
             supplies the value.
-        default: the raw value, or its formula, in a built frame if the caller supplies no value.
-            For bytes, it is one byte that is repeated to fill the field.
+        default: the raw value that `build` uses if the caller supplies no value, or the formula of
+            this value. For bytes, it is one byte that is repeated to fill the field.
         is_enforced: whether a parsed frame must have the value of `rebuilt` (`SizeOf`).
         labels: the names of raw values (construct's Enum).
         optional: whether some frames do not have the field.
@@ -465,13 +465,13 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
 
 
 def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """Return the description of one element of a field that is inside arrays.
+    """Return the description of a field in one element of some arrays.
 
-    Returns None if the field is not inside all arrays of `indices`.
+    Returns None if the field is not inside all these arrays.
 
     Args:
-        info: the description of the field.
-        path: the path of the element.
+        info: the description of the field in all elements.
+        path: the path with the indices.
         indices: the index of the element in each array, by the axis of the array.
     """
     if not indices.keys() <= set(info.axes):
@@ -484,7 +484,7 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return a "/" or a float that makes a formula fractional; None if it has neither."""
+    """Return a "/" or a float in a formula, whose value may be a fraction; else None."""
     for part in iter_subformulas(formula):
         if isinstance(part, float):
             return part
@@ -595,9 +595,9 @@ class Ending:
     """The end of bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
-        size: a field that represents the number of bytes before the end, for formulas.
-        mark: the bytes of the mark, such as a terminator. It is searched in steps of its size. b""
-            if the bytes end with the datagram.
+        size: the number of bytes before the end as a field, to be used in formulas.
+        mark: the bytes of the mark, such as a terminator; b"" if the bytes end with the datagram.
+            Only multiples of the size of the mark are tried as its offset.
         mask: the bits of each byte that are compared with the mark.
         is_content: whether the mark belongs to the content, as in a number of variable size.
     """
@@ -790,12 +790,12 @@ class PartSequence:
     Attributes:
         axis: the path of the array of parts.
         kinds: the kinds of parts, in the order in which they are tried.
-        count: the number of parts, or None.
-        size: the size of the first part in bytes, or None. If it is given, each part declares the
-            size of the next part.
-        within: the total size of all parts in bytes, or None.
+        count: the number of parts; None if it is not declared.
+        size: the size of the first part in bytes, if each part declares the size of the next part;
+            else None.
+        within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
-        total: the total size of all parts as a field, for the formulas after the parts.
+        total: the total size of all parts as a field, to be used in formulas of later fields.
         is_array: whether the parts are the elements of an array that differ in size. The fields of
             the elements are then columns of the outer frame.
     """
@@ -811,9 +811,10 @@ class PartSequence:
     is_array: bool = False
 
     def following(self, kind: Kind) -> Formula | None:
-        """Return the formula of the size of the part after a part of this kind.
+        """Return the size of the part that follows a part of this kind, as a formula.
 
-        The paths start at the top of the frame.
+        The paths in the formula start at the top of the frame. Returns None if parts do not declare
+        the size of the next part.
         """
         if kind.following is None:
             return None
@@ -1077,7 +1078,8 @@ def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formul
 def infos(node: Node) -> tuple[FieldInfo, ...]:
     """Return the fields of a node, without the fields of the nodes below it.
 
-    A block has the fields of its parts. Structs, arrays and choices have no fields.
+    The integers in a block are not nodes, so the block returns their fields. Structs, arrays and
+    choices return no fields.
     """
     match node:
         case Number() | Blob() | Opaque():
@@ -1166,7 +1168,7 @@ class RawCopyScope(Scope):
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A computed value, as later expressions read it.
+    """A computed value that later expressions can read.
 
     Attributes:
         content: a formula or a constant; `Untraced` if the value has no formula.
@@ -1180,7 +1182,7 @@ class Value:
         return refs(self.content)
 
     def read(self) -> Any:
-        """Return a symbol, or the constant.
+        """Return a symbol for a formula; a constant is returned unchanged.
 
         Raises:
             UntraceableExpressionError: if the value has no formula.

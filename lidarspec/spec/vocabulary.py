@@ -99,11 +99,11 @@ class AlongAxis(NDArrayOperatorsMixin):
     def align(self, names: tuple[str, ...]) -> NDArray[Any]:
         """Return the numbers with one axis for each name.
 
-        Axes that the numbers do not have get the length 1.
+        An axis has the length 1 if the numbers are the same for all elements of its array.
 
         Args:
-            names: for each axis of the result, the name of its array without the path. They must
-                include the arrays of `axes`.
+            names: for each axis of the result, the last name in the path of its array. The names
+                must include all arrays of `axes`.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])
@@ -112,7 +112,7 @@ class AlongAxis(NDArrayOperatorsMixin):
 
 
 def along(axis: str | tuple[str, ...], values: Array) -> Any:
-    """Return numbers for the elements of an array, as in ``along("pixels", ELEVATIONS)``.
+    """Return numbers for the elements of an array: ``along("pixels", ELEVATIONS)``.
 
     Args:
         axis: the name of an array of the frame, or the names of several nested arrays, outermost
@@ -253,7 +253,7 @@ def between_blocks(
     Args:
         azimuth: the azimuth of each block, in the unit of `full`.
         ahead: the azimuth of the next block, for example ``following(azimuth)``. If consecutive
-            blocks have the same azimuth, it is the next azimuth that differs.
+            blocks can have the same azimuth, pass the next different azimuth.
         fastest: the angle from block to block at the highest speed of the sensor, in the unit of
             `full`. Steps may be up to 25 % larger, because encoder readings vary.
         repeat: False to replace invalid steps by nan.
@@ -319,9 +319,9 @@ def take(table: Array, index: Array) -> Array:
 
 
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
-    """Return the row numbers for indices, in the shape of `index`.
+    """Return the row of a table for each index, in the shape of `index`.
 
-    An index that is out of range becomes the number of the last row, which contains nan.
+    For an index that is out of range, it is the last row, which contains nan.
     """
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 

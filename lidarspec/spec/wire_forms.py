@@ -105,7 +105,7 @@ class NumberRun:
 
     @cached_property
     def remaining(self) -> Offsets:
-        """For each byte of the run, how many bytes of the same number follow it, (bytes,)."""
+        """How many bytes of the same number follow each byte of the run, (bytes,)."""
         return self.ends[self.owners] - 1 - np.arange(len(self.owners))
 
     @cached_property
@@ -127,9 +127,9 @@ class NumberRun:
 
     @cached_property
     def _word_offsets(self) -> Offsets:
-        """For each byte of the run, its offset in an array of big-endian 8-byte words.
+        """The offset of each byte of the run in an array of big-endian 8-byte words.
 
-        The array has one word for each number.
+        Each number is one word.
         """
         significance = np.where(
             self.is_little[self.owners],
@@ -201,15 +201,12 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """The offset in the frame of each byte of the struct; the last item is `end`.
-
-        The offset of a byte is the offset of the field that contains it.
-        """
+        """For each byte of the struct, the offset of its field in the frame; then `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
     def offset(self, place: int) -> int:
-        """Return the offset in the encoded frame of the field that contains a struct byte.
+        """Return where the field of a byte begins in the encoded frame.
 
         Args:
             place: the offset of the byte in the struct.
@@ -228,7 +225,7 @@ class WireForm(Protocol):
     is_text: ClassVar[bool]
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        """Return the first bytes of all encoded frames; None for each byte that varies.
+        """Return the first bytes of every encoded frame; None for a byte that varies.
 
         The result ends before the first byte without a fixed offset.
 
@@ -279,7 +276,12 @@ class DrawsValues(Protocol):
     """A wire form that cannot encode every value up to `largest`."""
 
     def to_encodable(self, run: NumberRun, values: Values) -> Values:
-        """Return random values that can be encoded, (n,), made from random bits, (n,)."""
+        """Return random values that can be encoded, (n,).
+
+        Args:
+            run: the numbers.
+            values: random bits from which the values are made, (n,).
+        """
 
 
 def find_ends(
@@ -426,7 +428,7 @@ class Tokens:
         joined: the number of fields of bytes that together form the first token.
         padded: whether a token may be shorter than its field of bytes, which is then padded with
             zero bytes.
-        optional: the number of fields of bytes at the end whose tokens may be missing; requires
+        optional: how many fields of bytes at the end of the frame may be missing; requires
             `padded`.
         rest: whether the field of bytes after the first token contains all other characters of the
             frame, including separators; requires `padded`.
@@ -759,7 +761,7 @@ class Echoes:
 
     @cached_property
     def _step(self) -> re.Pattern[bytes]:
-        """The pattern of one step; a mark joins two echoes only if characters follow it."""
+        """The pattern of one step: an echo, and further echoes after marks."""
         mark = re.escape(self.mark)
         echo = b"[^%b].{%d}" % (mark, self.size - 1)
         return re.compile(b"%b(?:%b%b){0,%d}" % (echo, mark, echo, self.most - 1), re.DOTALL)
@@ -818,7 +820,9 @@ class Echoes:
         return not is_whole
 
     def join(self, characters: bytes, zero: bytes) -> bytes:
-        """Return the characters of steps without the echoes that are not sent.
+        """Return the characters of steps as they are sent, with marks between echoes.
+
+        Echoes of 0 at the end of a step are left out.
 
         Raises:
             SpecError: if the characters are not whole steps.
@@ -857,8 +861,8 @@ class SixBits:
             such steps.
 
     Raises:
-        SpecError: for invalid `echoes`: a mark that is a digit or not one character, or a size or
-            number below 1.
+        SpecError: for invalid `echoes`: the mark is not a single character, the mark is a digit, or
+            `size` or `most` is below 1.
     """
 
     first: bytes = b"0"
@@ -976,7 +980,7 @@ class Lines:
         numbers: how numbers are encoded; None for unchanged bytes.
 
     Raises:
-        SpecError: if a line has no characters, or if there are echoes but no head before them.
+        SpecError: if a line has no characters, or if `numbers` has echoes but there is no head.
     """
 
     is_text: ClassVar[bool] = True
@@ -1051,7 +1055,7 @@ class Lines:
 
     @cached_property
     def _head_ends(self) -> Sequence[int]:
-        """For each line of the head, the offset in a frame at which the line ends."""
+        """The offset in a frame at which each line of the head ends."""
         lengths = [size + self._has_check(number) + 1 for number, size in enumerate(self.head)]
         return [end - 1 for end in itertools.accumulate(lengths)]
 
@@ -1083,10 +1087,11 @@ class Lines:
         return replace(decoded, problem=problem)
 
     def _strip(self, data: bytes) -> tuple[bytes, Offsets, Problem | None]:
-        """Return the characters of all lines without check characters, and their offsets.
+        """Remove newlines and check characters, and return the other characters.
 
-        The characters end before the first line with a wrong length. The third value of the result
-        is the first error in the lines, or None if all lines are valid.
+        Returns:
+            The characters up to the first line with a wrong length, the offset of each character,
+            and the first error in the lines. The error is None if all lines are valid.
         """
         *lines, _ = data.split(b"\n")
         if lines and not lines[-1]:

@@ -97,9 +97,9 @@ def without_int_adapters(con: Construct) -> Construct:
 
 
 def is_int_adapter(con: Construct) -> bool:
-    """Return whether a construct is an adapter of an integer with an unknown function.
+    """Return whether a construct is an adapter that converts an integer.
 
-    The adapters of construct that are in `_KNOWN` do not count.
+    Returns False for the adapters of construct in `_KNOWN`, which are handled elsewhere.
     """
     if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
         return False
@@ -241,10 +241,10 @@ def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
 
 
 def make_part_adapter(con: Construct) -> tree.Adapter | None:
-    """Return the functions that decode and encode a part that depends only on its own bytes.
+    """Return the functions that decode and encode an independent part.
 
     Returns:
-        None if only construct can read the part.
+        None if the part depends on other bytes, or if only construct can read the part.
     """
     size = fixed_size(con)
     if not is_independent(con):

@@ -68,7 +68,7 @@ def frame_tree(con: Construct) -> tree.Node:
     """Return the tree of a struct.
 
     Raises:
-        SpecError: if a constant of an Enum field is none of the names of its Enum.
+        SpecError: if the constant of an Enum field is a name that the Enum does not have.
     """
     return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
@@ -167,10 +167,11 @@ class _Builder:
         before: the builder of the first pass, if this is the second pass (`_build_twice`).
 
     Attributes:
-        scopes: the complete scope of each struct, by its path.
-        sizes: the formulas of all SizeOf fields, in the order of the fields; None if not known yet.
-        rebuilding: whether a second pass is required, because values of built frames depend on
-            other fields.
+        scopes: the scope of each struct after all its members were added, by path.
+        sizes: the formula of each SizeOf field, in the order of the fields; None while it is
+            unknown.
+        rebuilding: whether a second pass is required, because a value in built frames may depend on
+            later fields.
     """
 
     def __init__(self, before: _Builder | None = None) -> None:
@@ -378,7 +379,10 @@ class _Builder:
             con = con.subcon
 
     def _find_adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
-        """Return the adapter of an integer; None if the field has a constant, labels or a scale."""
+        """Return the adapter of an integer field.
+
+        Returns None if the field has a constant, labels or a scale.
+        """
         if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
             return None
         return make_int_adapter(con)
@@ -708,7 +712,12 @@ class _Builder:
     def _make_part_frame(
         self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
-        """Return a part as a frame of its own, and `following` as a formula."""
+        """Return the node of a part as a frame of its own, and the formula of `following`.
+
+        Args:
+            case: the construct of the part.
+            following: an expression of fields of the part; None for no formula.
+        """
 
         def around(builder: _Builder) -> _Context:
             assert place.scope is not None
@@ -906,7 +915,7 @@ class _Builder:
 
 
 def _to_scope_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
-    """Return a field in the form that later expressions read."""
+    """Return a field as a reference or a computed value for later expressions."""
     ref = tree.Ref(info.path, info)
     if info.adapter is None:
         return ref
@@ -961,9 +970,9 @@ def _iter_formulas(root: tree.Node, *others: tree.Formula | None) -> Iterator[tr
 
 
 def _trace_predicate(predicate: Any, scope: tree.Scope) -> Any:
-    """Return the value of a RepeatUntil's predicate for an element.
+    """Trace the predicate of a RepeatUntil for one element.
 
-    The list of the earlier elements is not available.
+    The predicate gets None instead of the list of elements.
     """
     if isinstance(predicate, ExprMixin):
         return _trace(predicate, scope)
@@ -971,7 +980,7 @@ def _trace_predicate(predicate: Any, scope: tree.Scope) -> Any:
 
 
 def _return_no_offset() -> None:
-    """Return None, because an offset in an array is different for each element."""
+    """Return None: each element of an array has a different offset."""
     return
 
 
@@ -983,7 +992,7 @@ def _find_offset_after(
 
 
 def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
-    """Return whether a field has exactly one value for each computed value.
+    """Return whether a field has one number for each element of a computed value.
 
     Args:
         ref: a reference to the field.
@@ -998,7 +1007,7 @@ def _is_single_value(ref: tree.Ref, info: tree.FieldInfo) -> bool:
 
 
 def _describe_integer(info: tree.FieldInfo) -> tree.FieldInfo:
-    """Return the description of a field with the type of computed integers."""
+    """Return the description of a field, with the type int64 of computed integers."""
     return replace(info, dtype=np.dtype(np.int64), kind="int", bits=64)
 
 
@@ -1198,7 +1207,7 @@ def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
 
 
 def _is_text(con: Construct) -> bool:
-    """Return whether a construct parses to all bytes up to an end, as texts do."""
+    """Return whether a construct consists of plain bytes up to an end, like a text."""
     while isinstance(
         con,
         construct.NullTerminated

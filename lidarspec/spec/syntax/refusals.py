@@ -144,16 +144,17 @@ def _check_class(part: Construct, path: str, *, in_bits: bool) -> None:
 def _check_ends(
     con: Construct, path: str, *, bounded: bool, is_last: bool = True
 ) -> SpecError | None:
-    """Raise SpecError for greedy parts without an end, and for parts that lose bytes.
+    """Raise SpecError for greedy parts not at the end, and for parts that lose bytes.
 
     A greedy part reads all available bytes. It is valid as the last part of the frame, or of a part
     that has an end.
 
     Returns:
-        An error if the last part of the frame is greedy, so that the frame has no end in a stream.
+        An error if the last part of the frame is greedy, so that the frame has no end in a stream;
+        None if the frame has an end.
 
     Raises:
-        SpecError: for any other greedy part without an end, or for a part that loses bytes.
+        SpecError: if other parts follow a greedy part without an end, or if a part loses bytes.
     """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}".strip(".")
@@ -203,7 +204,7 @@ def _check_ends(
 
 
 def _reads_all_bytes(con: Construct, *, padded: bool) -> bool:
-    """Return whether a part of known size reads all its bytes, and can build them.
+    """Return whether parsing and building keep all bytes of a part of known size.
 
     Args:
         padded: whether a part that is too short is padded with zeros.
@@ -273,7 +274,7 @@ def _check_measures(
     measure: tuple[float, float, str],
     measures_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
-    """Raise SpecError for a field with different scales or units in different branches.
+    """Raise SpecError for a field whose branches have different scales or units.
 
     The field becomes one column, which has one scale and one unit.
     """

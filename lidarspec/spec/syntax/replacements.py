@@ -242,8 +242,7 @@ class CheckedConst(Const):  # type: ignore[misc]
     """A Const that can be parsed without verification.
 
     With verification, a wrong constant raises `MismatchError` with its offset and both values.
-    Without it, as in ``parse(verify=False)`` and `explain`, the frame is parsed. construct's Const
-    supports neither.
+    ``parse(verify=False)`` and `explain` also parse frames with wrong constants.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -345,10 +344,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions the name of its value, also when it is built.
+    """An Enum that gives expressions its name, in parsed and in built frames.
 
-    If a frame is built from the number, expressions such as the key of a Switch get the number from
-    construct's Enum, and find no case for it.
+    construct's Enum gives expressions the number if the frame is built from the number. The key of
+    a Switch would then match no case.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -419,7 +418,7 @@ class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
 
 
 class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
-    """A NamedTuple that ignores private entries of its struct, unlike construct's."""
+    """A NamedTuple without the private entries that a prepared struct adds."""
 
     def _decode(self, obj: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, dict):
@@ -444,7 +443,7 @@ class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
 class Reserved(CountedBytes):
     """Reserved bytes, in place of construct's Padding, which loses them.
 
-    If no value is given, they are built from a pattern.
+    If no value is given, `build` repeats the byte `pattern`.
     """
 
     def __init__(self, length: Any, pattern: bytes = b"\0") -> None:
@@ -497,8 +496,8 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         of: the names that lead from the struct with this field to the part. The name "_" leads to
             the outer struct. If there are no names, the part is the struct itself.
         plus: a number that is added to the size.
-        since: the name of an earlier member at which the counted bytes begin; "" to count only the
-            part.
+        since: the name of an earlier member; the size includes all bytes from this member to the
+            part. "" for the size of the part alone.
     """
 
     def __init__(
@@ -512,7 +511,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
     @property
     def levels_up(self) -> int:
-        """The number of struct levels between this field and the struct with the part."""
+        """How many levels above the struct of this field the part is."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
@@ -544,9 +543,9 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
     def _register_size(self, context: Any, entry: tuple[str, int, Any]) -> None:
-        """Store the parsed size, so that the struct that contains the part can check it.
+        """Register this field in the struct that contains the part.
 
-        If a bit block is probed, there is no such struct.
+        The struct checks or computes the size. When a bit block is probed, there is no such struct.
         """
         for _ in range(self.levels_up):
             context = context.get("_", {})
@@ -596,15 +595,14 @@ class BoundedPart(Subconstruct):  # type: ignore[misc]
 
 
 class PaddingField(CountedBytes):
-    """The bytes that pad consecutive members to a length, or a multiple of a length.
-
-    If no value is given, they are built from a pattern.
+    """The padding after consecutive members.
 
     Args:
-        of: the names of the first and the last padded member.
-        to: the length in bytes, or None.
-        modulus: a length in bytes; the members are padded to a multiple of it. None if `to` is
+        of: the names of the first and the last of the members.
+        to: the total size of members and padding, in bytes; None if `modulus` is given.
+        modulus: a number of bytes; the total size is a multiple of this number. None if `to` is
             given.
+        pattern: the byte that `build` repeats if no value is given.
     """
 
     def __init__(
@@ -659,7 +657,8 @@ class Partition(Construct):  # type: ignore[misc]
         count: the number of parts, or None.
         size: the size of the first part in bytes, or None.
         within: the total size of all parts in bytes, or None.
-        following: an expression of the fields of a part for the size of the next part, or None.
+        following: an expression that gives the size of the next part, by fields of the part; or
+            None.
         limit: the maximum size of a frame, in bytes.
     """
 

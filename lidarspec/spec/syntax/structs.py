@@ -231,11 +231,11 @@ def _name_padding(members: list[Construct]) -> list[Construct]:
 
 
 def _replace_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
-    """Return a padded part with its padding as a field.
+    """Return the construct that replaces padding or a padded struct.
 
     Returns:
-        A field for the bytes or bits of a padding, or a struct with the padding as its last member.
-        None if neither is possible.
+        For padding alone, a field of its bytes or bits. For a padded struct of fixed size, a struct
+        with the padding as its last member. Otherwise None.
     """
     if con.subcon is construct.Pass and in_bits:
         return construct.Default(BitsInteger(con.length), 0)
@@ -334,19 +334,19 @@ def find_xor_key(con: construct.ProcessXor) -> bytes | None:
 
 
 def _name_field(con: Construct, ending: str, field: Construct, what: str) -> Construct:
-    """Give a hidden field a name and documentation that refer to another field.
+    """Return a hidden field, named and documented by the name of a member.
 
     Args:
-        con: the other field.
-        ending: the text that is added to its name.
+        con: the member.
+        ending: the text after the member's name in the name of the field.
         field: the hidden field.
-        what: the documentation up to the name of the other field.
+        what: the text before the member's name in the documentation of the field.
     """
     return construct.Renamed(field, newname=con.name + ending, newdocs=f"{what} {con.name}")
 
 
 def _expand_content(con: Construct, content: Construct) -> list[Construct]:
-    """Return the members that replace a member if `content` is its content."""
+    """Return the members that replace a member with this content."""
     return _expand_macro(construct.Renamed(content, newname=con.name, newdocs=con.docs))
 
 
@@ -374,10 +374,9 @@ def _expand_prefixed(con: Construct, inner: construct.Prefixed) -> list[Construc
 
 
 def _expand_focused(con: Construct, inner: construct.FocusedSeq) -> list[Construct]:
-    """Return the members that replace a FocusedSeq.
+    """Return the members that replace a FocusedSeq: its value, and its other parts.
 
-    They are its value and a field for each other part. If this is not possible, the FocusedSeq is
-    returned unchanged.
+    If this is not possible, the FocusedSeq is returned unchanged.
     """
     focus = inner.parsebuildfrom
     parts = {part.name: _strip_name(part) for part in inner.subcons}
@@ -496,8 +495,8 @@ class _ComparisonRecorder:
 def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     """Return the raw values that a validator accepts; None if they are unknown.
 
-    To find them, the values with which the validator makes comparisons are tried. If it makes no
-    comparisons with integers, all values of up to 16 bits are tried.
+    If the validator compares the value with integers, these integers are tried. Otherwise all
+    values of a field of up to 16 bits are tried.
     """
     field = unwrap(con)
     subcon = con.subcon
@@ -750,9 +749,8 @@ def random_value(
 ) -> Any:
     """Return a random value that a construct can build.
 
-    Examples of frames with `Parts`, and of frames without a layout, are built from these values,
-    because random bytes are hardly ever a valid chain of parts or a text with its terminator.
-    Examples of all other frames are random bytes in a layout.
+    The values are used for examples of frames with `Parts` or without a layout, because random
+    bytes are hardly ever such a frame.
 
     Args:
         source: the source of random numbers. If it has the methods `draw_number` and
@@ -841,9 +839,10 @@ def _draw_until(
 
 
 def _count_elements(con: Construct, scope: Any) -> int:
-    """Return the number of values that an element of an array contains.
+    """Return the number of values in an element of an array.
 
-    It is 1 unless the element is itself an array of known length.
+    An element that is an array of known length contains several values. All other elements count as
+    1.
     """
     with contextlib.suppress(Exception):  # the count may depend on fields that are not drawn yet
         if isinstance(con, Array):
@@ -855,7 +854,7 @@ def _count_elements(con: Construct, scope: Any) -> int:
 def _draw_parts(
     con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> ParsedParts:
-    """Return random parts with their sizes, for expressions of the fields after them."""
+    """Return random parts, with the sizes that expressions of later fields read."""
     parts = ParsedParts()
     around = Container(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
