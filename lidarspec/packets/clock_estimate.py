@@ -8,11 +8,11 @@ In this module, the delay of a packet is its arrival time minus the sensor's tim
 time, all delays lie above a line, and many lie close to it. This line is the shortest delay that a
 packet can have. Its height is the offset between the clocks, and its slope is the drift.
 
-The estimate keeps the smallest delay of each quarter of a second, for the last half minute, and
-computes their lower convex hull. The line is as high as the samples above it allow. It keeps its
-previous slope if this slope lies between the slopes of the hull shortly before and after the middle
-of the samples, because the delays do not determine a better slope. Otherwise it gets the nearer of
-these two slopes. If the line changes, the delays of stamps approach it smoothly.
+The estimate keeps one sample for each quarter of a second of the last half minute: the smallest
+delay. The line lies below all samples, as high as possible. Its slope is limited by two slopes of
+the lower convex hull of the samples, shortly before and shortly after the middle. If the previous
+slope is between these limits, the line keeps it, because the samples do not determine a better
+slope. If the line changes, the delays of stamps approach it smoothly.
 
 A jump of the clock is detected in two cases: several consecutive samples are far below the line, or
 all samples of a second are far above the line, compared with the differences between their delays.
@@ -104,12 +104,12 @@ class DeviceClock:
     time that a packet needs in the sensor and on the line to the host.
 
     Args:
-        parts: the number of quarters of a second to which the line is fitted. With more parts the
-            drift is more precise; with fewer parts it follows changes sooner.
+        parts: the duration to which the line is fitted, in quarters of a second. A longer duration
+            makes the drift more precise. With a shorter duration, the drift follows changes sooner.
 
     Attributes:
         jumps: how often the sensor's clock was set.
-        jump: the last jump, until ten seconds after it; otherwise None.
+        jump: the last jump; None if there was no jump in the last ten seconds.
     """
 
     def __init__(self, parts: int = PARTS) -> None:
@@ -220,8 +220,7 @@ class DeviceClock:
     def _stamp_part(self, device: Times, host: Times) -> Times:
         """Return the times of regular packets by the host's clock, (n,) ns.
 
-        The packets are from one quarter of a second. Their delays are interpolated between the
-        delays of the previous packet and of the last packet.
+        The packets are from one quarter of a second, in which the delay changes evenly.
         """
         before = self._last_stamped
         assert before is not None
@@ -330,7 +329,7 @@ class DeviceClock:
         return jump
 
     def _update_line(self, sample: ClockSample) -> None:
-        """If a sample is the lowest of its quarter of a second, store it and fit the line."""
+        """Fit the line again if the sample is the lowest in its quarter of a second."""
         slope = self._line.slope
         if self._min_delays and sample.device // PART_NS <= self._min_delays[-1].device // PART_NS:
             last = self._min_delays[-1]

@@ -63,7 +63,7 @@ class OffsetSample:
     Attributes:
         host_ns: arrival time, ns since 1970.
         offset_s: the sensor's time minus the host's, s.
-        jitter_ms: the 95th percentile of the packets' delays, as in `ClockReport`, ms.
+        jitter_ms: the 95th percentile of the delays of packets, see `ClockReport`, ms.
     """
 
     host_ns: int
@@ -80,14 +80,15 @@ class ClockReport:
         state: the meaning of the clock's status; "" if the sensor has not sent the status.
         locked: whether the clock is locked; None if unknown.
         offset_s: the sensor's time minus the host's, s; nan if unknown. It is too low by the
-            shortest delay of a packet.
+            time that the fastest packet needs from the sensor to the host.
         error_s: the offset minus the difference between the time scales of sensor and host, s; nan
             if the clock has no date.
         drift_ppm: how much faster the sensor's clock runs than the host's, in millionths; nan if
             unknown.
-        jitter_ms: the 95th percentile of how much later packets arrive than the fastest ones, ms.
+        jitter_ms: the 95th percentile of the delays of packets, ms. The fastest packets have a
+            delay of about 0.
         packets: number of packets.
-        late: the number of packets that arrived more than 50 ms later than the fastest ones.
+        late: the number of packets with a delay of more than 50 ms.
         jumps: how often the clock was set or restarted.
         findings: the findings, the most serious first; at least one.
         events: the events in order of time.

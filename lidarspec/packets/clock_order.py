@@ -1,17 +1,18 @@
 """Find lost, late and duplicate datagrams by their clock, if they have no counter.
 
 `ClockOrder` compares each datagram with the newest packets, which it stores in the order of their
-times. The datagram directly follows the newest packet, or follows it after a gap, or is late, or is
-a duplicate, or shows that the clock was set. It is a duplicate if a stored packet has the same time
-and the same bytes; bytes are compared by their CRC-32. A late packet is inserted between its
-neighbours, and the number of packets missing between them is corrected. In the end, the counters
-are the same as if the packets had arrived in order.
+times. A datagram directly follows the newest packet, comes after a gap, is late, is a duplicate, or
+shows that the clock was set. It is a duplicate if a stored packet has the same time and the same
+bytes; bytes are compared by their CRC-32. A late packet is inserted between its neighbours, and the
+number of packets missing between them is corrected. In the end, the counters are the same as if the
+packets had arrived in order.
 
 Each packet gets an index, a sequence number that leaves out a number for each missing packet, and
 an order, which is its sort key. The order is the time of the packet since the first packet, in
 nanoseconds. Packets of equal time that are not duplicates get different orders. If the clock was
-set or the sensor restarted, the order increases by `2 * MAX_STEP_NS`. To get the final index and
-breaks, sort the packets by their order and pass them to another `ClockOrder`.
+set or the sensor restarted, the order increases by `2 * MAX_STEP_NS`. `Reorder` sorts the packets
+by their order, and uses a second `ClockOrder` to find the index and the breaks of the sorted
+packets.
 
 If the pace of the clock is not declared, lost packets are not found, and the index has no gaps. A
 gap at a masked sector (`masked_sector`) is not a loss.
@@ -312,7 +313,7 @@ def _count_missing(passed: int, pace: float) -> int:
 
     Args:
         passed: the time between the packets, ns.
-        pace: the time that each packet takes, ns; nan or 0 if unknown.
+        pace: the time from one packet to the next, ns; nan or 0 if unknown.
     """
     if not pace > 0:
         return 0

@@ -189,7 +189,7 @@ class ClockEpoch:
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
     def _fold_step(self, step: int) -> int:
-        """Return a step modulo the wrap period, at most half a period up or down, ns."""
+        """Return a step modulo the wrap period, from minus to plus half a period, ns."""
         return (step + self._period_ns // 2) % self._period_ns - self._period_ns // 2
 
 
@@ -252,7 +252,7 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
         times: the times of these packets, (k,).
-        before: the times for the packets before the first packet that has a time, (n,).
+        before: a time for each packet, used up to the first packet that has a time, (n,).
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
@@ -349,7 +349,7 @@ def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table)
 
 @lru_cache(maxsize=256)
 def to_exact_ns(seconds: float) -> int:
-    """Return seconds in ns; a float counts as the decimal number that Python prints."""
+    """Return seconds in whole ns; 0.1 gives exactly 100,000,000."""
     return int(to_exact(seconds) * 10**9)
 
 

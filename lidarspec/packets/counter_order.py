@@ -59,7 +59,7 @@ class CounterReadings:
         has_counter: whether each packet has the counter, (n,); None if all packets have it.
         times: the times by the sensor's clock, (n,) ns; None without a clock with a declared pace.
         steps: the time since the previous packet, (n,) ns; None if `times` is None.
-        paces: the time that each packet takes, (n,) ns; nan if unknown.
+        paces: the time from each packet to the next, (n,) ns; nan if unknown.
     """
 
     numbers: NDArray[Any]
@@ -326,10 +326,10 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Correct the counter of a packet if it contradicts the clock.
+        """Correct a counter that contradicts the clock.
 
-        The counter is kept if it continues the last counter that contradicted the clock, because
-        the sensor has then reset its counter.
+        If it continues the previous counter that contradicted the clock, the sensor has reset its
+        counter, and the counter is kept.
 
         Returns:
             How many places the packet is ahead of the newest packet, by the clock; and the

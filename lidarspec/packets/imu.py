@@ -154,7 +154,7 @@ class WaitingSamples:
     def keep_newest(self, most: int) -> None:
         """Keep only the samples that were added last, so that memory is limited if no scan ends.
 
-        Nothing is dropped until twice as many samples are stored.
+        Samples are dropped when more than twice `most` are stored.
 
         Args:
             most: the number of samples to keep.

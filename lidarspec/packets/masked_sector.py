@@ -195,8 +195,8 @@ class SectorFinder:
                 about one step, because packets do not begin exactly at the edges of the sector.
 
         Returns:
-            The earlier gaps at the same sector, as numbers counted back from the last gap (1 is the
-            last gap). The list is empty if no sector is found.
+            The earlier gaps at the same sector: 1 for the newest of the earlier gaps, 2 for the
+            next older gap, and so on. The list is empty if no sector is found.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
@@ -216,11 +216,11 @@ class SectorFinder:
         return []
 
     def has_unseen_gaps(self, step: float) -> bool:
-        """Return whether any stored gap may be at a masked sector."""
+        """Return whether a masked sector may explain one of the stored gaps."""
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet has begun between the edges of a sector.
+        """Return whether all packets so far began outside of a sector.
 
         Returns False if the sector is too narrow to tell.
         """
@@ -317,7 +317,9 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def revoke_losses(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """If a loss recurs at the same angles, count all these losses as masked.
+        """Count a loss and the earlier losses at the same angles as masked.
+
+        Nothing is changed if there is no earlier loss at these angles.
 
         Args:
             row: the row of the packet after the loss.

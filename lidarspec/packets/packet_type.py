@@ -101,9 +101,9 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
     """Return the clock of a frame type; None if it has no clock.
 
-    A frame type uses the clock that it declares. If it declares none, it uses the clock of the
-    sensor, but only if it has the fields of this clock. Frames that have neither points nor IMU
-    data use the clock of the sensor only if the sensor has no points.
+    A frame type uses the clock that it declares, or else the clock of the sensor, if the frame has
+    the fields of this clock. In a sensor with points, a frame type without points and IMU data uses
+    only the clock that it declares.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
@@ -124,8 +124,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of a frame type have a field.
 
-    If no frame type with packets has the field, returns True, so that reading the field raises an
-    error.
+    Returns True if the field is missing in all frame types, so that reading it raises the error.
     """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [

@@ -198,12 +198,12 @@ class Packets:
         - If consecutive packets contain the returns (`PacketCounter.returns`): (groups of packets,
           *shape of the points of a packet, returns), ordered by `return_index`, or by the counter
           if the return indices of a group's packets are equal.
-        - If each packet contains them in the same places: (packets, *shape of the firings of a
-          packet, returns).
+        - If a packet contains all returns of its firings, at the same places in each packet:
+          (packets, *shape of the firings of a packet, returns).
         - Otherwise: (firings, returns).
 
         Raises:
-            SpecError: as `points`.
+            SpecError: as for `points`.
         """
         from lidarspec.packets.returns import arrange_returns
 
@@ -416,10 +416,10 @@ def _nested_dtype(
 
 
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms that a name has in the branches of a struct.
+    """Return the forms that the path `here` has in the branches of a struct.
 
-    A form is a pair: whether the name is a value, not a struct; and the number of array axes that
-    belong to this name.
+    A form is a pair: whether the path is a value (else it is a struct), and the number of array
+    axes at this path.
     """
     parts = [
         (path, info)

@@ -81,7 +81,7 @@ class GroupCounter:
         self._counted = set[int]()  # those of them that are counted
 
     def push(self, batch: Batch, index: NDArray[np.int64]) -> None:
-        """Count the groups that the next packets show to be incomplete.
+        """Add packets, and count the groups that turn out to be incomplete.
 
         Args:
             index: the index of each packet, (n,).
@@ -131,7 +131,7 @@ class GroupCounter:
 def _find_incomplete(
     groups: NDArray[np.int64], places: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> NDArray[np.intp]:
-    """Return the rows of packets from groups that are not complete in a batch, (k,)."""
+    """Return the rows of packets whose groups are incomplete in a batch, (k,)."""
     _, first_rows = np.unique(groups * int(sizes.max()) + places, return_index=True)
     _, numbers, counts = np.unique(groups[first_rows], return_inverse=True, return_counts=True)
     is_incomplete = counts[numbers.reshape(-1)] < sizes[first_rows]
@@ -172,7 +172,7 @@ def _place_by_return_index(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return `members`, with the return index of each packet as its position.
 
-    A group keeps its positions if the return index does not distinguish its packets.
+    If the packets of a group do not have different return indices, their positions are unchanged.
 
     Args:
         members: for each packet, its group, its position in the group, and the size of the group,
@@ -215,7 +215,7 @@ def _join_packets(
 
 
 def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
-    """Return indices of points, with the returns of a firing along the last axis.
+    """Return the indices of points, arranged by firings: (n, *firings, returns).
 
     Returns None if the return indices differ between packets, if the returns have different numbers
     of points, or if the return index varies along several axes.

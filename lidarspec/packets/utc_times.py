@@ -84,12 +84,12 @@ class UtcSource:
 
 @dataclass(frozen=True)
 class UtcChange:
-    """A source of UTC, and the time from which on it is used.
+    """A source of UTC, and the time at which it begins to apply.
 
     Attributes:
-        utc_ns: the UTC from which on the source is used, ns since 1970.
+        utc_ns: the UTC at which the source begins to apply, ns since 1970.
         source: the source.
-        is_first: whether no other source was used before.
+        is_first: whether this is the first source of UTC.
     """
 
     utc_ns: int
