@@ -1,11 +1,11 @@
 """Count the packets of the current scan, and the packets that are missing in it.
 
-The index of packets shows how many packets are missing before each of them (see `Packets.index`). A
-break shows that an unknown number is missing. A frame counts as one packet, even if several of its
-parts have points.
+Gaps in `Packets.index` show how many packets are missing. `Packets.breaks` shows where an unknown
+number of packets is missing. A frame counts as one packet, even if several of its parts have
+points.
 
-A packet in which one scan ends and the next one begins counts in both scans. Packets missing before
-it count in the first scan only.
+A packet in which one scan ends and the next one begins counts in both scans. Packets that are
+missing before this packet count in the first of the two scans.
 """
 
 from __future__ import annotations

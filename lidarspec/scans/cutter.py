@@ -157,7 +157,7 @@ class ScanCutter:
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
     ) -> NDArray[np.intp]:
-        """Add packets, and cut before each packet with which the scan exceeds its limits.
+        """Add packets to the scan, and cut before each packet that exceeds the limits.
 
         Returns:
             The rows of the packets before which the scan is cut.

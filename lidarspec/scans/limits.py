@@ -2,9 +2,9 @@
 
 The duration of a scan, by the times of the packets, is limited to twice the duration of the slowest
 revolution. If the number of points of a scan is constant, its size is limited to twice this number.
-Otherwise its size is limited to the bytes that the serial line carries in the maximum duration, or
-to `MAX_BYTES` without a serial line. If packets of a scan are missing, its end may be missing as
-well. Such a scan may become only slightly longer than the previous scan.
+Otherwise its size is limited to `MAX_BYTES`, or on a serial line to the number of bytes that the
+line transmits in the maximum duration. If packets of a scan are missing, its end may be missing as
+well. Such a scan is limited to `MAX_GROWTH` times the number of packets of a whole scan.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ScanLimits:
         """Return whether a scan is within the limits.
 
         Args:
-            scan: the scan, including `packets`.
+            scan: the counts of the scan, in which `packets` are already included.
             packets: the last packets of the scan.
             usual: the number of packets of a whole scan.
         """
@@ -79,13 +79,13 @@ class ScanLimits:
         """Find the first packet with which a scan exceeds the limits.
 
         Args:
-            scan: the scan, without `packets`.
+            scan: the counts of the scan before the next packets.
             packets: the next packets.
             usual: the number of packets of a whole scan.
 
         Returns:
-            The row of this packet, or None; and whether the scan exceeds a limit that holds for all
-            scans. Otherwise it exceeds only the limit for scans with missing packets.
+            The row of this packet, or None; and which limit it exceeds: True for a limit of all
+            scans, False for the limit of scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

@@ -38,7 +38,7 @@ class Masking:
     The packets have to be in order.
 
     Args:
-        sensor: the sensor that sends the packets; its `AngleReader` has to be available.
+        sensor: the sensor that sends the packets; its `AngleReader.is_available` has to be true.
 
     Attributes:
         angle_before_sector: the angle of the last packet before the first marked packet, in turns;

@@ -28,8 +28,9 @@ FIRST_CHUNK_ROWS = 64
 class Rotation:
     """Finds the direction in which an angle rotates.
 
-    In the first half turn, the direction is that from the first angle to the current one. After
-    that, the direction reverses when the angle has moved back by half a turn.
+    Until the angle has moved by half a turn, the direction at a row is the direction from the first
+    angle to the angle of this row. Later, the direction reverses when the angle has moved back by
+    half a turn.
     """
 
     def __init__(self) -> None:
@@ -159,11 +160,11 @@ class WrapDetector:
     ) -> NDArray[np.intp]:
         """Return the rows of the passes that jitter cannot have caused.
 
-        Between two such passes, the angle moves away from the angle that is passed.
+        Before such a pass, the angle has been well away from the angle to pass (`_was_away`).
 
         Args:
             passed: the rows of all passes.
-            behind: the angle at each row, measured from the angle that is passed, (k,).
+            behind: the angle at each row minus the angle to pass, from 0 to `full`, (k,).
             full: a whole turn in the unit of the angles.
         """
         armed = list[int]()

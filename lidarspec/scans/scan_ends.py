@@ -1,8 +1,8 @@
 """Find the ends of scans by the sensor's declared rule.
 
-Each end is between two points. A rule reads a column of the points, a field of the packets, a field
-in an array of the packets, or the time. `EndFinder` converts the rows of fields to the indices of
-points. The module `cutter` decides whether the scan ends there.
+A rule reads a column of the points, a field of the packets, a field in an array of the packets, or
+the time. `EndFinder` returns each end as the index of the first point after the end. The module
+`cutter` ends the scans at these points.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class EndFinder:
         """Return the rows at which a scan begins.
 
         Args:
-            rule: the rule that decides this by the values.
+            rule: the sensor's rule for the ends of scans.
             values: the values of the rows.
             full: a whole turn in the unit of the values; None if they are not angles.
         """
@@ -296,10 +296,10 @@ def first_points(points: EvaluatedPoints) -> Indices:
 
 
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
-    """Return the sums over all axes but the first `axis_count`.
+    """Return counts, summed over all axes after the first `axis_count` axes.
 
-    An axis with zero stride has equal values. The first value is multiplied by the length of the
-    axis, which is faster than a sum.
+    All values along an axis with zero stride are equal, so they are multiplied instead of summed,
+    which is faster.
     """
     times = 1
     while counts.ndim > axis_count:

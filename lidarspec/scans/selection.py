@@ -188,7 +188,7 @@ class TimeSlice:
 
         Args:
             source: the name of the source.
-            number: states how much data the source has, for example "12 scans,".
+            number: the amount of data in the source for the message, for example "12 scans,".
         """
         first = self.first or 0
         last = self.last or 0

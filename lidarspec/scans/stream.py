@@ -136,7 +136,7 @@ class ScanStream:
         return scans
 
     def _use_sector(self, packets: Packets) -> None:
-        """Cut scans in the masked sector that was found."""
+        """Cut scans in the masked sector from now on, and store a warning about it."""
         assert self._masking is not None
         sector = self._masking.sector
         assert sector is not None
@@ -147,7 +147,7 @@ class ScanStream:
     def _take_parts_with_points(self, packets: Packets) -> Packets:
         """Return `packets`, or their parts if the parts have the points.
 
-        Frames without parts are left out of the index, so that they do not count as missing.
+        The index of the parts has no gap for a frame without parts, because no packet is missing.
         """
         parts = packets.with_points
         if parts is not packets:
