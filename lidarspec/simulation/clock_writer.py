@@ -1,18 +1,19 @@
 """Write the time and the status of a clock into simulated frames.
 
 A clock is a field, a sum of fields, or a function of fields. To find the fields that a function
-depends on, each field is increased by one, and again by one. If the time increases by the same step
-both times, the field is linear, for example the microseconds or the hour. If both steps are 28 to
-31 days, the field is the month. If both are 365 or 366 days, it is the year.
+depends on, each field is increased by one twice. If the time increases by the same step both times,
+the field is linear, for example the microseconds or the hour. If both steps are 28 to 31 days, the
+field is the month. If both steps are 365 or 366 days, the field is the year.
 
 To write a time, the date is written into the fields of the date. The time of day is distributed
 over the linear fields, from the coarsest to the finest.
 
-If the clock is a single field, a time difference is added to this field, in all elements of its
-array and in all parts of its frame, and to all fields of the same unit, scale and size. These
-fields have times of the same clock, such as the start and the end of a measurement.
+If the clock is a single field, the difference between the new and the old time is added to this
+field, in every element of its array and in every part of its frame. The same difference is added to
+all other fields of the same unit, scale and size. These fields have times of the same clock, such
+as the start and the end of a measurement.
 
-If the time that was written cannot be read back from a frame, the clock cannot be written.
+A clock is not supported if a frame does not give the time that was written into it.
 """
 
 from __future__ import annotations
@@ -269,7 +270,7 @@ class ClockWriter:
         self._fields = sorted(fields, key=lambda field: -field.step_ns)
 
     def _probe(self, table: CompiledTable, path: str, info: FieldInfo) -> tuple[int, int]:
-        """Return by how much the reading grows if a field grows by 1, and again by 1, ns."""
+        """Return the two steps of the reading when a field is increased by 1 twice, ns."""
         before = table.raw(path)
         start = 0  # a float cannot represent a date and a step of one raw value
         if info.kind == "int":
@@ -439,7 +440,7 @@ def _find_written_clock(sensor: Sensor, frame: str) -> Clock | None:
 
 
 def find_status_clocks(sensor: Sensor) -> dict[str, Clock]:
-    """Return {frame type: clock} of the frame types with the status of a clock."""
+    """Return {frame type: clock} for the frame types that contain a clock status."""
     clocks = dict[str, Clock]()
     for name in sensor.main_frames:
         clock = find_clock(sensor, name)
@@ -503,8 +504,8 @@ class StatusWriter:
         Args:
             table: the frames.
             states: LOCKED, LOST or RESTARTED for each frame, (n,).
-            follows: the time scale that the clock follows, by which one of several locked states is
-                chosen.
+            follows: the time scale that the clock follows. A locked clock gets a status with this
+                epoch, if there is one.
         """
         raw = np.array(self.choose(follows))[states]
         for path, column in zip(self._paths, raw.T, strict=True):
@@ -513,10 +514,11 @@ class StatusWriter:
             write_raw(table, path, np.broadcast_to(shaped, (len(states), *axes)))
 
     def choose(self, follows: str) -> tuple[tuple[int, ...], ...]:
-        """Return the raw values of the fields for a locked, a lost and a restarted clock.
+        """Return the raw values of the status fields: locked, lost and restarted.
 
-        If possible, the status of a lost clock has the same epoch as the status of the locked
-        clock, and the status of a restarted clock has the epoch power-on.
+        If possible, the status of a locked clock has the epoch `follows`, the status of a lost
+        clock has the epoch of the locked clock, and the status of a restarted clock has the epoch
+        "boot".
         """
 
         def rank(choice: _StatusChoice, epoch: str, raw: tuple[int, ...]) -> tuple[Any, ...]:
@@ -592,7 +594,7 @@ class StatusWriter:
 def _shift_raw(
     info: FieldInfo, raw: NDArray[Any], shifts: Times, step_ns: float, period_ns: int
 ) -> NDArray[Any]:
-    """Add time differences to raw values of a clock, and return them, wrapped."""
+    """Return raw values of a clock, shifted by time differences and wrapped."""
     if info.kind == "int" and isinstance(step_ns, int):
         # exact, also for a shift of years
         whole: NDArray[Any] = raw.astype(np.int64) + shifts // step_ns
@@ -604,7 +606,7 @@ def _shift_raw(
 
 
 def _get_encoding(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties that all fields with times of one clock have in common."""
+    """Return the properties of a field that are equal in all times of one clock."""
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 

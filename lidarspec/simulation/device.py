@@ -275,7 +275,7 @@ def _make_command_decoder(sensor: Sensor, link: str) -> Decoder:
 
 @functools.lru_cache(maxsize=256)
 def _make_incoming(frame: Frame) -> Frame:
-    """Return an outgoing frame type as an incoming type, as the sensor receives it.
+    """Return an outgoing frame type as an incoming type, to parse commands.
 
     The result is cached, so that its layout is computed only once.
     """
@@ -303,11 +303,11 @@ def _iter_flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[st
 
 
 class _PlannedData(NamedTuple):
-    """Data to send at a time; sorted by time, then by the order of planning.
+    """Data to send at a planned time. The plan is sorted by `at`, then by `number`.
 
     Attributes:
         at: the time, ns since power-on.
-        number: number of the data, in the order of planning.
+        number: a running number in the order of planning.
         link: name of the link to send the data over.
         frame: the frame type; "" for bytes that are not a frame.
         data: the bytes.
@@ -652,9 +652,9 @@ class SimulatedDevice:
         self._plan_data(due.at + period_ns, due.link, due.frame, data, repetition)
 
     def _reply(self, request: ReceivedCommand, now: float) -> None:
-        """Plan the reply to a command, unless the command is ignored while data is sent.
+        """Plan the reply to a command, and the data if the command starts it.
 
-        If the command starts the data, plans the data after the reply.
+        While data is sent, a command with `only_stopped` is ignored.
         """
         self.commands_received.append(request.name)
         command = request.command

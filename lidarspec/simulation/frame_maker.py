@@ -112,8 +112,8 @@ class FrameMaker:
     def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return a table with one frame for each mapping of field paths to values.
 
-        Values are physical. The value of an enum may be given by its name, an array of bytes as
-        bytes, and a part as a mapping like that of a frame.
+        Values are physical. The value of an enum may be its name, an array of bytes may be bytes,
+        and a part is a mapping of field paths to values.
 
         Raises:
             SpecError: if a value is given for a field that the frame does not have.
@@ -191,7 +191,7 @@ class FrameMaker:
         return result
 
     def _with_counts(self, values: Values) -> Values:
-        """Return the values of a frame, with the counts of its arrays if they are missing."""
+        """Return the values of a frame, completed by the counts of its arrays."""
         missing = [
             axis
             for axis, count_path in self._counts.items()

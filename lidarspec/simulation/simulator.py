@@ -93,8 +93,8 @@ class RangeField:
 
     Attributes:
         path: path of the field.
-        inner: the points may have more axes than the field. The field determines the points at this
-            index in the additional axes.
+        inner: an index into the axes that the points have in addition to the axes of the field. The
+            field determines the points with this index.
         step: metres per raw step; None if it differs between packets, for example because of a
             value in the header or a calibration.
         zero: range of the raw value 0, metres.
@@ -333,8 +333,8 @@ class Measurement:
     def _find_linear_fields(self, table: CompiledTable) -> list[RangeField]:
         """Return the fields that `points` converts to ranges by a linear function.
 
-        Only fields in metres, and array elements without a unit, are tried. To elements without a
-        unit, the ranges must be proportional.
+        Candidates are fields in metres, and integers without a unit in arrays. If a field has no
+        unit, the ranges must be proportional to its raw values.
         """
         targets = []
         for path, info in table.schema.fields.items():
@@ -392,7 +392,7 @@ class Measurement:
 
         Args:
             table: the frames.
-            answer: the ranges of their points, (n, ...).
+            answer: the ranges of the points, (n, ...).
         """
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
@@ -571,7 +571,10 @@ def _get_table_name(frame: str, table: CompiledTable) -> str:
 
 
 def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
-    """Call `points` for a table, as if its frames were the first ones of a stream."""
+    """Return the result of `points` for a table, and the batch of the table.
+
+    The frames of the table are treated as the first frames of a stream.
+    """
     batch = _make_point_batch(sensor, table)
     points = sensor.points_of(_get_table_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
@@ -587,7 +590,7 @@ def _evaluate_points(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[
 
 
 def _make_point_batch(sensor: Sensor, table: CompiledTable) -> Batch:
-    """Return frames or parts as a batch, as if no frame of another type had arrived."""
+    """Return a table as a batch whose state has no frames of other types."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -673,7 +676,7 @@ class RestingImu:
             table.put_back()
 
     def _find_linear_fields(self, table: CompiledTable) -> list[str]:
-        """Return the fields that the measurements depend on linearly."""
+        """Return the fields on which the IMU measurements depend linearly."""
         zero = self._read_motion(table)
         paths = list[str]()
         for path, info in table.schema.fields.items():
@@ -697,14 +700,17 @@ class RestingImu:
         return paths
 
     def _probe(self, table: CompiledTable, path: str) -> Floats:
-        """Return the measurements if a field is `PROBE_VALUE` and all others are 0."""
+        """Return the IMU measurements in a table whose field is set to `PROBE_VALUE`.
+
+        The field is 0 afterwards.
+        """
         write_raw(table, path, np.array(PROBE_VALUE))
         readings = self._read_motion(table)
         write_raw(table, path, np.array(0))
         return readings
 
     def _read_motion(self, table: CompiledTable) -> Floats:
-        """Return three angular velocities and three accelerations, (6, n, ...)."""
+        """Return the angular velocities and accelerations in a table, (6, n, ...)."""
         batch = _make_point_batch(self._sensor, table)
         function = self._sensor.imu_of(_get_table_name(self._frame, table))
         with (
@@ -819,8 +825,8 @@ class FrameSimulation:
     Args:
         sensor: the sensor.
         frame: the frame type.
-        blocked: whether the rotor does not turn. If so, all frames have the angles of the second
-            frame, and its value of the field that separates scans.
+        blocked: whether the rotor is blocked. If so, the angles and the field that ends scans are
+            the same in all frames.
 
     Attributes:
         interval: mean time between packets, ns; 0 if the spec does not determine times.
@@ -936,7 +942,7 @@ class FrameSimulation:
             return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
     def _select_angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return those values of a frame that change only because the rotor turns."""
+        """Return the values of a frame that are constant while the rotor is blocked."""
         fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
         assert rule is not None  # as of every sensor with points
@@ -1053,7 +1059,7 @@ def find_periodic_rates(sensor: Sensor) -> dict[str, float]:
 
 
 def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
-    """Yield (time in seconds, type, number) of the frames of a type, without end."""
+    """Yield (time in seconds, type, number) for each frame of a type, without end."""
     return ((number / rate, name, number) for number in itertools.count())
 
 
