@@ -33,7 +33,7 @@ from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.syntax import check_struct, fixed_size, frame_tree, prepare
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import Node, Sealed, children
-from lidarspec.spec.wire_forms import WireForm
+from lidarspec.spec.wire_forms import WireForm, check_wire_form
 
 #: An item that a sensor sends after a command; see `Simulation.answers`.
 Answer = str | tuple[str, Mapping[str, Any]] | bytes | float
@@ -196,6 +196,8 @@ class Frame:
             raise SpecError(
                 "a data frame uses the sensor's clock: pass clock= to the Sensor", path="clock"
             )
+        if self.wire is not None:
+            check_wire_form(self.wire)
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)
         object.__setattr__(

@@ -217,21 +217,25 @@ class Decoded:
 class WireForm(Protocol):
     """The encoding of the frames of one type.
 
+    A subclass defines `find_end`, `decode` and `encode`.
+
     Attributes:
         is_text: whether fields of bytes contain printable characters. If so, they contain letters
-            in examples.
+            in examples. The default is False.
     """
 
-    is_text: ClassVar[bool]
+    is_text: ClassVar[bool] = False
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
         """Return the first bytes of every encoded frame; None for a byte that varies.
 
-        The result ends before the first byte without a fixed offset.
+        The result ends before the first byte without a fixed offset. By default, it is empty: a
+        frame may begin at any byte, and `find_end` is called for each of them.
 
         Args:
             texts: the bytes of the first fields of the struct; None for each byte that varies.
         """
+        return ()
 
     def find_end(self, data: bytes) -> int:
         """Return the size of the encoded frame at the start of some bytes.
@@ -251,7 +255,34 @@ class WireForm(Protocol):
         """
 
     def largest(self, size: int) -> int:
-        """Return the largest number that can be encoded for a field of `size` bytes."""
+        """Return the largest number that can be encoded for a field of `size` bytes.
+
+        By default, all numbers can be encoded.
+        """
+        return int(256**size - 1)
+
+
+#: The members of a wire form, and those that a subclass of `WireForm` must define itself.
+_MEMBERS = ("is_text", "begins", "find_end", "decode", "encode", "largest")
+_OWN_METHODS = ("find_end", "decode", "encode")
+
+
+def check_wire_form(form: object) -> None:
+    """Raise an error if an object lacks members of `WireForm`.
+
+    Raises:
+        SpecError: if it lacks one or more members.
+    """
+    kind = type(form)
+    missing = [name for name in _MEMBERS if not hasattr(form, name)]
+    missing += [
+        name for name in _OWN_METHODS if getattr(kind, name, None) is getattr(WireForm, name)
+    ]
+    if missing:
+        advice = "" if WireForm in kind.__mro__ else "; derive it from WireForm for defaults"
+        raise SpecError(
+            f"{kind.__name__} does not define {', '.join(missing)}{advice}", path="wire"
+        )
 
 
 @runtime_checkable

@@ -6,22 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from construct import Array, Int8ub, Int16ub, Struct, this
 
-from lidarspec.spec import Decoded, Frame, NumberRun, Problem, TextRun
+from lidarspec import Sensor, SpecError
+from lidarspec.spec import Decoded, Frame, NumberRun, Problem, Serial, TextRun, WireForm
+from lidarspec.testing.check import CheckTarget, iter_reports
 from tests.shapes import SHAPES
 
 
 @dataclass(frozen=True)
-class HexLines:
-    """A colon, two digits for each byte, and a line end; linked from docs/how-to/wire-forms.md."""
-
-    is_text = False
-
-    def begins(self, texts: Sequence[Sequence[int | None]]) -> bytes:
-        return b":"
+class HexLines(WireForm):
+    """A colon, two digits for each byte, and a line end."""
 
     def find_end(self, data: bytes) -> int:
+        if data[:1] not in (b"", b":"):
+            return -1
         return data.find(b"\n") + 1
 
     def decode(self, data: bytes, next_runs: object) -> Decoded:
@@ -34,9 +34,6 @@ class HexLines:
 
     def encode(self, struct: bytes, runs: Sequence[TextRun | NumberRun]) -> bytes:
         return b":" + struct.hex().encode() + b"\n"
-
-    def largest(self, size: int) -> int:
-        return int(256**size - 1)
 
 
 def test_frames_are_found_whatever_the_split() -> None:
@@ -56,3 +53,35 @@ def test_frames_are_found_whatever_the_split() -> None:
         found += decoder.finish()
         assert [(item.offset, item.data) for item in found] == [(7, data), (23, data)]
         assert not decoder.stats.plugin_errors
+
+
+def test_it_is_checked_like_a_shipped_one() -> None:
+    struct = Struct("id" / Int8ub, "value" / Int16ub)
+    frame = Frame(struct, max_length=20, wire=HexLines())
+    sensor = Sensor(
+        "acme-hex",
+        vendor="Acme",
+        model="Hex",
+        frames={"state": frame},
+        links={"data": Serial(9600)},
+        status="manual",
+        source="invented",
+    )
+    assert sensor.parse(b":010002\n").value == 2
+    (report,) = iter_reports(CheckTarget([sensor]), sensor.id, examples=4)
+    assert not report.findings
+
+
+def test_a_missing_method_is_named_at_declaration() -> None:
+    class Unencodable(WireForm):
+        find_end = HexLines.find_end
+        decode = HexLines.decode
+
+    class Underived:
+        find_end = HexLines.find_end
+        decode = HexLines.decode
+        encode = HexLines.encode
+
+    for form, names in ((Unencodable, "encode"), (Underived, "is_text, begins, largest")):
+        with pytest.raises(SpecError, match=f"wire: {form.__name__} does not define {names}"):
+            Frame(Struct("id" / Int8ub), max_length=20, wire=form())  # type: ignore[abstract]
