@@ -152,7 +152,7 @@ def list_frames(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame,
 
 
 def describe_left_out(sensor: Sensor) -> str:
-    """Return a sentence with the frame types that `BYTE_EXPORTS` leave out, or ""."""
+    """Return a sentence that names the frame types omitted by `BYTE_EXPORTS`, or ""."""
     with_form = _find_wire_forms(sensor)
     if not with_form:
         return ""
@@ -173,9 +173,9 @@ def _join_forms(forms: Mapping[str, str]) -> str:
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:
-    """Return the fields that a node and its descendants depend on.
+    """Return the fields that the formulas in a node and its descendants use.
 
-    Sizes, counts and conditions depend on fields, and so do the values that other fields must have.
+    The formulas give sizes, counts, conditions, and values that a field must have.
     """
     formulas = [
         value

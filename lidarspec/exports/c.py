@@ -373,8 +373,8 @@ def _format_stored_checksum(held: list[CEntry], order: str) -> str:
     """Return the C expression of a checksum that is stored in one or more fields.
 
     Args:
-        held: the fields, in the order of their bits, lowest first.
-        order: the byte order of fields of bytes.
+        held: the fields that store the checksum, the field with the lowest bits first.
+        order: the byte order of a checksum in a field of bytes.
     """
     terms = []
     shift = 0

@@ -189,7 +189,7 @@ class CEntry:
 
     @property
     def condition(self) -> str:
-        """The C condition under which a function returns this field; "" if it always does.
+        """The C condition under which a C function returns this field; "" for always.
 
         If an array inside a bit block contains the field, the condition compares the arguments of
         the function with `indices`.
@@ -204,7 +204,8 @@ class CEntry:
 def format_size_arguments(node: tree.Node, depth: int) -> str:
     """Return the arguments for calling a size function inside `depth` arrays.
 
-    If all elements have the same size, every index is 0.
+    The arguments are the frame and an index for each array. The indices are 0 if all elements have
+    the same size.
     """
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
@@ -269,9 +270,10 @@ class CLayout:
         return f"(size_t)({self.format_formula(value)})"
 
     def count(self, node: tree.Repeat, depth: int) -> int | str:
-        """Return the number of elements of an array inside `depth` other arrays.
+        """Return the length of an array; a C expression if the length varies.
 
-        Returns a C expression if the number is not fixed.
+        Args:
+            depth: the number of arrays around the array.
         """
         if isinstance(node.count, int):
             return node.count
@@ -371,7 +373,10 @@ class CLayout:
                 start = start + self.compute_size(below)
 
     def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
-        """Yield an entry for each member of a struct; all have the start of the struct."""
+        """Yield an entry for each member of a struct.
+
+        Each entry has the start of the struct. The caller replaces it.
+        """
         node = entry.node
         if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
@@ -468,7 +473,8 @@ def find_accesses(layout: CLayout, path: str) -> list[CEntry]:
 def iter_functions(layout: CLayout) -> Iterator[str]:
     """Yield the C functions of all fields, in wire order.
 
-    If several alternatives contain a field, its functions come with those of the last alternative.
+    The functions of a field in several alternatives are yielded once, in the place of the last
+    alternative.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_iter_writers(entry))
@@ -502,7 +508,7 @@ def _iter_writers(entry: CEntry) -> Iterator[tuple[Writer, str]]:
 
 
 def _iter_size_functions(layout: CLayout) -> Iterator[str]:
-    """Yield the size function of each part whose alternatives differ in size."""
+    """Yield a C function for the size of each part whose alternatives differ in size."""
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.list_sizes(entry)
@@ -517,7 +523,7 @@ def _iter_size_functions(layout: CLayout) -> Iterator[str]:
 
 
 def _find_inner_axes(part: tree.Part) -> tuple[str, ...]:
-    """Return the paths of the arrays inside a bit block that contain a part."""
+    """Return the paths of the arrays around a part, inside its bit block."""
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 
 
@@ -595,7 +601,7 @@ def _write_field(layout: CLayout, path: str) -> Iterator[str]:
 
 
 def _write_names(labels: Mapping[int, str], name: str) -> str:
-    """Return the C function that returns the name of a number; NULL without a name."""
+    """Return the C function that returns the name of a number, or NULL."""
     cases = [f"    case {code}: return {quote_text(label)};" for code, label in labels.items()]
     head = f"static inline const char *{name}(long long code)"
     return "\n".join([head, "{", "    switch (code) {", *cases, "    }", "    return NULL;", "}"])

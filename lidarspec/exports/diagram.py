@@ -93,7 +93,8 @@ class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
-        seals: for each field that stores a checksum, by path, the node with the algorithm.
+        seals: the node with the checksum algorithm, by the path of the field that stores the
+            checksum.
         has_both_orders: whether the frame has numbers in both byte orders. Each number then shows
             its byte order.
     """
@@ -212,7 +213,7 @@ class _ItemBuilder:
     ) -> DiagramBox:
         """Return the box of the bits `low` to `high` of a value.
 
-        The box shows the bit numbers if it does not contain the whole value.
+        The box shows the bit numbers if the value has bits in further boxes.
         """
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)

@@ -99,7 +99,7 @@ Scope = tuple[str | None, ...]
 
 
 def format_reference(scope: Scope, ref: tree.Ref) -> str:
-    """Return the integer expression of a field, for use in the innermost type.
+    """Return a field as an integer expression for the innermost type of `scope`.
 
     Raises:
         ExportError: if no type around the expression contains the field.
@@ -126,12 +126,13 @@ def format_integer(formula: tree.Formula, scope: Scope) -> str:
 
 
 def _format_of_last_part(formula: tree.Formula, scope: Scope) -> str:
-    """Return a formula that Kaitai evaluates after each part, to find the last one.
+    """Return a formula that Kaitai evaluates after each part to find the last part.
 
     Kaitai calls the part that was just read "_".
 
     Args:
-        formula: the formula. A field is in the part, or in the frame if its path begins with "_.".
+        formula: the formula. A path that begins with "_." is a field of the frame. Any other path
+            is a field of the part.
         scope: the types around the parts.
     """
 
@@ -273,11 +274,11 @@ def _copy_condition(more: Mapping[str, Any]) -> Attribute:
 
 
 def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """Return the parts of a block in Kaitai's order, and the order: "be" or "le".
+    """Return the parts of a block as Kaitai reads them, and the order "be" or "le".
 
-    With "be", Kaitai reads each byte from its highest bit and fills integers from the highest bit.
-    With "le", it reads and fills from the lowest bit. Returns None if neither order reads every
-    part as consecutive bits that fill the block.
+    With "be", Kaitai begins with the highest bits; with "le", with the lowest bits. Returns None if
+    the block cannot be read in either order: the bits of each part must be consecutive, and the
+    parts must fill the block.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
@@ -291,9 +292,9 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the bit position of the field's start that each segment implies.
+    """Return the position at which the field begins, calculated from each segment.
 
-    If all segments imply the same position, Kaitai can read the field as consecutive bits.
+    If all segments give the same position, Kaitai can read the field as consecutive bits.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -303,7 +304,7 @@ def _find_starts(bits: BitField, suffix: str) -> set[int]:
 
 
 def _assemble_part(part: tree.Part, raw: str) -> str:
-    """Return the expression that assembles a part from the bytes of its block."""
+    """Return the Kaitai expression that calculates a part from its block's bytes."""
     terms = []
     for segment in part.bits.segments:
         if segment.mask == 0xFF:
@@ -403,7 +404,8 @@ class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
-        seals: for each field that stores a checksum, by path, the node with the algorithm.
+        seals: the node with the checksum algorithm, by the path of the field that stores the
+            checksum.
     """
 
     seals: Mapping[str, tree.Sealed]
@@ -652,7 +654,7 @@ def _format_size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _name_value(node: tree.Node) -> tree.Node:
-    """Return an array element, or an alternative, as a member named `value`."""
+    """Return an array element or an alternative with the name `value`."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

@@ -50,10 +50,10 @@ MAX_LISTED_CHANNELS = 128
 
 
 def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
-    """Return the page as Markdown.
+    """Return the reference page of a sensor as Markdown.
 
     Args:
-        pictures: the address of the packet diagram of each frame type.
+        pictures: the address of the packet diagram, by frame type.
     """
     parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", _write_quick_start(sensor)]
     for name, picture in (pictures or {}).items():

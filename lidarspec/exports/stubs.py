@@ -200,7 +200,7 @@ def _find_number_type(info: FieldInfo) -> str:
 
 
 def _find_bytes_type(info: FieldInfo) -> str:
-    """Return the type of the parsed value of bytes; a function may decode the bytes."""
+    """Return the Python type of a field of bytes, after decoding."""
     if info.adapter is None:
         return "bytes"
     if info.adapter.form.startswith("text"):

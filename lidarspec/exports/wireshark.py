@@ -50,7 +50,7 @@ MAX_LINE_CHARS = 140
 
 
 class LuaCode(str):
-    """Lua code, which is not quoted."""
+    """Lua code, which `lua` writes without quotes."""
 
 
 _OPERATIONS = {
@@ -164,8 +164,8 @@ class _TableWriter:
     def node(self, node: tree.Node, path: str = "") -> Table:
         """Return the table of a node.
 
-        The entry `skip` of the table is the size of the node in bytes. It is None if the node
-        cannot be skipped, because its bytes must match a constant or a later formula uses them.
+        The entry `skip` of the table is the size of the node in bytes. It is None if the bytes must
+        be read, because they must match a constant or a later formula uses their value.
         """
         match node:
             case tree.Number():
@@ -544,9 +544,10 @@ def _find_width(bits: int) -> int:
 
 
 def _find_word_order(block: tree.Block) -> str | None:
-    """Return the byte order in which each part of a block is a bit mask of one word.
+    """Return the byte order with which a block can be read as one integer.
 
-    Returns None if there is no such byte order, or if the block has more than 4 bytes.
+    The bits of each part must be contiguous in the integer. Returns None if they are not, or if the
+    block has more than 4 bytes.
     """
     orders = (
         order
@@ -559,9 +560,9 @@ def _find_word_order(block: tree.Block) -> str | None:
 
 
 def _find_lowest_bit(bits: BitField, size: int, order: str) -> int | None:
-    """Return the position of a field's lowest bit, if its block is read as one word.
+    """Return the position of a field's lowest bit in its block, read as one integer.
 
-    Returns None if the bits of the field are not contiguous in that word.
+    Returns None if the bits of the field are not contiguous in the integer.
     """
     places = (
         (run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments
