@@ -120,13 +120,13 @@ _TWO_BYTE_CHECKSUMS: tuple[Checksum, ...] = (
 
 @dataclass(frozen=True)
 class ChecksumWithConstant(Checksum):
-    """A checksum that combines the value of another checksum with a constant.
+    """A checksum that is calculated from the value of a base checksum and a constant.
 
-    The result is ``constant ^ value`` for XORs, ``constant - value`` if `negative` is set, and
-    ``constant + value`` for other checksums.
+    The result is ``constant ^ value`` if the base is an XOR, ``constant - value`` if `negative` is
+    set, and ``constant + value`` in all other cases.
 
     Attributes:
-        base: the other checksum, which computes the value.
+        base: the base checksum, which computes the value.
         constant: the constant.
         negative: whether the value is subtracted from the constant.
     """
@@ -223,7 +223,10 @@ def needs_class(algorithm: Checksum) -> bool:
 def iter_plain_matches(
     samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place
 ) -> Iterator[ChecksumMatch]:
-    """Yield the simple checksums that match, the widest first, until one is certain."""
+    """Yield the simple checksums that match: first of 4 bytes, then of 2, then of 1.
+
+    The search ends early if a match is certain.
+    """
     few = samples.take_spread(SCREENING_FRAMES)
     tried = 0
     has_sure = False
@@ -273,7 +276,7 @@ def _iter_matches(
     span: CoveredSpan,
     tried: int,
 ) -> Iterator[ChecksumMatch]:
-    """Yield the match of an algorithm, and of its variants with a constant.
+    """Yield the matches of an algorithm, alone and combined with a constant.
 
     Args:
         samples: all frames.
@@ -281,7 +284,7 @@ def _iter_matches(
         algorithm: the algorithm.
         place: the offset and size of the checksum.
         span: the covered bytes.
-        tried: number of checksums that were tried so far.
+        tried: number of checksums tried so far; it reduces the certainty of a match.
     """
     computed = few.compute_checksums(algorithm, place, span)
     byte_orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)

@@ -9,9 +9,9 @@ The start value and the final XOR are calculated from the polynomial. If the fra
 lengths, the two values are the solution of linear equations. If all frames have the same length,
 many pairs of values are equivalent, and the most usual pair is returned.
 
-The XOR of two frames needs frames of the same length. If there are few of them, the search first
-assumes a usual pair of start value and final XOR, because the polynomial then divides each frame
-alone.
+If there are too few frames of the same length, the search assumes that the start value and the
+final XOR are 0 or all ones. With the contribution of these values removed, the polynomial divides
+each single frame.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def remainder(a: int, b: int) -> int:
 
 
 def quotient(a: int, b: int) -> int:
-    """Return polynomial a divided by polynomial b, rounded down; b must not be 0."""
+    """Return the quotient of polynomials a and b without remainder; b must not be 0."""
     size = b.bit_length()
     result = 0
     while (shift := a.bit_length() - size) >= 0:
@@ -374,7 +374,8 @@ def _iter_candidates(
     """Yield candidate CRCs.
 
     Yields:
-        (CRC, number of frames that determined init and xorout, notes about ambiguous parameters).
+        A CRC; the number of frames from which its init and xorout were calculated; notes about
+        ambiguous parameters.
     """
     ones = (1 << reading.width) - 1
     lengths = {size for size, _ in words}
@@ -429,14 +430,16 @@ def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
 def _iter_crcs(
     words: Codewords, poly: int, reading: _BitOrder, *, has_one_length: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield the CRC with a polynomial; nothing if no start value and final XOR match.
+    """Yield the likeliest CRC with a given polynomial.
+
+    Yields nothing if no pair of start value and final XOR matches the frames.
 
     Args:
         words: the codewords of the frames.
         poly: the polynomial.
         reading: the bit order.
-        has_one_length: whether all frames have the same length. Several pairs of start value and
-            final XOR match such frames.
+        has_one_length: whether all frames have the same length, so that several pairs of start
+            value and final XOR match.
     """
     first = dict(reversed(words))  # the first frame of each length
     remainders = {size: remainder(word, poly) for size, word in first.items()}

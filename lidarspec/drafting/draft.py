@@ -90,12 +90,12 @@ class Draft:
         length: the length field; None if all frames have one length.
         frames: the offset and the bytes of each frame that has all known properties, in order.
         bytes_in: number of input bytes.
-        rising_fields: the fields with rising values outside the blocks.
+        rising_fields: the fields with rising values, except those in the blocks.
         blocks: repeated blocks of a frame; None if a frame has no blocks.
         checksum: the checksum; None if none was found.
-        others: other checksums that match.
-        common_bytes: if the length field counts bytes, the number of first bytes that nearly all
-            frames have; fields are searched only there. Otherwise 0.
+        others: further checksums that match the frames.
+        common_bytes: the number of bytes at the start of a frame in which fields are searched, if
+            the length field counts bytes; otherwise 0. Frames of fewer bytes are ignored.
     """
 
     datagrams: bool
@@ -271,8 +271,9 @@ def _has_valid_checksum(checksum: ChecksumMatch, frame: bytes) -> bool:
 def _find_count(draft: Draft, stream: bytes) -> Draft:
     """Search for a length field with the help of an incomplete frame at the end.
 
-    A byte that is equal in all other frames, but not in the incomplete frame, is probably a number
-    of elements. The result is the draft with this length field, or the unchanged draft.
+    A byte that is the same in all complete frames, but differs in the incomplete frame, is probably
+    a number of elements. Returns the draft with this length field, or the unchanged draft if there
+    is no such byte.
 
     Args:
         draft: the draft.
@@ -317,9 +318,9 @@ def _find_count(draft: Draft, stream: bytes) -> Draft:
 
 
 def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
-    """Return the draft with `common_bytes`, and without frames that are shorter than that.
+    """Return the draft with `common_bytes`, and without frames of fewer bytes.
 
-    Shorter frames are probably of another type.
+    Frames of fewer bytes are probably of another type.
     """
     if draft.length is None or not draft.frames:
         return draft
@@ -334,9 +335,10 @@ def _find_common_bytes(draft: Draft, parts: Sequence[bytes]) -> Draft:
 
 
 def _find_checksums(draft: Draft) -> list[ChecksumMatch]:
-    """Return the matching checksums that a struct can declare.
+    """Return the checksums that match and that a struct can declare.
 
-    Checksums at rising or nearly constant bytes are omitted.
+    Matches at rising fields or at nearly constant bytes are left out, because they are probably a
+    coincidence.
     """
     frames = [frame for _, frame in draft.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
@@ -390,9 +392,9 @@ def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
 
 
 def _find_blocks(draft: Draft) -> Draft:
-    """Return the draft with blocks, which are searched only in frames of the same length.
+    """Return the draft with its repeated blocks, if there are any.
 
-    Rising fields in the blocks, the checksum or the sync bytes are removed from the draft.
+    Fields in the blocks, in the checksum or in the sync bytes are removed from `rising_fields`.
     """
     if not draft.frames:
         return draft

@@ -209,9 +209,10 @@ def _find_known_fields(draft: Draft) -> list[DraftField]:
 
 
 def _iter_sync_fields(draft: Draft) -> Iterator[DraftField]:
-    """Yield the sync bytes as fields, split where the covered bytes begin or end.
+    """Yield the sync bytes as fields.
 
-    Sync bytes that belong to the first block are omitted.
+    A field ends where the bytes that the checksum covers begin or end. Sync bytes in the first
+    block are omitted.
     """
     if draft.blocks is None:
         end = len(draft.sync)
@@ -402,7 +403,7 @@ def _make_checksum_field(draft: Draft, checksum: ChecksumMatch, start: int) -> D
 def _format_checksum_arguments(
     draft: Draft, checksum: ChecksumMatch, fields: Sequence[DraftField]
 ) -> str:
-    """Return the arguments of `Checksummed` after its struct."""
+    """Return the arguments of `Checksummed` that follow the struct."""
     if needs_class(checksum.algorithm):
         algorithm = "Check()"
     else:
@@ -497,10 +498,10 @@ def _format_max_length(draft: Draft) -> str:
 
 
 def _make_imports(text: dict[str, str]) -> dict[str, str]:
-    """Return {name: text} of the template values with imports.
+    """Return the template values with the imports, as {name: text}.
 
     Args:
-        text: all other template values, which use the imported names.
+        text: the template values with code. The names in this code are imported.
     """
     code = "\n".join(text.values())
     construct = sorted(

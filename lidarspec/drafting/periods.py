@@ -1,7 +1,7 @@
 """Find frames in unknown bytes, and fields with steadily rising values.
 
-`find_structure` finds the frames. If all frames have the same length, many bytes are equal at this
-distance, and the sync bytes are the longest run of constant bytes. If frames have several lengths,
+`find_structure` finds the frames. If all frames have the same length, many bytes repeat at this
+interval, and the sync bytes are the longest run of constant bytes. If frames have several lengths,
 their sync bytes are a frequent pair of bytes, and a length field after the pair gives the distance
 to the next pair.
 
@@ -293,7 +293,7 @@ def _iter_rising(
 def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
     """Return whether the lowest byte of the values belongs to the field.
 
-    If it does, the steps vary clearly more without this byte.
+    If it does, the steps between the values vary clearly more without this byte.
     """
     steps = np.diff(field_values)
     moved = steps != 0
@@ -419,9 +419,9 @@ def split_frames(data: bytes, period: int, start: int = 0) -> list[bytes]:
 
 
 def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
-    """Return the structure of datagrams of the same length.
+    """Return the structure of the datagrams of one length.
 
-    The length with the most bytes is selected.
+    The length whose datagrams have the most bytes in total is selected.
     """
     if len(chunks) < MIN_FRAMES:
         return None
@@ -441,8 +441,8 @@ def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
 def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
     """Return the structure of a stream, with frames of one or of several lengths.
 
-    The structure with the larger share of bytes in frames is returned. If the shares are equal, it
-    is the structure with frames of the same length.
+    If both are found, frames of several lengths are preferred if they contain clearly more bytes,
+    or if there are many of them and few frames of one length.
     """
     periodic = _find_fixed_length(data)
     varying = _find_varying_length(data)
@@ -481,10 +481,10 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Return the structure of shorter frames if `whole` consists of groups of them.
+    """Return the structure of shorter frames if `whole` consists of groups of frames.
 
-    A group of frames can repeat, for example because an index in the frames counts from 0 to 5. The
-    parts of a group are accepted as frames if their sync bytes differ from each other, or if they
+    Frames can repeat in groups, for example because an index in the frames counts from 0 to 5.
+    Shorter frames are accepted if their sync bytes have at least two different values, or if they
     have a counter. Otherwise, `whole` is returned.
     """
     period = whole.period or 0
@@ -507,7 +507,7 @@ def _has_counter(structure: FrameStructure) -> bool:
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield (weight, structure) of frames of the length `period`, if they are found.
+    """Yield (weight, structure) of frames with the length `period`, if there are any.
 
     The frames begin with the longest run of constant bytes. The weight is the share of constant
     bytes, multiplied by the share of bytes in frames.
@@ -536,10 +536,10 @@ def _iter_frames_of_length(
 
 
 def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period: int) -> bool:
-    """Return whether random bytes are likely to have as many constant bytes as the data.
+    """Return whether the number of constant bytes is probably a coincidence.
 
-    The random bytes have the same distribution of values as the data. The probability is estimated
-    by Chernoff's bound, and multiplied by the number of periods that are tried.
+    Chernoff's bound gives the probability that random bytes with the same distribution of values
+    have as many constant bytes. It is multiplied by the number of periods that are tried.
 
     Args:
         data: the data.

@@ -64,9 +64,12 @@ class ChecksumPlace:
 
 @dataclass(frozen=True)
 class CoveredSpan:
-    """The bytes that a checksum covers: before the checksum, after it, or both.
+    """The bytes of a frame that a checksum covers.
 
-    The first `head` and the last `tail` bytes are omitted.
+    Attributes:
+        part: "before" the checksum, "behind" the checksum, or "all" for both.
+        head: the number of bytes at the start of this part that are not covered.
+        tail: the number of bytes at the end of the frame that are not covered.
     """
 
     part: Part = "all"
@@ -116,13 +119,13 @@ class ChecksumMatch:
         order: the byte order of the stored checksum.
         right: the number of frames with a valid checksum.
         total: number of all frames.
-        evidence_bits: a measure of certainty: one of 2**evidence_bits wrong checksums would match
-            as well by coincidence.
+        evidence_bits: the certainty: of 2**evidence_bits wrong checksums, one matches by
+            coincidence.
         source: the Python source of the algorithm.
-        notes: further remarks for the user.
+        notes: remarks for the user.
         name: the name of a CRC in the catalogue; "" if it has none.
-        is_ambiguous: whether other parameters match these frames as well.
-        has_constant: whether a constant was fitted to the frames.
+        is_ambiguous: whether the frames leave a choice of parameters.
+        has_constant: whether the checksum includes a constant that was calculated from the frames.
         is_in_nibbles: whether the checksum is stored in the low nibbles of two bytes.
         variation: the result of `SampleFrames.measure_variation` for `place`.
     """
@@ -155,7 +158,7 @@ class ChecksumMatch:
 
     @property
     def odds(self) -> str:
-        """A text such as "1e+09": one of this many wrong checksums matches by chance."""
+        """The number of wrong checksums of which one matches by chance, e.g. "1e+09"."""
         return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property
@@ -163,7 +166,7 @@ class ChecksumMatch:
         """Whether the search can end with this match.
 
         The match must have enough evidence and unique parameters. The checksum must be at the end
-        of the frame, or cover all other bytes except a header.
+        of the frame, or cover all bytes after it.
         """
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
         return (
@@ -225,7 +228,7 @@ class SampleFrames:
         return 0
 
     def take_spread(self, number: int) -> SampleFrames:
-        """Return at most `number` frames, spread over all lengths."""
+        """Return at most `number` frames, at equal steps from the shortest to the longest."""
         step = max(1, len(self.frames) // number)
         return SampleFrames(self.frames[::step][:number])
 
@@ -233,9 +236,9 @@ class SampleFrames:
         """Return frames of the most frequent length, and up to two of each other length.
 
         Args:
-            number: maximum number of frames of the most frequent length. It also limits the number
-                of other lengths.
-            pick: a number that selects the frames. Other numbers select other frames.
+            number: maximum number of frames of the most frequent length, and maximum number of
+                other lengths.
+            pick: selects which frames of a length are returned.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
@@ -317,15 +320,14 @@ class SampleFrames:
 
     @property
     def is_single(self) -> bool:
-        """Whether there is only one frame. If so, only its end is searched."""
+        """Whether there is a single frame, in which a checksum is searched at the end."""
         return len(self) == 1
 
     def measure_variation(self, place: ChecksumPlace) -> float:
         """Return a measure of how much the bytes at a place vary.
 
-        It is calculated for the byte that varies least, from its range and its number of distinct
-        values. For a place at the end of the frame it is increased, because checksums are usually
-        there.
+        The measure depends on the range and the number of distinct values of the byte that varies
+        least. It is higher for a place at the end of the frame, where checksums usually are.
         """
         columns = [
             self.read_field(ChecksumPlace(place.offset + index, 1), "little")
@@ -377,7 +379,7 @@ def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredS
 def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
     """Return the evidence for a match, in bits.
 
-    If there are k bits, one of 2**k wrong checksums would match as well by coincidence.
+    Evidence of k bits means that of 2**k wrong checksums, one matches by coincidence.
 
     Args:
         width: width of the checksum, in bits.
