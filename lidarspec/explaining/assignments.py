@@ -145,10 +145,10 @@ def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | f
 
 
 def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """Return the length of an array, which is declared or follows from count fields.
+    """Return the length of an array, as declared or calculated from count fields.
 
-    If neither determines the length, but elements of the array are given, returns 0. The caller
-    then makes the array as long as its elements require.
+    Returns 0 if the count fields are missing, but elements of the array are given. The caller then
+    makes the array as long as these elements require.
     """
     declared = table.arrays.get(path)
     if isinstance(declared, int):

@@ -11,7 +11,7 @@ from lidarspec.spec.timing import DATED_EPOCHS, EPOCHS
 
 
 def iter_clock_rows(report: ClockReport) -> Iterator[tuple[str, str]]:
-    """Yield the lines about a clock, each a label and a text."""
+    """Yield (label, text) for each line about a clock."""
     yield "time", describe_time_source(report)
     if not math.isnan(report.offset_s):
         yield "offset", describe_offset(report)

@@ -96,7 +96,7 @@ def find_changes(
 
 
 def _find_max_size(engine: Codec, values: int) -> int:
-    """Return the maximum length of a frame for which the search is fast enough.
+    """Return the maximum length of a frame that is searched for changes, in bytes.
 
     Args:
         engine: parses the frame type.
@@ -172,10 +172,7 @@ def _undo_changes(
     changes: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """Return a copy of the damaged frame for each change, with this change undone.
-
-    The result is an array (number of changes, size).
-    """
+    """Return the damaged frame with each change undone, (number of changes, size)."""
     columns = count_up(size)
     change_columns = offsets[:, None]
     if kind == "inserted byte":
@@ -194,8 +191,8 @@ def describe_damage(
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
-    If there are more than `MAX_DESCRIBED_CHANGES`, one sentence with their kind and the number of
-    their offsets is yielded.
+    If there are more than `MAX_DESCRIBED_CHANGES` changes, a single sentence gives the kind of
+    change and the number of possible offsets.
 
     Args:
         frame: the frame type.

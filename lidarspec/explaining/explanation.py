@@ -192,7 +192,7 @@ def read_values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue
 
 
 def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
-    """Return a sentence on the result of a command, and the fields of the reply.
+    """Return a sentence about the result of a command, and the fields of the reply.
 
     Each field is a tuple (path, value as text, documentation).
     """
@@ -305,9 +305,9 @@ def _find_point_numbers(
     Args:
         path: the path of the row.
         chain: the paths of the nested arrays that contain the points, outermost first.
-        axes: for each dimension of `numbers`, the path of the array whose elements it counts; None
-            if it does not correspond to an array.
-        numbers: the index of the point of each array element; -1 for an element without a point.
+        axes: the path of the array for each dimension of `numbers`; None for a dimension without an
+            array.
+        numbers: the index of the point in each array element; -1 for an element without a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

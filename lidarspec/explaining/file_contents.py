@@ -334,11 +334,10 @@ def _make_content(path: str, verdict: Verdict) -> SensorContent:
 
 
 def _measure(source: str, sensor: Sensor) -> dict[str, Any]:
-    """Return attributes of `SensorContent`, measured at the beginning of a file.
+    """Return statistics of the beginning of a file, as attributes of `SensorContent`.
 
-    They are `reading`, `incomplete_returns`, `info` and `clock`.
-
-    Returns an empty dict if the frames cannot be decoded.
+    The attributes are `reading`, `incomplete_returns`, `info` and `clock`. Returns an empty dict if
+    the frames cannot be decoded.
     """
     try:
         with Device(source, sensor) as device:

@@ -91,9 +91,9 @@ class FieldValue:
         unit: the unit; "" if the field has none.
         digits: number of decimals to print; None for a float field.
         label: the name of the raw value; "" if it has none.
-        is_unknown: whether this raw value has no name although other values of the field have
-            names.
-        bits: a text with the bits of the field, e.g. ".. 000001.."; "" if it has only whole bytes.
+        is_unknown: whether other values of the field have names, but this value has none.
+        bits: a text with the bits of the field, e.g. ".. 000001.."; "" if the field consists of
+            whole bytes.
         docs: the documentation of the field.
         start: offset of the first byte in the frame.
         masks: for each byte that contains bits of the field, a mask in which these bits are 1.
@@ -118,7 +118,7 @@ class FieldValue:
 
     @property
     def has_meaning(self) -> bool:
-        """Whether the value has a unit or the name of a code in addition to the raw value."""
+        """Whether the value has a unit, or belongs to a field with named values."""
         return bool(self.unit or self.label) or self.is_unknown
 
     def contains_bit(self, offset: int, bit: int) -> bool:
@@ -242,11 +242,15 @@ class ExplainedRow:
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
-        """Return each value as text; in later elements of an array, the bits are omitted.
+        """Return each value as text.
+
+        The bits of a value are shown in the first element of an array, and omitted in later
+        elements.
 
         Args:
-            alone: whether the row is a single field. Otherwise, a text begins with the name of its
-                field, unless no other field of the row has the same unit.
+            alone: whether the row is a single field, so that its text needs no name. In any other
+                row, a text begins with the name of its field, unless its unit occurs once in the
+                row.
         """
         if alone and self.remarks:
             return []
@@ -323,7 +327,7 @@ class FieldDifference:
 
     @property
     def change(self) -> str:
-        """The signed change of the physical value as text; "" if it is not a number."""
+        """The signed change of the field's number as text; "" for any other field."""
         if (
             not self.before
             or not self.after
@@ -487,7 +491,7 @@ def describe_declared_clock(clock: Clock) -> str:
 
 
 def describe_declared_status(clock: Clock) -> str:
-    """Return the field with a clock's state and the meaning of its values, as Markdown."""
+    """Describe in Markdown the field with the state of a clock, and its values."""
     status = clock.status
     assert status is not None
     if callable(status.source):

@@ -77,9 +77,9 @@ def iter_pieces(
     Args:
         sensor: the sensor.
         chunks: the input.
-        datagrams: whether each chunk is a datagram, not a piece of a stream.
-        frame: the frame type that is selected if several types match the same bytes. It need not
-            follow the type in its `after`.
+        datagrams: whether each chunk is a datagram; otherwise it is a piece of a stream.
+        frame: the frame type that is selected if several types match the same bytes. The `after` of
+            this type is ignored.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -163,13 +163,14 @@ def explain_piece(
 ) -> Iterator[tuple[InputPiece, Explanation]]:
     """Yield a piece with its explanation.
 
-    Bytes that are not in a frame are first split into damaged frames and the bytes between them.
-    Each of these is then yielded as a piece.
+    Bytes without a valid frame are split into damaged frames and the bytes between these frames.
+    Each part is then yielded as a piece.
 
     Args:
         sensor: the sensor.
         piece: the piece.
-        frame: the frame type of a piece of the type `NEAREST`; by default the type that fits best.
+        frame: the frame type by which a piece of the type `NEAREST` is explained; by default the
+            type that fits best.
 
     Raises:
         WireError: if no frame type begins like the bytes of a piece of the type `NEAREST`.
@@ -257,9 +258,8 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    This is the offset in `ends` at which the frame has the length of its type, or one byte less or
-    more. If there is none, the frame ends at the next offset in `ends`, or at the length of its
-    type if that is shorter.
+    The frame ends at an offset in `ends` that gives it the length of its type, or one byte more or
+    less. If there is no such offset, the end is estimated.
 
     Args:
         data: the bytes.

@@ -48,8 +48,7 @@ def join_text(line: Line) -> str:
 def fold(line: Line, width: int) -> Line:
     """Insert line breaks into a line that is wider than `width` characters.
 
-    Continuation lines are indented, so that they leave the columns with offset, bytes and name
-    free.
+    Continuation lines are indented to the column after offset, bytes and name.
     """
     indent = sum(len(span.text) for span in line[:COLUMN_COUNT])
     if len(join_text(line)) <= width or indent + MIN_FOLDED_WIDTH > width:
