@@ -52,12 +52,12 @@ class CheckTarget:
 
     Attributes:
         sensors: the sensors that could be loaded.
-        findings: the reasons why other sensors could not be loaded.
+        findings: the reasons why sensors could not be loaded.
         files: the modules that declare the sensors.
-        vectors: the file of golden vectors, which is next to the modules, in the source folder of
-            the distribution, or in its folder of tests; None if there is no such file.
-        family: the ids of the sensors that share the file of vectors: all sensors of the checked
-            file or distribution.
+        vectors: the file of golden vectors; None if there is no such file. It is next to the
+            modules, in the source folder of the distribution, or in its folder of tests.
+        family: the ids of all sensors of the checked file or distribution, which share the file of
+            vectors.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
@@ -213,7 +213,8 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
 def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
     """Return a finding for each id or alias that several plugins use.
 
-    The path of the finding names the plugin whose sensor was not registered for this reason.
+    The path of the finding names the plugin whose sensor was not registered because of the
+    conflict.
     """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
@@ -228,7 +229,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
 
 
 def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """Return a finding for each sensor of a file that has an installed sensor's id."""
+    """Return a finding for each id in a file that an installed sensor already has."""
     return [
         Finding(
             "LS005",
@@ -246,9 +247,9 @@ def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
 
 
 def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
-    """Load a plugin without other plugins, and return its sensors.
+    """Return the sensors of one plugin.
 
-    The hooks of the plugin are applied to its sensors.
+    The hooks of all installed plugins are applied to the sensors.
 
     Raises:
         Exception: any error of the plugin.
@@ -306,7 +307,7 @@ def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
 
 
 def _find_loading_rule(error: BaseException, cause: BaseException) -> str:
-    """Return the code of the rule that is violated if loading raises this error."""
+    """Return the code of the rule for an error that occurred while loading a plugin."""
     functions = [location.name for location in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
@@ -392,9 +393,10 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Location | None:
-        """Return the location of a field of the source; None if there is no such field.
+        """Return the location of a field in the source; None if there is no such field.
 
-        If the path `parts` ends with the paths of several fields, the longest path is selected.
+        If several fields of the source match the end of the path `parts`, the field with the
+        longest path is selected.
         """
         fitting = [
             (len(chain), location)
@@ -444,7 +446,7 @@ def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
 
 
 def _iter_fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Yield (path of names, line) of each ``"name" / construct``."""
+    """Yield (names of the path, line) for each expression ``"name" / construct``."""
     match node:
         case ast.BinOp(op=ast.Div(), left=ast.Constant(value=str(name)), right=right):
             yield (*chain, name), node.lineno

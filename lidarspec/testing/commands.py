@@ -160,7 +160,7 @@ def an_exchange_holds(
 
 
 def replies_can_match(subject: SensorUnderTest, name: str) -> None:
-    """Check that the fields that identify a reply exist in a reply of the command."""
+    """Check that a reply of the command has the fields by which it is recognized."""
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
@@ -250,7 +250,7 @@ def _get_reply(subject: SensorUnderTest, name: str, given: dict[str, float]) -> 
 def _run_exchange(
     device: SimulatedDevice, session: Session, pending: PendingReply, name: str, now: int
 ) -> int:
-    """Simulate a device until it has replied to a command; return that time in ns."""
+    """Run a simulated device until it has replied; return the simulated time in ns."""
     sensor = session.sensor
     link = sensor.commands[name].link
     decoder = sensor.decoder(stream=not is_datagram(sensor.links[link]))

@@ -42,7 +42,7 @@ SHIFT_COUNT = 24
 
 
 def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
-    """Check that the clock stays below `wraps_at`, also in late packets of the sweep."""
+    """Check that the clock stays below `wraps_at` in packets far into the sweep."""
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
@@ -109,8 +109,8 @@ def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     """Check that the times of points agree with the clock.
 
-    A step is the mean time between two packets by the clock. The times of the points of n packets
-    may cover at most n + `MAX_SPREAD_STEPS` steps.
+    The times of the points of n packets may cover at most n + `MAX_SPREAD_STEPS` steps. A step is
+    the mean time from packet to packet by the clock.
     """
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:

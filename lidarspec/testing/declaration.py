@@ -319,8 +319,7 @@ def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
 def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of valid frames with a large value in one header field.
 
-    The value is the largest that `max_length` allows. These frames are needed because random
-    headers seldom have large counts, and a `sweep` may have the same count in all packets.
+    Random headers seldom have large counts, and a `sweep` may have the same count in all packets.
     """
     frame = subject.sensor.frames[name]
     engine = get_codec(frame)
@@ -365,7 +364,7 @@ def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
 
 
 def _find_range_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields that `range` is calculated from, if one of them is in metres."""
+    """Return the source fields of `range`; an empty set if none is a length."""
     try:
         infos = [
             find_field_of_node(subject, name, node)
@@ -510,7 +509,7 @@ def _check_strength(
 
 
 def _find_max_weak_bits(sensor: Sensor, frame: Frame) -> int:
-    """Return the maximum number of constant and checksum bits of a weak frame."""
+    """Return the number of constant and checksum bits up to which a frame is weak."""
     if sensor.datagrams:
         return WEAK_BITS_IN_DATAGRAMS
     if frame.data:

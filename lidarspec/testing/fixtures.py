@@ -28,18 +28,18 @@ def virtual_port(
     faults: Faults | None = None,
     virtual_time: bool = False,
 ) -> Iterator[Served]:
-    """Put a simulated sensor on a pseudo-terminal or a socket; a context manager.
+    """Run a simulated sensor on a pseudo-terminal or a socket, in a context manager.
 
     Args:
         sensor: an id or a Sensor.
-        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; with TCP port 0, a free port
-            is chosen.
+        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; with TCP port 0, a free port is
+            chosen.
         link: the name of a symbolic link to the pseudo-terminal. It stays valid if the sensor is
             unplugged and plugged in again. The default is a link in a temporary folder.
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
         rate: speed relative to real time; with `inf`, the sensor sends as fast as the reader reads.
-        faults: the faults on its links.
+        faults: the faults to simulate on the links of the sensor.
         virtual_time: whether the sensor's time passes only in calls of `advance`.
 
     Yields:

@@ -400,7 +400,12 @@ def _check_edit(
 
 
 def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
-    """Return the author's strategy for a field's raw values, else one for all values."""
+    """Return a strategy for the raw values of a field.
+
+    Args:
+        own: a strategy or function of the plugin's author, which is preferred; None if there is
+            none.
+    """
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
@@ -423,7 +428,10 @@ def has_free_values(info: FieldInfo | None) -> bool:
 
 
 def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that a truncated frame raises `WireError` with an offset up to its end."""
+    """Check that parsing a truncated frame raises `WireError` with a valid offset.
+
+    The offset must not be after the end of the truncated frame.
+    """
     data = subject.example(name, seed=2)
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CUT_BYTES

@@ -123,9 +123,10 @@ def make_sweep(
 def decode_frames(
     subject: SensorUnderTest, name: str, frames: list[bytes], *, by_clock: bool = True
 ) -> Packets:
-    """Decode frames of one data type, with or without the sensor's clock.
+    """Decode frames of one data type.
 
-    If several frame types have points, the sensor is configured for this type.
+    If several frame types have points, the sensor is configured for this type. If `by_clock` is
+    false, the clock of the sensor is not used.
     """
     if by_clock:
         sensor = subject.sensor
@@ -176,9 +177,9 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
 
 
 def find_field_of_node(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
-    """Return the field that a node of a traced expression reads; None if there is none.
+    """Return the field that a traced node reads; None if it reads no field.
 
-    A node reads a field of this frame type, or a field of another type from the state.
+    The field belongs to the frame type `name`, or to another type if the node reads the state.
     """
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
@@ -391,11 +392,11 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
 def _find_axis_sense(axes: tuple[str, str, str], zero: float) -> int:
     """Return the direction in which the vendor's angles increase.
 
-    1 is counter-clockwise, -1 clockwise, 0 unknown.
+    The result is 1 for counter-clockwise, -1 for clockwise, and 0 if unknown.
 
     Args:
-        axes: the vendor's axes.
-        zero: the azimuth of the angle 0, in radians.
+        axes: the directions of the vendor's x, y and z.
+        zero: the azimuth at which the vendor's angle is 0, in radians.
     """
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
@@ -408,9 +409,10 @@ def _find_axis_sense(axes: tuple[str, str, str], zero: float) -> int:
 
 
 def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
-    """Check that the azimuths of each ring in the sweep turn in one direction.
+    """Check that the azimuths of each ring turn in one direction during the sweep.
 
-    They must also do so where they cross the full circle. Only sensors that rotate are tested.
+    The direction must be the same where azimuths cross the full circle. Sensors that do not rotate
+    are not tested.
     """
     frames = make_sweep(
         subject,
@@ -656,9 +658,9 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def find_half_step(subject: SensorUnderTest, name: str) -> float:
-    """Return half the resolution of the coarsest field in a unit of length, in metres.
+    """Return half of the largest step of the length fields of a frame, in metres.
 
-    The result is `MIN_HALF_STEP_M` if the resolution is not larger than this value.
+    The result is `MIN_HALF_STEP_M` if the largest step is at most this value.
     """
     fields = subject.fields(name).values()
     metres = [

@@ -83,11 +83,11 @@ class Property:
 
     @property
     def name(self) -> str:
-        """The name of its function."""
+        """The name of the property, which is the name of its function."""
         return self.function.__name__
 
     def cases(self, subject: SensorUnderTest) -> Iterable[tuple[str, ...]]:
-        """Return the arguments of each call of `function`, without the first, `subject`."""
+        """Return the arguments of each call of `function` that follow `subject`."""
         if self._is_tested_elsewhere(subject):
             return []
         if self.each == "sensor":

@@ -221,7 +221,7 @@ class SensorUnderTest:
         """The commands that are tested for this sensor.
 
         A command is omitted if a related model in `tested` has the same command with the same
-        frames, links and answers.
+        frames, links and simulated replies.
         """
         return [
             name

@@ -412,7 +412,7 @@ def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrateg
 
 
 def _element_values(info: FieldInfo, ranges: LayoutRanges, fields: Fields) -> SearchStrategy[Any]:
-    """Return a strategy for raw values of a field, or of its elements or bytes."""
+    """Return a strategy for the raw value of a field, an array element or a byte."""
     if info.path in fields:
         return fields[info.path]
     if info.kind == "float":

@@ -76,12 +76,12 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return the struct with these values; replace invalid values by valid values.
+        """Return a valid struct with these values; invalid values are replaced.
 
-        Returns None if no valid struct with the values of the fixed fields is found.
+        Returns None if no valid struct has the values of the fixed fields.
 
         Args:
-            fixed: the fields that keep their values.
+            fixed: the paths of the fields whose values must not be replaced.
         """
         row = self._make_rows([values])
         if self._check_rows(row)[0]:
@@ -106,10 +106,10 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and all values that are valid together with them.
+        """Return the fixed values, and the `values` that are valid together with them.
 
-        Invalid values are omitted, so that the fields keep their values of `base`. Invalid elements
-        of an array are replaced by the elements of `base`.
+        Invalid values are left out, so that the struct keeps the values of `base`. In an array,
+        elements of `base` replace invalid elements.
         """
         kept = dict(fixed)
         for leaf in self.free:
@@ -391,11 +391,11 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def find_value_ranges(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
-    """Return the lowest and highest raw value of integer fields of a frame.
+    """Return the lowest and highest valid raw value of integer fields of a frame.
 
-    The frame type need not be compiled. The values are found by changing one valid frame. Two kinds
-    of fields are omitted: fields that determine which fields follow, such as counts, and fields
-    that have only one valid value in that frame.
+    Each field is varied in one valid frame. Two kinds of fields are left out: fields that decide
+    which fields follow, such as counts, and fields with a single valid value. The frame type may be
+    one that is not compiled.
     """
     if sensor.frames[frame].plausible is None:
         return {}

@@ -207,7 +207,7 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
 
 
 def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
-    """Check that vectors have points in two quadrants, within the declared range."""
+    """Check that the points of vectors are in two quadrants and in the declared range."""
     vectors = [vector for vector in read_valid_entries(subject).values() if vector["frame"] == name]
     placed = [
         point
@@ -466,8 +466,8 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
     """Return whether an entry belongs to the sensor.
 
     Raises:
-        ViolationError: if several sensors share the file and the entry names none, or if it names
-            an unknown sensor.
+        ViolationError: if the entry names an unknown sensor, or if it names no sensor although
+            several share the file.
     """
     named = vector.get("sensor", [])
     family = subject.family
@@ -526,7 +526,7 @@ def _compare_values(
     vector: Mapping[str, Any],
     entry_key: str,
 ) -> None:
-    """Compare the fields of a vector with its raw and physical values."""
+    """Check that the parsed fields have the values that the vector states."""
     fields = subject.fields(name)
     parsed_values = dict(iter_leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
