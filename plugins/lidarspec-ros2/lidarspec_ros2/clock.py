@@ -40,7 +40,9 @@ class MessageStamps:
         self._wall_step_ns = 0
 
     def learn(self, device_ns: Times, host_ns: Times) -> None:
-        """Update the conversion with packets, and record a step of the computer's clock.
+        """Update the conversion of the sensor's clock to the host's clock.
+
+        If the computer's clock was set, the step is recorded.
 
         Args:
             device_ns: the time of each packet by the sensor's clock, ns.

@@ -377,7 +377,7 @@ class LidarNode(LifecycleNode):
 
 
 def _predict_scan_end(expected: float, feed: LiveScans) -> float:
-    """Return the time at which to look for the end of the next scan, by `time.monotonic`.
+    """Return when to look for the end of the next scan, by `time.monotonic`.
 
     Args:
         expected: the time that was returned for the previous scan.

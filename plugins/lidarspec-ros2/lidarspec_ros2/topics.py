@@ -120,7 +120,7 @@ class Topics:
         self._selector = ScanSelector(settings.make_selection())
 
     def learn(self, packets: Packets) -> None:
-        """Update the conversion of the sensor's clock with packets."""
+        """Update the conversion of the sensor's clock with the times of packets."""
         self._arrival_ns = int(packets.host_ns[0]) or self._arrival_ns
         self.stamps.learn(packets.time_ns, packets.host_ns)
 
@@ -249,7 +249,7 @@ class Topics:
 
 
 def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
-    """Return the transform from the frame of the carrier to the frame of the points."""
+    """Return the transform from the parent frame to the frame of the points."""
     mount = settings.find_mount() or Mount()
     roll, pitch, yaw = (
         math.radians(angle) / 2
