@@ -46,8 +46,8 @@ class ShownScan:
         scan: the scan.
         number: number of the shown scan, from 0.
         position: seconds from the first scan of the source.
-        sent: arrival time of its last packet, or for a file the time when it was shown, seconds
-            since 1970.
+        sent: arrival time of the last packet of the scan, seconds since 1970. For a file, it is the
+            time at which the scan was shown.
     """
 
     def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
@@ -83,7 +83,7 @@ class Broadcast:
         device: an open device.
         reopen: a function that opens the source again; called to seek in a file.
         select: the scans to show; by default all.
-        switch: records the source, if it is live.
+        switch: starts and stops recordings of a live source; None for a file.
 
     Attributes:
         shown: the newest scan; None before the first scan.
@@ -95,7 +95,7 @@ class Broadcast:
         clock: a description of the sensor's clock; "" if the sensor sends no time.
         history: the statistics of the last minute, one dict for each second.
         failure: the error that ended the reading; None if there was no error.
-        news: a function that the reading thread calls if there is anything new to show.
+        news: a function that the reading thread calls when there is something new to show.
     """
 
     def __init__(
@@ -326,7 +326,10 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Store a new scan, new statistics and the end of a file; call `news` if there are any."""
+        """Update the scan, the statistics and the state of the file.
+
+        If one of them has changed, `news` is called.
+        """
         has_news = self._update_scan()
         if self._update_statistics():
             has_news = True
@@ -397,8 +400,8 @@ class Broadcast:
     def _find_clock_offset(self, clock: ClockReport) -> float | None:
         """Return by how many seconds the sensor's clock is ahead of the host's clock.
 
-        If the sensor's clock has no date, the result is the change since reading began. Returns
-        None if it is unknown.
+        If the sensor's clock has no date, the result is the change of this difference since reading
+        began. Returns None if the difference is unknown.
         """
         if not math.isnan(clock.error_s):
             return clock.error_s
@@ -419,10 +422,10 @@ class Broadcast:
         return self.now()
 
     def _find_position(self, scan: Scan) -> float:
-        """Return the seconds from the first scan to a scan.
+        """Return the position of a scan, in seconds after the first scan.
 
-        They are computed from arrival times if the source is live, and from the times of the scans
-        of a file. If a file has no times, they are computed from the number of scans.
+        The position is calculated from arrival times for a live source, and from the times of the
+        scans for a file. In a file without times, the scans are counted.
         """
         first = self._first_scan
         assert first is not None

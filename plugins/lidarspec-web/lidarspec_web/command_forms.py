@@ -24,9 +24,10 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
 
 
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
-    """Return the commands that stop the data and start it again; None if one is missing.
+    """Return the commands that stop the data and start it again.
 
-    Only commands without arguments are used, first those of `on_open`.
+    The commands have no arguments. Commands in `on_open` are preferred. Returns None if the sensor
+    lacks one of the two commands.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]

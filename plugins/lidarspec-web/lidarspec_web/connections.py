@@ -67,7 +67,7 @@ class Connections:
         return LimitedProtocol
 
     def admit(self, client: Client | None) -> None:
-        """Record that the connection of a client has sent the token; ignore None."""
+        """Record that a client's connection has sent the token; None is ignored."""
         if client in self._waiting:
             self._admitted[client] = self._waiting.pop(client).transport
 

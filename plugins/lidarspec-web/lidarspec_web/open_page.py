@@ -220,7 +220,7 @@ class OpenPage:
         return state
 
     def _find_recording(self) -> tuple[str, str]:
-        """Return the name of the file that is being recorded, and the last error."""
+        """Return the file of the current recording, and the error of the last recording."""
         switch = self._broadcast.switch
         if switch is None:
             return "", ""
@@ -292,7 +292,7 @@ class OpenPage:
     def _reply_later(
         self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
     ) -> None:
-        """Put a slow request into the queue; the reply is sent when it has run.
+        """Queue a slow request; the reply is sent when the request has run.
 
         Args:
             word: the name of the request.
@@ -351,7 +351,10 @@ class OpenPage:
         self.notify()
 
     def _show_frame(self, request: Mapping[str, Any]) -> None:
-        """Reply with the frame of a point, a damaged frame, or a frame by its number."""
+        """Reply with the frame that the page requests.
+
+        The request has a point, the number of damaged bytes, or the number of a frame.
+        """
         backlog = self._backlog
         point = request.get("point")
         if isinstance(point, dict):

@@ -143,7 +143,7 @@ class PageMessages:
     def find_origin(
         self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
-        """Return the frame that contained a point of a scan, with the path of its field."""
+        """Return the frame that contained a point, and the path of the point's field."""
         if shown is None or index >= len(shown.scan):
             return _make_discarded_reply(f"point {index} of scan {number}")
         point_origin = shown.scan.provenance(index)
@@ -153,7 +153,7 @@ class PageMessages:
         return self.frame(stored, "point", point_origin)
 
     def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
-        """Return the damaged bytes with a number, and the changes that would explain them."""
+        """Return damaged bytes by their number, with changes that explain the damage."""
         piece = backlog.find_damaged(number)
         if piece is None:
             return _make_discarded_reply(f"damaged piece {number}")

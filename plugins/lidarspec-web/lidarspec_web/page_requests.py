@@ -101,7 +101,7 @@ class RequestQueue:
         self._requests.put_nowait(request)
 
     async def run(self) -> NoReturn:
-        """Run the requests until this is cancelled."""
+        """Run the requests until the task is cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             request = await self._requests.get()

@@ -36,10 +36,10 @@ MAX_DAMAGED_BYTES = 1 << 13
 
 @dataclass(frozen=True)
 class DamagedBytes:
-    """A damaged piece: consecutive bytes of the input that are not in valid frames.
+    """Consecutive bytes of the input that are not in valid frames: a damaged piece.
 
     Attributes:
-        number: number of this piece among all damaged pieces, from 0.
+        number: number of the damaged piece, from 0.
         offset: offset in the input.
         size: number of bytes.
         at: arrival time of the frame after these bytes, ns since 1970; -1 if it is unknown.
@@ -88,8 +88,8 @@ class _DecoderInput:
     """One input of the decoder.
 
     Attributes:
-        offset: offset of its first byte in the whole input.
-        buffer: an array that contains its bytes, and may contain others.
+        offset: offset of the first byte in the whole input.
+        buffer: an array with the bytes of this input, and possibly further bytes.
         starts: the offset of each part in the buffer. A stream has one part; otherwise, each
             datagram is a part.
         sizes: sizes of the parts, in bytes.
@@ -239,8 +239,8 @@ class RecentBytes:
     def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
         """Return the explanation of damaged bytes, in the form of `Explanation.to_dict`.
 
-        It has the rows of each damaged frame in these bytes, with the change that would explain the
-        damage, and the rows of the bytes between these frames.
+        The result has the rows of all damaged frames, and of the bytes between these frames. The
+        notes describe changes that explain the damage.
         """
         parts = list(
             explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.is_datagram))
@@ -258,7 +258,7 @@ class RecentBytes:
         return first.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
 
     def _drop_old(self) -> None:
-        """Drop the oldest inputs and results beyond the limits."""
+        """Drop the oldest inputs and the oldest frames until the limits are met."""
         inputs = self._inputs
         results = self._results
         while self._input_size > MAX_INPUT_BYTES and len(inputs) > 1:

@@ -89,9 +89,9 @@ class ScanSaver:
             path.unlink()
 
     async def _write(self, path: Path, shown: ShownScan) -> None:
-        """Write a scan, after a pause that is as long as the previous scan took to write.
+        """Write a scan to a file, after a pause that leaves processor time to open pages.
 
-        The pause leaves processor time to open pages.
+        The pause is as long as writing the previous scan took, at most `MAX_REST_S`.
         """
         loop = asyncio.get_running_loop()
         async with self._writing:

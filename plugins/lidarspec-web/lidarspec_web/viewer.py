@@ -87,7 +87,7 @@ class Viewer:
         return self._failure
 
     def close(self) -> None:
-        """Close the source; the last picture stays."""
+        """Close the source; the last picture remains visible."""
         self._is_closed = True
         if self._broadcast is not None:
             self._broadcast.stop()
