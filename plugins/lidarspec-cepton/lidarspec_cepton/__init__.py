@@ -112,7 +112,7 @@ def points(f: Fields) -> Cartesian:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Return the simulated values of packet i, 64 packets a scan."""
+    """Return the simulated values of packet i; a scan has 64 packets."""
     return {
         "signature": SIGNATURES[0],
         "time": i * MAX_POINTS_PER_PACKET * SIMULATED_STEP_S,

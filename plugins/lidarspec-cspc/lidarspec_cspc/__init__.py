@@ -163,9 +163,9 @@ AUXILIARY = Checksummed(
 
 
 def make_angle() -> Construct:
-    """Return the struct of FSA or LSA: steps of 1/64 degree, then a check bit.
+    """Return the struct of the first or the last angle of a packet (FSA or LSA).
 
-    Source: manual 2.2.3.
+    It has the angle in steps of 1/64 degree, and then a check bit. Source: manual 2.2.3.
     """
     return ByteSwapped(
         BitStruct(
@@ -276,9 +276,12 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
 
 
 def points(f: Fields, zero: str = "data", has_exposure: bool = False) -> Polar:
-    """Return the points of a packet, with times from the latest reported speed.
+    """Return the points of a packet.
 
-    `has_exposure` adds the column `exposure`.
+    The times of the points are calculated from the latest reported speed.
+
+    Args:
+        has_exposure: whether to add the column `exposure`.
     """
     raw, clockwise = directions(f, zero)
     rate_hz = last(f.mt.m / 10, where=(f.mt.start == 1) & (f.mt.m > 0))
@@ -371,11 +374,11 @@ class RotationSweep:
 
 
 def change_speed(sweep: RotationSweep, i: int, hertz: float) -> RotationSweep:
-    """Return the sweep from packet i on; its speed changes after the revolution.
+    """Return a sweep that has a new speed from the next start packet on.
 
     Args:
-        sweep: the sweep before packet i.
-        i: the number of the packet.
+        sweep: the sweep before the change.
+        i: the number of the packet at which the speed is set.
         hertz: the new revolutions per second. The points per second do not change.
     """
     values = map(sweep, itertools.count(i))
@@ -399,9 +402,9 @@ def older_sweep(i: int) -> dict[str, float]:
 
 
 def make_request(mode: str, **more: Any) -> Command:
-    """Return the command that is acknowledged with the same mode.
+    """Return a command; its acknowledgement has the same mode.
 
-    A repeated command has no further effect, so it is sent again if no reply arrives.
+    The command is sent again if no reply arrives, because a repetition has no further effect.
     """
     return Command(
         "command", {"mode": mode}, reply="ack", matches={"mode": mode}, retries=1, **more
@@ -435,7 +438,7 @@ def has_customer_firmware(f: Fields) -> Any:
 
 
 def has_bits_beside_firmware(f: Fields) -> Any:
-    """Return whether the upper bits of M&T have a value other than the firmware.
+    """Return whether the upper bits of M&T differ from the customer firmware.
 
     The customer firmware is sent in the packet after a start packet, and is the same in each
     revolution. The first packet of a batch is ignored, because the packet before it is not known.

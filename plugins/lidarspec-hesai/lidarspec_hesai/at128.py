@@ -169,7 +169,10 @@ class Mirror(Calibration):
 
 
 def parse_adjustments(data: bytes, resolution: int) -> Table:
-    """Return corrections in degrees, (181, channels), the last row equal to the first."""
+    """Return corrections in degrees, (181, channels).
+
+    The last row repeats the first row.
+    """
     degrees = np.frombuffer(data, np.int8).reshape(LASERS, 180).T * (resolution / 100)
     return np.concatenate([degrees, degrees[:1]])
 
@@ -198,8 +201,7 @@ TAIL = (
 def points(f: Fields, channels: Mirror) -> Polar:
     """Return the points of a packet; the last shot is at the packet's time (nebula).
 
-    Measured clockwise from the left, the azimuth of a point is twice the mirror's angle from the
-    start of the face, plus the azimuth and the correction of the channel.
+    The module's docstring describes the azimuth, which is clockwise from the left.
     """
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]
@@ -230,9 +232,9 @@ def points(f: Fields, channels: Mirror) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i, 10 scans a second, single return.
+    """Return the values of simulated packet i, 10 scans a second with single return.
 
-    The mirror rotates while no packet is sent; the simulated time omits that interval.
+    The simulated time omits the intervals in which the mirror rotates and no packet is sent.
     """
     shot = i * BLOCKS + np.arange(BLOCKS)
     azimuth = (

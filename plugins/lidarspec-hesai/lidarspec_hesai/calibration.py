@@ -154,8 +154,8 @@ def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> 
         wanted: the columns to read, each with the nominal values of the model.
 
     Raises:
-        UsageError: if the file cannot be read, does not have one value in these columns for every
-            channel of the model, or if `check_spread` rejects a column. The error has the line and
+        UsageError: if the file cannot be read, if a channel of the model does not have exactly one
+            value in each column, or if `check_spread` rejects a column. The error has the line and
             column.
     """
     (line, headings), *rows = read_rows(path)
@@ -219,7 +219,7 @@ def read_rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
 
 
 def read_content(path: str | Path | Learned) -> bytes:
-    """Return the unit's reply, or the bytes of the file.
+    """Return the bytes of a correction file, or of a unit's reply.
 
     Raises:
         UsageError: if the file cannot be read, or is too long.

@@ -185,8 +185,8 @@ FRAMES = {
 def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
     """Return the points of a packet.
 
-    The last shot is fired `last` seconds after the packet's time (as in HesaiLidar_SDK_2.0), and
-    earlier shots are counted back from it. Delays of channels depend on the state of the block.
+    The time of the last shot is as in HesaiLidar_SDK_2.0. The delays of the channels depend on the
+    state of the block.
 
     Args:
         last: the time from the packet's time to the last shot, seconds.
@@ -217,11 +217,11 @@ def sweep(i: int, status: int) -> dict[str, Any]:
 def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
     """Return the firing time of each channel in each state, (states, channels).
 
-    Times are in seconds.
+    The times are in seconds.
 
     Args:
-        groups: the letter of the group of each channel.
-        times_us: the firing times of a group, one for each state.
+        groups: a letter for each channel, which names its group.
+        times_us: the firing time of each group in each state, in microseconds.
     """
     return np.array([times_us[group] for group in groups]).T * 1e-6
 

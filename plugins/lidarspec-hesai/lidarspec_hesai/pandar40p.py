@@ -99,7 +99,7 @@ def pace(f: Fields, blocks: int) -> Any:
 
 
 def make_clock(blocks: int) -> Clock:
-    """Return the clock for packets with `blocks` blocks, with or without the sequence."""
+    """Return the clock for packets with `blocks` blocks."""
     return replace(CLOCK, pace=partial(pace, blocks=blocks))
 
 

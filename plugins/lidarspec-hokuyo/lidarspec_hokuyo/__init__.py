@@ -88,7 +88,7 @@ def make_frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
 def configure(
     sensor: Sensor, *, content: str = "distances", first: int = -1, last: int = -1, cluster: int = 1
 ) -> Sensor:
-    """Return the scanner with a request for other scans.
+    """Return the scanner with a request for the selected scans.
 
     Args:
         content: "distances", "intensities" (with distances), or "short" distances; for a

@@ -130,9 +130,9 @@ def make_status_reply(
 
     Args:
         command: the letters of the command.
-        fields: the fields of further lines.
+        fields: the fields of the lines after the status.
         size: the number of characters of the command's argument.
-        line_sizes: the number of characters of each further line.
+        line_sizes: the number of characters of each line after the status.
     """
     value = ("value" / Bytes(size),) if size else ()
     wire = Lines(64, head=(len(command) + size, 2, *line_sizes), bare=1, check=Scip()) | SixBits()

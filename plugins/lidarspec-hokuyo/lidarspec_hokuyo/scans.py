@@ -87,7 +87,7 @@ def make_decimal(name: str, places: int, most: int = 9999) -> Any:
     Args:
         name: the name of the field.
         places: the number of digits.
-        most: the largest number. It limits the first digit of a number with four digits.
+        most: the largest number; it limits the first digit if there are four digits.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
@@ -131,9 +131,9 @@ def plausible(f: Fields, end: int) -> Any:
 
 
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
-    """Return points that begin at the first step, counter-clockwise.
+    """Return the points of a scan, counter-clockwise from the first step.
 
-    A value below the shortest distance is an error code or a missing echo; its point is invalid.
+    A value below the shortest distance is an error code or a missing echo, so its point is invalid.
     """
     step = decimal_value(f.first) + f.points.index * cluster_size(f) + (cluster_size(f) - 1) / 2
     returns = f.points if echoes == 1 else f.points.echoes

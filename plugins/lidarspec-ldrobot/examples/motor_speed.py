@@ -49,7 +49,7 @@ class Pin(Protocol):
 
 
 class LinuxPwm:
-    """A channel of the PWM hardware, through its folder in /sys/class/pwm."""
+    """A PWM channel of Linux, controlled by the files in its folder in /sys/class/pwm."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -234,9 +234,9 @@ def make_lidar(
     Args:
         name: a key of `POINT_RATES_HZ`.
         turns: simulated revolutions per second.
-        correct_parallax: as for `points`.
+        correct_parallax: whether to correct the angles for the parallax.
         older_rate: points per second of older units.
-        frames: the frames other than the data.
+        frames: the frame types in addition to `data`.
         more: further arguments of `Sensor`.
     """
     rate = POINT_RATES_HZ[name]

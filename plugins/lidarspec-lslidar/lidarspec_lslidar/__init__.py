@@ -192,7 +192,7 @@ def n_sweep(i: int, packets: int) -> dict[str, float]:
 
 
 def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dict[str, float]:
-    """Return the values of simulated packet i, 24 packets per revolution.
+    """Return the values of simulated packet i; a revolution has 24 packets.
 
     Args:
         i: the number of the packet.

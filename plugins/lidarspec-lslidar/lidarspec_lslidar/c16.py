@@ -159,7 +159,7 @@ def pace(f: Fields) -> Any:
 
 
 def block_step(f: Fields, dual: Any) -> Any:
-    """Return the degrees from the azimuth of each block to the next azimuth."""
+    """Return the angle from each block to the block of the next firing, in degrees."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2), following(azimuth))
     return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * BLOCK_PERIOD_S)

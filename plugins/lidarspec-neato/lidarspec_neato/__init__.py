@@ -131,7 +131,7 @@ def points(f: Fields, direction: int) -> Polar:
 
 
 def lfcd_points(f: Fields) -> Polar:
-    """Return points one degree apart, clockwise, the first at 359 degrees (ROBOTIS)."""
+    """Return points one degree apart, clockwise from 359 degrees (ROBOTIS)."""
     azimuth = np.deg2rad(359 - f.start_angle - np.arange(6))
     return Polar(
         range=f.samples.distance,

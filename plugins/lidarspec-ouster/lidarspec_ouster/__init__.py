@@ -68,9 +68,9 @@ METADATA_ONLY = "the packets are identical; the metadata name the model"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Return the points of the pixels, calculated with the tables of the unit.
+    """Return the points of the pixels, calculated with the beams of the unit.
 
-    With two returns, both points of a pixel are adjacent.
+    The two returns of a pixel are adjacent points.
     """
     columns = f.columns
     bits = PROFILES[unit.profile]
@@ -121,7 +121,10 @@ def pace(f: Fields, columns: int) -> Any:
 
 
 def sweep(unit: Unit, i: int) -> dict[str, Any]:
-    """Return the values of simulated packet i, at ten revolutions a second by default."""
+    """Return the values of simulated packet i.
+
+    The unit makes ten revolutions a second if its metadata give no rate.
+    """
     numbers = unit.columns * i + np.arange(unit.columns)
     turn_numbers = numbers % unit.turn
     times = numbers * (1_000_000_000 // (unit.turn * int(unit.rate or 10)))
@@ -208,13 +211,13 @@ def configure(
     turn: int | None = None,
     profile: str | None = None,
 ) -> Sensor:
-    """Return the sensor with the layout and beams of a unit, or with a nominal unit.
+    """Return the sensor with the layout and the beams of a unit.
 
     Args:
         metadata: the unit's JSON file, as its web server returns it at /api/v1/sensor/metadata.
-        rows: the number of pixels per column, 16 to 128.
-        turn: the number of columns per revolution, 512 to 4096.
-        profile: the packing of pixels, such as RNG19_RFL8_SIG16_NIR16.
+        rows: the number of pixels per column of a nominal unit, 16 to 128.
+        turn: the number of columns per revolution of a nominal unit, 512 to 4096.
+        profile: the packing of pixels of a nominal unit, such as RNG19_RFL8_SIG16_NIR16.
 
     Raises:
         UsageError: if the metadata cannot be read or belong to another model, or if the layout does

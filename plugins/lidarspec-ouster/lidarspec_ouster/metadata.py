@@ -283,9 +283,12 @@ class MetadataKeys:
     def _read_numbers(
         self, key: str, count: int | None, default: tuple[float, ...] | None = None
     ) -> Table:
-        """Return `count` finite numbers; with None, any number of finite numbers.
+        """Return the finite numbers of a key.
 
-        `default` is used if the key is missing.
+        Args:
+            key: the key.
+            count: the required number of numbers; None for any number.
+            default: the numbers if the key is missing; None if the key is required.
         """
         value = self.data.get(key, default)
         try:

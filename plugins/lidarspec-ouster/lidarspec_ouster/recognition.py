@@ -118,10 +118,10 @@ def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
 
 
 def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
-    """Return how similar the mean ranges of every fourth row are, from 0 to 1.
+    """Return how similar the mean ranges of four groups of rows are, from 0 to 1.
 
-    Rows are grouped by their index modulo four. The result is the smallest mean range of a group
-    divided by the largest mean range; -1 if unused bits are set in many pixels.
+    Each group has every fourth row. The result is the smallest mean range divided by the largest
+    mean range; -1 if unused bits are set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]

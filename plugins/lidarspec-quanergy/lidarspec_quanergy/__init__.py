@@ -118,10 +118,10 @@ def plausible(f: Fields) -> Any:
 
 
 def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
-    """Return three returns of each laser.
+    """Return the points of packets with three returns of each laser.
 
-    If a laser has fewer than three returns, the packet repeats the first or second distance as the
-    third. In this case, the first or second return is left out, so that it is not counted twice.
+    If a laser has fewer returns, the third distance repeats the first or the second. The repeated
+    distance is then kept once, as the third return.
 
     `elevation` is in radians, one per laser.
     """
@@ -144,7 +144,7 @@ def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
 
 
 def one_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
-    """Return one return of each laser.
+    """Return the points of packets with one return of each laser.
 
     `elevation` is in radians, one per laser.
     """

@@ -13,7 +13,7 @@ The sources disagree about the axes. In the manual's formula, x is proportional 
 azimuth. In rs_driver, x is proportional to the cosine and y to the negative sine, as for all
 models. This module follows rs_driver. It is assumed that the integers of the IMU are big-endian, as
 all others are, and that blocks with dual return have the order that rs_driver derives from their
-position. Models of 48 and 192 lasers (bytes 1 and 3) send other packets, which are not accepted.
+position. Packets of models with 48 or 192 lasers (`lidar_model` 1 or 3) are not accepted.
 """
 
 from __future__ import annotations
@@ -82,9 +82,10 @@ GRAVITY = 9.80665
 
 
 def make_firing_times(*times: float) -> Any:
-    """Return the seconds from the azimuth to each laser's firing, (blocks, lasers).
+    """Return the time from a block's azimuth to each laser's firing, (blocks, lasers).
 
-    `times` has the microseconds of each group of eight lasers in a pair of blocks.
+    The result is in seconds. `times` has the firing time of each group of eight lasers in a pair of
+    blocks, in microseconds.
     """
     return np.tile(np.repeat(times, 8).reshape(2, HALF_LASERS), (BLOCKS // 2, 1)) * 1e-6
 
@@ -263,7 +264,7 @@ def sweep_data(i: int) -> dict[str, Any]:
 
 
 def sweep_imu(i: int) -> dict[str, Any]:
-    """Return the values of IMU sample i, with the factory's ranges."""
+    """Return the values of IMU sample i, with the factory's measuring ranges."""
     codes = {"data_rate": 3, "acceleration_range": 1, "rotation_range": 1}
     return {
         "seconds": i // IMU_RATE_HZ,

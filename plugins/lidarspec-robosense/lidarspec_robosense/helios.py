@@ -180,7 +180,7 @@ def points_32(f: Fields, model: Rotor) -> Polar:
 
 
 def scale_range(f: Fields, polar: Polar) -> Any:
-    """Return ranges in metres, with the distance step that the header declares."""
+    """Return ranges in metres, scaled by the distance step that the header declares."""
     return polar.range * np.where(f.range_resolution == 0, 2, 1)
 
 

@@ -184,7 +184,7 @@ def count_returns(f: Fields) -> Any:
 
 
 def packets_per_frame(f: Fields) -> Any:
-    """Return the number of packets in a frame, which is the highest counter."""
+    """Return the number of packets in a frame, which is the highest packet number."""
     return SINGLE_RETURN_PACKETS * count_returns(f)
 
 
@@ -227,8 +227,8 @@ def points(f: Fields) -> Polar:
 def simulated_angles(number: int) -> tuple[Any, Any]:
     """Return elevation and azimuth in degrees, (25, 5), of a simulated packet.
 
-    Each channel scans a fifth of 120 degrees, back and forth, in lines from +12.5 to -12.5 degrees.
-    `number` counts the packets of a frame from 0, with single return.
+    Each of the five channels scans 24 degrees back and forth, in lines from +12.5 to -12.5 degrees
+    of elevation. `number` is the number of the packet in its frame, from 0, with single return.
 
     Source: the field of view, the number of packets and the directions of the channels are from the
     guide; the lines are assumed.

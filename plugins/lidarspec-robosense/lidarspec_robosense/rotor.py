@@ -261,10 +261,10 @@ def split_angles(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def laser_degrees(entry: Any) -> Any:
-    """Return the angle of each laser in degrees, on the axis of channels.
+    """Return the angle of each channel's laser in degrees.
 
-    `entry` is an array of signs and magnitudes in DIFOP. If the sensor is not calibrated, angles
-    are nan, so that points are invalid.
+    `entry` is an array of signs and magnitudes in DIFOP. The angles are nan if the sensor is not
+    calibrated, so that points are invalid.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
@@ -331,9 +331,10 @@ def make_points(
     computed from the speed in DIFOP.
 
     Args:
-        lasers: elevation, and the clockwise angle from the rotor's direction, in degrees.
+        lasers: the elevation of each laser, and its angle clockwise from the rotor's direction, in
+            degrees.
         ahead: azimuth of the next shot, degrees.
-        elapsed: the seconds from the azimuth of a shot to the firing of each laser.
+        elapsed: the seconds from the moment of a shot's azimuth to the firing of each laser.
         duration: the seconds from shot to shot.
         shot: the number of the shot in the packet, for each block.
         echo: the number of the return, for each block.

@@ -18,7 +18,7 @@ of a pair is the last return, and the second value is the strongest return.
 No table of nominal angles was found. The angles are assumed to be evenly spaced over 40 degrees,
 with the lowest laser first. 40 degrees is the field of view in the data sheets for 128 and 80
 lasers. Clouds are marked as nominal until the first DIFOP packet arrives. It is also assumed that
-no RS-Ruby has 5, the series number of the Ruby Plus. The range limits are from rs_driver, and are
+a packet with the series number 5 is from a Ruby Plus. The range limits are from rs_driver, and are
 the same for all models.
 """
 

@@ -173,7 +173,7 @@ E1_DIFOP = Struct(
 def plausible(f: Fields, model: Scanner) -> Any:
     """Return whether the packet number is possible.
 
-    Frames with dual return have the highest numbers.
+    A frame with dual return has up to twice as many packets as with single return.
     """
     return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
 
@@ -270,8 +270,8 @@ def imu(f: Fields) -> Imu:
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
     """Return the values of simulated packet i.
 
-    Lines run back and forth, from the top to the bottom; each channel scans an equal part of a
-    line.
+    The lines run back and forth, from the top of the field of view to the bottom. Each channel
+    scans an equal part of a line.
     """
     number = i % model.packets
     time = i / (model.packets * FRAME_RATE_HZ)

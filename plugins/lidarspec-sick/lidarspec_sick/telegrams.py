@@ -212,7 +212,7 @@ def points(f: Fields, echoes: int) -> Polar:
 
 
 def scaled_intensity(channel: Fields) -> Any:
-    """Return the values of an RSSI channel, on the axis of the samples of DIST1."""
+    """Return the values of an RSSI channel, one for each sample of DIST1."""
     return (channel.samples * channel.scale + channel.offset).on("dist1.samples")
 
 

@@ -124,7 +124,7 @@ def make_descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct,
 
 
 def make_reply(kind: int, size: int, *fields: Construct) -> Frame:
-    """Return the frame of a single reply of `size` bytes after its descriptor."""
+    """Return the frame of a single reply: its descriptor and `size` bytes of fields."""
     return Frame(Struct(*make_descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields))
 
 

@@ -247,8 +247,8 @@ def ultra_points(f: Fields) -> Polar:
 def ultra_dense_points(f: Fields) -> Polar:
     """Return 64 points per capsule.
 
-    The low 10 to 13 bits of a point are the distance, in steps of 2 to 5 mm. The 8 to 5 bits above
-    them are the quality. The scale of the point determines how many bits the distance has.
+    The low 10 to 13 bits of a point are the distance, in steps of 2 to 5 mm, and the high bits are
+    the quality. The scale of the point determines how many bits the distance has.
     """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
@@ -291,9 +291,13 @@ def nearest_codes(mm: Any) -> Any:
 
 
 def encode_prediction(mm: Any, code: Any) -> Any:
-    """Return the difference of a distance from the distance of a code, in steps.
+    """Return the difference from a reference distance to `mm`, in steps.
 
-    The result is 511 if the distance cannot be encoded, or if it is 0 (no return).
+    The result is 511 if the difference cannot be encoded, or if `mm` is 0 (no return).
+
+    Args:
+        mm: the distance to encode, in mm.
+        code: the code of the reference distance, which determines the size of a step.
     """
     base = CODE_MILLIMETRES[code]
     scale = np.exp2(CODE_LEVELS[code])

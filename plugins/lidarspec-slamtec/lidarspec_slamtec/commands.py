@@ -68,8 +68,8 @@ def make_mode_request(key: int) -> Command:
 def make_express_request(mode: int | None = None) -> Command:
     """Return the request for capsules of one scan mode.
 
-    If `mode` is None, the mode is an argument of the command. The descriptor in the reply depends
-    on the mode; the command `get_answer_type` returns its type.
+    If `mode` is None, the mode is an argument of the command. The reply has a descriptor that
+    depends on the mode. The command `get_answer_type` returns the type of this descriptor.
     """
     values = {"flags": 0, "param": 0} | ({} if mode is None else {"mode": mode})
     args = {"mode": ("mode", 0, 0xFF)} if mode is None else {}

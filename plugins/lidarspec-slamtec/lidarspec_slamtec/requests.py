@@ -44,7 +44,7 @@ PAYLOAD_CODES = {
 
 
 def make_request(*fields: Construct) -> Checksummed:
-    """Return the struct of a request: start byte, fields, XOR of all bytes before."""
+    """Return the struct of a request: start byte, fields, and their XOR."""
     return Checksummed(
         Struct("start" / START, *fields, "checksum" / Int8ul), field="checksum", algorithm=Xor()
     )

@@ -121,7 +121,10 @@ def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> A
 
 
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
-    """Return the sensor with a rule for the last block, see the module's docstring."""
+    """Return the sensor with a rule for the last block.
+
+    The module's docstring describes the rules.
+    """
 
     def set_rule(function: Any) -> Any:
         return function and partial(function, last_block=last_block)

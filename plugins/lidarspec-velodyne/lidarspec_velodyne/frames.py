@@ -153,7 +153,7 @@ def is_plausible_vlp32c(f: Fields) -> Any:
 def is_plausible_single(f: Fields) -> Any:
     """Return whether azimuths, banks and return mode are those of single return.
 
-    The blocks of the four banks follow each other, three times.
+    A packet has one block of each bank, in order, three times.
     """
     return (
         (f.blocks.azimuth <= 360)
@@ -197,10 +197,10 @@ CLOCK_STATUS = ClockStatus(
 def nmea_seconds(f: Fields) -> Any:
     """Return the time of the first valid sentence, seconds since 1970.
 
-    A sentence is valid only if the clock is locked to the PPS.
+    Sentences are ignored while the clock is not locked to the PPS.
 
     Returns:
-        The time for the packet with this sentence, nan for all other packets, (n,).
+        The time for the packet with the sentence, nan for all further packets, (n,).
     """
     is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
     seconds = np.full(len(is_locked), np.nan)

@@ -67,7 +67,10 @@ CSPC_MODELS = {
 
 
 def make_angle() -> Construct:
-    """Return the struct of FSA or LSA: steps of 1/64 degree, and a check bit of 1."""
+    """Return the struct of the first or the last angle of a packet (FSA or LSA).
+
+    It has the angle in steps of 1/64 degree, and a check bit of 1.
+    """
     return ByteSwapped(
         BitStruct(
             "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
@@ -173,10 +176,10 @@ def make_id(name: str) -> str:
 
 
 def contains_state(f: Fields, slowest: float) -> Any:
-    """Return whether a packet other than a zero packet contains the device's state.
+    """Return whether a packet contains the device's state.
 
-    The state is in the bits of the scan frequency. Models without a state send the frequency 0 in
-    these packets (protocol, CT).
+    A zero packet contains the scan frequency. All other packets have the state in the same bits, or
+    0 if the model has no state (protocol, CT).
     """
     return (f.ct.start == 0) & (f.ct.frequency > slowest)
 
