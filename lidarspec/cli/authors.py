@@ -119,9 +119,10 @@ def new(
 
 
 def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
-    """Return the files with a draft of the frames of a capture.
+    """Draft the frames in a capture, and return the files of a distribution by name.
 
-    Only the packets from one sender to one port are used: the sender and port with the most bytes.
+    If the capture has several senders or ports, the packets of the pair (sender, receiving port)
+    with the most bytes are used.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(open_transport(capture)) as opened:

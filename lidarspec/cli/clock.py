@@ -129,7 +129,7 @@ def clock(
 def diagnose_clock(source: str, sensor_id: str | Sensor | None, seconds: float) -> Diagnosis | None:
     """Return the finding of `doctor` about the clock of a source with valid data.
 
-    It is not a problem if nothing synchronizes the clock, because many sensors are used this way.
+    A clock that is not synchronized is no problem, because many sensors are used this way.
 
     Returns:
         None if the sensor sends no time, or cannot be opened again.

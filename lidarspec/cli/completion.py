@@ -83,7 +83,7 @@ def complete(group: click.Command, instruction: str) -> int:
 
 
 def attach(command: click.Command) -> None:
-    """Add completion to the parameters of a verb whose names are in `BY_NAME`."""
+    """Add completion to the parameters of a verb, if `BY_NAME` has their names."""
     for param in command.params:
         list_names = BY_NAME.get(param.name or "")
         if list_names is not None and isinstance(param.type, click.types.StringParamType):
@@ -115,9 +115,10 @@ def _complete_sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _complete_sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return devices, ports, simulated sensors, and the files that match.
+    """Return devices, ports, simulated sensors, and the files that begin with a text.
 
-    The result is empty if only files match, so that the shell completes file names.
+    If the text can only begin a file name, the result is empty, and the shell completes the file
+    name.
     """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]

@@ -326,10 +326,12 @@ def _iter_imu(device: Device, selection: Selection) -> Generator[ImuSamples]:
 
 
 def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> None:
-    """Raise UsageError unless all packets so far have a clock, or none has.
+    """Raise UsageError if some frame types have a clock and others have none.
 
     Args:
-        frames_by_clock: the first frame type with and without a clock; updated by this function.
+        packets: the next packets.
+        frames_by_clock: True -> a frame type with a clock, False -> a frame type without a clock.
+            This function adds the type of `packets`.
     """
     has_clock = find_clock(packets.sensor, packets.frame) is not None
     frames_by_clock.setdefault(has_clock, packets.frame)
@@ -347,13 +349,14 @@ def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[s
     Args:
         device: the device.
         target: the output file.
-        frame: the requested type, such as "report", or a kind of parts of a frame, such as
-            "report.tags.temperature"; None for all types that a sensor without points sends.
+        frame: the requested frame type, such as "report", or type of parts, such as
+            "report.tags.temperature"; None for all frame types that the sensor sends.
 
     Raises:
         UnknownFrame: for a frame type that the sensor does not send.
         UnknownField: for parts that the frame does not have.
-        UsageError: if no type is requested, but the format can contain only one.
+        UsageError: if `frame` is None, the sensor sends several frame types, and the file format
+            can contain one type.
     """
     sensor = device.sensor
     frames = sensor.incoming
@@ -455,11 +458,11 @@ def _select_frames(
 
 
 def _take_types(packets: Packets, types: Sequence[str]) -> dict[str, Packets]:
-    """Return the packets of each type in `types`, by type.
+    """Return the packets of the requested types, by type, without empty packets.
 
     Args:
         packets: packets of one frame type.
-        types: frame types, and kinds of parts such as "report.tags.temperature".
+        types: the requested frame types, and types of parts such as "report.tags.temperature".
     """
     found = dict[str, Packets]()
     for name in types:
@@ -543,7 +546,15 @@ def _write_points(
 
 @contextlib.contextmanager
 def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | None]:
-    """Open a file a second time and yield its packets; yield None if not `wanted`."""
+    """Open a file a second time, and yield an iterator over its datagrams.
+
+    Args:
+        source: the file.
+        wanted: if False, the file is not opened and None is yielded.
+
+    Raises:
+        UsageError: if the source can be read only once, or is a byte stream.
+    """
     if not wanted:
         yield None
         return

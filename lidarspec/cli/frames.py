@@ -319,7 +319,7 @@ class FrameSelection:
             raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
-        """Print how many frames and other bytes the input had, after the last one was shown.
+        """Print the numbers of frames and other bytes, at the end of the input.
 
         Raises:
             UsageError: if the input ends before the selected bytes.
@@ -382,7 +382,12 @@ def _compare(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print the differences between the first frame of the input and the one `diff` names."""
+    """Print the differences between the first frame of the input and another frame.
+
+    Args:
+        diff: "next" to compare with the next frame of the same type in the input; else a file or
+            hexadecimal text that contains the other frame.
+    """
     frames = (
         piece
         for piece in pieces

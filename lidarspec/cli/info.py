@@ -26,7 +26,10 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     has_unknown_file = False
 
     def iter_texts() -> Iterator[str]:
-        """Yield a text about each file, and record whether any file has no known sensor."""
+        """Yield texts about each file.
+
+        Sets `has_unknown_file` if a file has no known sensor.
+        """
         nonlocal has_unknown_file
         for file in files:
             contents = read_contents(file)

@@ -201,17 +201,17 @@ def _make_no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecEr
 def refuse_overwriting(
     target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True
 ) -> None:
-    """Raise an error if an output file is also an input, or exists without `force`.
+    """Raise an error if a verb must not overwrite its output file.
 
-    Two names of the same file, such as a symbolic link, are recognised.
+    A symbolic link to an input is recognised as the input.
 
     Args:
         target: the output file or files.
         inputs: SOURCEs, file names, and sensors whose options may be file names.
-        force: whether existing files that are not inputs may be overwritten.
+        force: whether the verb may overwrite existing files. Inputs are never overwritten.
 
     Raises:
-        UsageError: if a file would be overwritten.
+        UsageError: if an output file is an input, or if it exists and `force` is false.
     """
     existing = [
         file
@@ -296,7 +296,7 @@ def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
 def nearest_fault_error(sample: SampleBytes) -> WireError:
     """Return the error for an input that no sensor fits.
 
-    It is the error of the sensor whose frames match the most bytes, or else a general error.
+    If the bytes begin like a frame, this is the error of the sensor that parsed most of the frame.
     """
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
@@ -321,9 +321,9 @@ def nearest_fault_error(sample: SampleBytes) -> WireError:
 
 
 def _make_wrong_checksums_error(sample: SampleBytes) -> WireError | None:
-    """Return an error if the input has frames that match a sensor except for all checksums.
+    """Return an error if the input has frames of a sensor, all with wrong checksums.
 
-    Returns None for any other input.
+    Returns None if the input has no such frames.
     """
     from lidarspec.detect.identification import find_wrong_checksums
 

@@ -78,8 +78,8 @@ def record(
 ) -> None:
     """Record a source with arrival times; a crash does not damage the file.
 
-    With -s ID or a source sim:ID, the sensor is started and its description is stored in the file.
-    Without a sensor, raw bytes are recorded.
+    With -s ID or a source sim:ID, the sensor is started, and its id and options are stored in the
+    file. Without a sensor, raw bytes are recorded.
     """
     check_suffix(target)
     if times is not None:
@@ -204,8 +204,8 @@ def _sum_up_recording(
 def _describe_damage(stats: Counters) -> str:
     """Format the counters of lost and damaged input.
 
-    Counters of the decoded data are left out, because more data may be decoded than the file
-    contains.
+    The counters of frames and received bytes are omitted, because they may include data that is
+    not in the file.
     """
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):

@@ -211,7 +211,7 @@ def _format_unit(sensor: Sensor, path: str) -> str:
 
 
 def _list_plan(sensor: Sensor, frame: str) -> list[str]:
-    """Return lines about how a frame's points are computed, or why they cannot be."""
+    """Return lines that describe how the points of a frame type are computed."""
     from lidarspec.frames.frame_table import CompiledTable
     from lidarspec.framing.results import Counters, Found, pack_found
     from lidarspec.packets.stream import PacketStream

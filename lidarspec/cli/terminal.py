@@ -44,8 +44,7 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         content: bytes, which are written unchanged, or a text. Characters of the text that control
             a terminal are escaped.
         nl: whether to end the output with a line break.
-        colour: whether to keep the colours that lidarspec has added to the text; None if it has
-            added none.
+        colour: whether to print the colours of a coloured text; None for a text without colours.
 
     Raises:
         BrokenPipeError: if the reader has closed the pipe.
