@@ -130,7 +130,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
     Args:
         record: all bytes of the record.
         datagram: the datagram in the record.
-        form: the reader of the records of its file.
+        form: the reader for the file that contains the record.
     """
     headers = datagram.headers
     pattern = form.find_layout(record)
@@ -466,9 +466,14 @@ class _RecordBlock:
         matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """Return `buffer`, followed by the datagrams that were read singly.
+        """Append the datagrams that were read singly, and return the new buffer.
 
-        For each of these datagrams, a row is inserted into `columns`, in the order of the records.
+        Args:
+            buffer: the bytes that contain the payloads of the datagrams in `columns`.
+            columns: arrays with a row for each datagram. This method inserts rows, so that the rows
+                are in the order of the records.
+            matched: the index of the record of each row.
+            names: sender -> index. New senders are added.
         """
         data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
@@ -507,12 +512,14 @@ class _RecordBlock:
                 self._matched_singles += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Assign a kind to the records that match it; return whether all now have a kind.
+        """Compare records with a kind, and assign the kind to the records that match.
 
         Args:
-            kind: the number of the kind.
-            since: the first record to compare. Earlier records were read singly, and must not match
-                the kind if they are malformed.
+            kind: the index of the kind in `_known`.
+            since: the index of the first record to compare. All earlier records were read singly.
+
+        Returns:
+            Whether all records have a kind.
         """
         template = self._known[kind]
         number = len(self._kinds)

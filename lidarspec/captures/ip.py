@@ -154,7 +154,12 @@ class IpPacket(NamedTuple):
 
 
 class UdpPacket(NamedTuple):
-    """The ports of a UDP packet, and the range of its payload in the IP packet's body."""
+    """The header of a UDP packet.
+
+    Attributes:
+        source, destination: the ports.
+        start, stop: the range of the payload in `IpPacket.body`.
+    """
 
     source: int
     destination: int
@@ -224,8 +229,8 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
 def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
     """Return the sizes of the headers of a UDP packet; None for a reassembled packet.
 
-    Two frames of the same link type and length have the same sender and the same offset of the
-    payload if their headers differ only in the bytes at `variable_offsets`.
+    Frames of one link type and length have the same sender and the same payload offset if their
+    headers are equal except for the bytes at `variable_offsets`.
     """
     if not packet.body_offset:
         return None
@@ -418,7 +423,7 @@ def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragme
 
 
 class _PartialPacket:
-    """The fragments of one packet that have arrived; they do not overlap."""
+    """An incomplete packet: the fragments that have arrived, which do not overlap."""
 
     __slots__ = ("arrival_ns", "parts", "protocol", "size", "starts", "total_size")
 

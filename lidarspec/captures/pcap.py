@@ -67,7 +67,7 @@ class Datagram:
             the time of the fragment that completed it.
         source: address and port of the sender.
         destination: address and port of the receiver.
-        headers: the headers of its packet; None if they do not determine the offset of the payload.
+        headers: the sizes of the packet's headers; None if the packet was reassembled or truncated.
     """
 
     data: bytes
@@ -338,7 +338,7 @@ def is_stream_capture(head: bytes) -> bool:
     Only little-endian files are recognised.
 
     Args:
-        head: the first bytes of a file; 24 bytes of pcap and 64 of pcapng are enough.
+        head: the first bytes of the file, at least 24 bytes of pcap or 64 bytes of pcapng.
     """
     if head.startswith(b"\x0a\x0d\x0d\x0a"):  # a section of pcapng, with an interface after it
         interface = int.from_bytes(head[4:8], "little")

@@ -213,10 +213,12 @@ class PcapRecords:
         return self._head.size + captured if self._is_plausible(captured, original) else 0
 
     def length_field(self, length: int) -> tuple[int, str, int]:
-        """Return (offset, NumPy type, value) of the two length fields, as one number.
+        """Return (offset, NumPy type, value) of the two length fields of a record.
+
+        The two fields are read as one number. The packet must not be truncated.
 
         Args:
-            length: the length of a record whose packet is not truncated.
+            length: the length of the record.
         """
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
@@ -421,8 +423,8 @@ class PcapngBlocks:
     def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """Return the first offset below `stop` at which a block may begin, or None.
 
-        If an interface block was lost, returns only the start of a section, because the interfaces
-        of the packets before it are unknown.
+        If an interface block was lost, only a section block is found, because the packets of the
+        current section cannot be read.
         """
         sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -444,8 +446,8 @@ class PcapngBlocks:
     def _has_wrong_length(self, kind: int, length: int) -> bool:
         """Return whether the length of a block is wrong.
 
-        The length is wrong if it is impossible for the type of the block, or if the last word of
-        the block does not repeat it. If the last word is not in the buffer, the length is wrong if
+        A length is wrong if it is impossible for the type of the block, or if the last word of the
+        block does not equal the length. If that word is not in the buffer, the length is wrong if
         another block begins within this block.
         """
         if not _is_possible_length(length) or (
@@ -492,18 +494,17 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
 
 
 def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
-    """Seek to shortly before the first packet that was captured at a time or later.
+    """Skip packets that were captured before a time.
 
-    The packets must be in the order of their times. The position is at most `NEAR_BYTES` before the
-    packet, but never after the start of another pcapng section, or after a packet with a time that
-    is more than a year away.
+    The packets must be in the order of their times. About `NEAR_BYTES` of earlier packets are not
+    skipped. The next section of a pcapng file is not skipped, and neither are packets with a time
+    more than a year from that of the first packet.
 
     Args:
         at: ns since 1970.
 
     Returns:
-        False if the position is unchanged, because the packet is near or behind, or because the
-        file is a pipe or compressed.
+        Whether packets were skipped; always False for a pipe or a compressed file.
     """
     # All sections are read with the interfaces of the current one. Another section may encode
     # times differently, so its packets are not used to decide what to skip.

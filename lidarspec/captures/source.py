@@ -77,7 +77,8 @@ class BufferedInput:
     def open_at(self, offset: int) -> BufferedInput:
         """Return a second source of the same file that starts at a file offset.
 
-        Both sources share the position of the file, so call `seek` before using this source again.
+        Reading the second source moves the position of the file, so call `seek` before using this
+        source again.
         """
         return _open_source_at(self._file, MIN_BUFFER_BYTES, offset)
 
