@@ -149,12 +149,12 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the related models that, unlike the sensor, may have sent some frames.
+    """Return the related models that must have sent some frames.
 
-    More than half of the packets must have a property that only the related model has.
+    More than half of the packets must have a property that the sensor's own packets never have.
 
     Returns:
-        Id of the related model -> its difference from the sensor.
+        Id of the related model -> the difference between the model and the sensor.
     """
     distinct_relatives = {
         name: relative
@@ -182,7 +182,7 @@ def _keep_matching(
     match: Callable[[Sensor, Sequence[Found]], str],
     frames: Mapping[str, Sequence[Found]],
 ) -> dict[str, str]:
-    """Return {id: evidence} of the sensors that match by one criterion.
+    """Return the sensors that one criterion selects, with the evidence.
 
     Args:
         candidates: the possible sensors.
@@ -190,8 +190,8 @@ def _keep_matching(
         frames: the frames of each candidate, by id.
 
     Returns:
-        The evidence by id. The dict is empty if the criterion does not distinguish the sensors,
-        because none of them matches, or because there are several and all of them match.
+        Id of each matching sensor -> evidence. The dict is empty if the criterion cannot decide:
+        if none of the sensors matches, or if all of several sensors match.
     """
     if len(candidates) == 1 and not candidates[0].relatives:
         return {}
@@ -388,7 +388,7 @@ def _get_nested(parsed: Any, path: str) -> Any:
 
 
 def _describe_value(value: Any, info: FieldInfo) -> str:
-    """Return the text in a field or the name of its code; "" if it has neither."""
+    """Return the text of a bytes field, or the name of a code; "" for other values."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
     return info.labels.get(value, "")
@@ -433,8 +433,8 @@ class Verdict:
         others: the models without an installed plugin that may have sent the bytes: id ->
             difference from the installed models. If `candidates` is empty, one of these models has
             sent the bytes.
-        fault: a description of the fault if frames match a sensor except for their checksums; else
-            "".
+        fault: a message about frames of a sensor that all have wrong checksums; "" if there are no
+            such frames.
     """
 
     sample: SampleBytes
@@ -481,10 +481,11 @@ def _list_sensors_with_frames() -> list[Sensor]:
 
 
 def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Return a message about frames that match a sensor except for all checksums.
+    """Return a message about frames of a sensor that all have wrong checksums.
 
     Returns:
-        The message, which names a checksum algorithm that fits; "" for all other bytes.
+        The message, with a checksum algorithm that matches, if one is found; "" if there are no
+        such frames.
     """
     unchecked = _score_each(
         _list_sensors_with_frames(),
@@ -518,7 +519,10 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _read_stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the stored checksums in place of computed ones, so that all are valid."""
+    """Return the checksums in the frames, (n,).
+
+    A decoder that uses this function to compute checksums accepts every checksum.
+    """
     return seal.load_stored(rows)
 
 
@@ -880,8 +884,7 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
 def _begins_like_frame(fault: WireError) -> bool:
     """Return whether invalid bytes begin with the constant bits of a frame type.
 
-    The frame type must have at least `MIN_CONSTANT_BITS` there, because fewer bits may be equal by
-    coincidence.
+    At least `MIN_CONSTANT_BITS` bits must be equal, so that the match is not a coincidence.
     """
     if not fault.frame:
         return False

@@ -80,8 +80,8 @@ def read_samples(
     """Yield the bytes of each sender of a source.
 
     If the source is a serial port without a baud rate, each rate that installed sensors declare is
-    tried. Data that is sent at another rate is received as invalid bytes. If nothing is received at
-    the most common, the lowest and the highest rate, the other rates are therefore not tried.
+    tried: first the most common, the lowest and the highest rate. If no bytes arrive at these three
+    rates, the sensor is silent, and the remaining rates are not tried.
 
     Args:
         source: the source.

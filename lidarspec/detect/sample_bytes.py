@@ -72,8 +72,8 @@ def read_beginning(opened: Transport, enough: int, *, max_chunks: int | None = N
 
     Args:
         opened: the file.
-        enough: reading ends when the chunks have this number of bytes. It is also the maximum
-            length of each chunk.
+        enough: the number of bytes after which reading ends. A longer chunk is truncated to this
+            number.
         max_chunks: maximum number of chunks; None for no limit.
     """
     return [

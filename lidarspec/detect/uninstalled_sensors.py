@@ -1,9 +1,8 @@
 """Recognize bytes of sensors that are not installed, with the table of known sensors.
 
-Without the plugin, frames cannot be parsed. The evidence is therefore weaker than in
-`identification`. It consists of the constant bytes at the start of a data frame, the frame size,
-and the UDP ports. They are often the same for several sensors of a vendor, but sufficient to name
-the distribution to install.
+Without the plugin, frames cannot be parsed. The sensor is recognized by the constant bytes at the
+start of a data frame, the frame size, and the UDP ports. These values may be the same for
+several sensors of a vendor, but the sensors of a vendor are in the same distribution.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ MAX_LISTED_SENSORS = 6
 
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
-    """Return the signatures of a sensor's data frames that have enough constants."""
+    """Return the signatures of data frames that have `MIN_SYNC_BYTES` constant bytes."""
     signatures = []
     for name in sensor.main_frames:
         engine = get_codec(sensor.frames[name])
@@ -51,7 +50,11 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
 
 
 def _format_sync(constant: dict[int, int]) -> str:
-    """Return constant bytes, given by offset, in hexadecimal; other bytes are ".."."""
+    """Return the bytes at the start of a frame as text, such as "54 .. 2c".
+
+    Args:
+        constant: offset -> value of each constant byte. Bytes that are not constant become "..".
+    """
     length = max(constant, default=-1) + 1
     return " ".join(
         f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)
@@ -145,7 +148,7 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Add the distributions to install to an error about unknown bytes, if they are known."""
+    """Add a note with the distributions to install to an error about unknown bytes."""
     missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))
