@@ -6,7 +6,7 @@ and warnings. Modules in reading order:
 * `device`: `Device`, the public class.
 * `packet_reader`: makes packets of one frame type, and scans, from arriving frames.
 * `device_input`: the interface of an input, and the input of a file.
-* `first_frames`: finds frames of a file that are applied from its first packet on.
+* `first_frames`: finds frames of a file that are needed to decode its first packets.
 * `file_scans`: reads the scans of a file, also from the middle and in another process.
 * `sender_filter`: selects the datagrams of one sender.
 * `live_input`: the input of a live source, decoded every few milliseconds.

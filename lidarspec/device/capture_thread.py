@@ -116,8 +116,8 @@ class BoundedQueue:
 
         Args:
             timeout: maximum time to wait, in seconds.
-            until: a time of `time.monotonic`. Before this time, the method does not return, so that
-                more events are returned together. It still waits for at most `timeout`.
+            until: a time of `time.monotonic`. Events are collected until this time, but not longer
+                than `timeout`.
             chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)

@@ -193,8 +193,8 @@ class Device(ClosingContext):
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read only once: all iterators share one position in it. After `latest`, a new
-        iterator begins with the batch that contains the end of the returned scan.
+        A file is read only once: all iterators share one position in it. An iterator that is made
+        after a call of `latest` begins with the batch that completed the returned scan.
 
         Args:
             frame: the name of a frame type; by default the data frame.
@@ -267,8 +267,8 @@ class Device(ClosingContext):
         ``complete=False``. A scan whose end does not arrive is yielded after twice the duration of
         the sensor's longest revolution, and `warnings` reports it.
 
-        A file is read only once: all iterators share one position in it. After `latest`, a new
-        iterator begins with the batch that contains the end of the returned scan.
+        A file is read only once: all iterators share one position in it. An iterator that is made
+        after a call of `latest` begins with the batch that completed the returned scan.
 
         Args:
             wait: if no scan arrives for this number of seconds, yield None.
@@ -378,11 +378,13 @@ class Device(ClosingContext):
     def make_selector(
         self, select: Selection, skip: Callable[[int], bool] | None = None
     ) -> ScanSelector:
-        """Return a selector for the scans of this device, whose warnings `warnings` includes.
+        """Return a selector for the scans of this device.
+
+        The attribute `warnings` of the device includes the warnings of the selector.
 
         Args:
             select: the scans to select.
-            skip: the argument of `ScanSelector`.
+            skip: a function that skips data that arrived before a time; see `ScanSelector`.
         """
         self._selector = ScanSelector(select, self.source, skip)
         return self._selector
@@ -558,10 +560,10 @@ class Device(ClosingContext):
             self._latest_stream = None
 
     def _take_batch_of_latest(self) -> FrameBatch | None:
-        """Return the batch of a file with the scan that `latest` returned last, if any.
+        """Return the batch that completed the last result of `latest`, for a new iterator.
 
-        A new iterator begins with this batch. `latest` therefore forgets the scans that it has
-        found in the batch but not returned.
+        Returns None for a live source, or if `latest` was not called. All unreturned scans of the
+        batch are removed from `_unseen_scans`, because the new iterator yields them.
 
         Raises:
             SourceError: if the file has been read to its end.
@@ -580,7 +582,12 @@ class Device(ClosingContext):
     def _iter_batches(
         self, wait: float | None, ahead: FrameBatch | None = None
     ) -> Iterator[FrameBatch | None]:
-        """Yield batches until the end, and None after each `wait` seconds without one."""
+        """Yield batches until the end of the input.
+
+        Args:
+            wait: if no batch arrives for this number of seconds, yield None; None for no limit.
+            ahead: a batch to yield first.
+        """
         if ahead is not None:
             yield ahead
         while not self._input.ended:

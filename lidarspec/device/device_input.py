@@ -54,7 +54,8 @@ class FrameBatch:
 class DeviceInput(Protocol):
     """The source of a device's frames.
 
-    A method with an implementation here does what is right for a file. `LiveInput` overrides it.
+    The implementations in this class are for files. `LiveInput` overrides the methods that differ
+    for a live source.
 
     Attributes:
         is_live: whether data arrives from a live source, not from a file.
@@ -62,7 +63,7 @@ class DeviceInput(Protocol):
         stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
-        info_frames: for each name in `Sensor.info`, the last frame with this information.
+        info_frames: name in `Sensor.info` -> the last frame that contains this information.
     """
 
     is_live: bool = False
@@ -73,9 +74,9 @@ class DeviceInput(Protocol):
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
-        """Store the last frame with each piece of information that `Sensor.info` names.
+        """Store the last frame that contains the information of each name in `Sensor.info`.
 
-        A frame with optional parts is ignored if it has less information than the stored frame.
+        A frame with optional parts is not stored if it lacks information that the stored frame has.
         """
         for frames in batches:
             for role, fact in self.sensor.reported.items():
@@ -84,7 +85,7 @@ class DeviceInput(Protocol):
                         self._store_info_frame(role, fact, name, frames)
 
     def _store_info_frame(self, role: str, fact: Reported, name: str, frames: Frames) -> None:
-        """Store the last frame of a type that reports a fact, such as the serial number."""
+        """Store the last frame of one type that reports a fact, such as the serial number."""
         rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
         if fact.where is not None:
             rows = rows[find_reporting(self.sensor, fact, name, frames.select(rows))]
@@ -158,8 +159,8 @@ class DeviceInput(Protocol):
         """Send the commands that the sensor declares for opening.
 
         Raises:
-            CommandError: if an opening command fails. A missing reply is only a warning if the
-                sensor sends data, or can be read without the values in the reply.
+            CommandError: if an opening command fails. If the reply is missing, but the sensor sends
+                data or can be read without the reply, a warning is added instead.
         """
 
     def next(self, wait: float) -> FrameBatch | None:
@@ -203,7 +204,7 @@ class DeviceInput(Protocol):
         """
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that are applied from the first packet on; none for a live source."""
+        """Return the frames to use before the first packet; none for a live source."""
         return FirstFrames()
 
     def close(self) -> None:
@@ -367,10 +368,10 @@ class FileInput(DeviceInput):
         self._frame_batches = iter(())  # the old generator holds this object and the read data
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that are applied from the first packet of the file on.
+        """Return the frames to use before the first packet of the file.
 
-        This opens and reads the file a second time. It returns no frames if the sensor needs none,
-        or if the source cannot be read twice, such as standard input.
+        To find these frames, the file is opened and read a second time. The result is empty if the
+        sensor needs no such frames, or if the source cannot be read twice, such as standard input.
         """
         path = Path(str(self._source).partition("?")[0])
         if not needs_first_frames(self.sensor) or not (

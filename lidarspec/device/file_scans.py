@@ -104,12 +104,12 @@ class FileScans(ClosingContext):
         """Read the next piece of the file and count its scans.
 
         Args:
-            size: minimum size of the piece, in bytes. The piece is longer if the state of the
-                reader cannot be stored there.
+            size: minimum size of the piece, in bytes. If a bookmark cannot be made at this size,
+                the piece is longer.
 
         Returns:
-            The number of scans that begin in the piece, and a bookmark of its end; None instead of
-            the bookmark at the end of the file.
+            The number of scans that begin in the piece, and the bookmark of the next piece. At the
+            end of the file, the bookmark is None.
         """
         scan_count = 0
         end = self._offset + size
@@ -184,9 +184,9 @@ class FileScans(ClosingContext):
 
 
 def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
-    """Return the objects that do not depend on the input, by name.
+    """Return the objects to which a bookmark refers by name: name -> object.
 
-    They are the parts of the sensor, and objects that are made from the sensor alone.
+    They are the sensor, its parts, and objects that are made from the sensor alone.
     """
     constants = dict[tuple[Any, ...], Any]()
     _name_parts(sensor, (), constants, set())
@@ -197,7 +197,14 @@ def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], A
 def _name_parts(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Store a value and its parts in `names`, by the attributes and keys that lead to them."""
+    """Store a value and all its parts in `names`.
+
+    Args:
+        value: the value.
+        name: the attributes and keys that lead from the sensor to the value.
+        names: name -> object. The results are added.
+        seen: the ids of all objects in `names`.
+    """
     if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return
     names[name] = value
@@ -227,7 +234,8 @@ class _StatePickler(pickle.Pickler):
     def persistent_id(self, obj: Any) -> Any:
         """Return the name of a constant; None for an object that has to be pickled.
 
-        A copy of the sensor with another clock is identified by the name of that clock.
+        If the object is a copy of the sensor with another clock, the result contains the name of
+        the clock.
         """
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Sensor):
@@ -235,10 +243,10 @@ class _StatePickler(pickle.Pickler):
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Return how to pickle a table, packets or a `struct.Struct`.
+        """Return the function and the arguments that restore a table or packets.
 
         A table is pickled as the bytes of its frames. Packets are pickled with the frames in
-        `state` that they need, and without all others.
+        `state` that they refer to. A `struct.Struct` is pickled as its format.
         """
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
@@ -280,11 +288,14 @@ def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:
-    """Return a table without the frames that no packet uses, and the new rows of the packets.
+    """Remove the frames that no packet uses from a table.
 
     Args:
-        table: frames of another type.
-        which: for each packet the row of its frame in `table`; -1 if it has none.
+        table: frames that packets refer to.
+        which: for each packet, the row of its frame in `table`; -1 for a packet without a frame.
+
+    Returns:
+        The table with the remaining frames, and `which` for this table.
     """
     rows = np.unique(which[which >= 0])
     if table is None or not len(rows):

@@ -1,7 +1,8 @@
-"""Search a file for frames that packets need, but that may arrive after the first packets.
+"""Search a file for frames that are needed to decode its first packets.
 
-They are the first frame of each type in `Sensor.state`, such as a calibration, and the first frame
-that provides a date for the clock. They are applied from the first packet of the file on.
+Some packets can be decoded only with a frame of another type, such as a calibration
+(`Sensor.state`) or a frame with the date. In a file, this frame may come after the first packets.
+The first such frame is therefore used as if it were at the start of the file.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ REFERENCE_SEARCH_BYTES = 64 << 20
 
 @dataclass
 class FirstFrames:
-    """The frames that are applied from the first packet of a file on.
+    """The frames that are used as if they were at the start of a file.
 
     Attributes:
-        state: the first frame of each type that `points` depends on, by name.
-        reference: the first frame that provides a date for the clock; None if no frame does.
+        state: frame type in `Sensor.state` -> the first frame of this type.
+        reference: the first date for the clock; None if the file has no date.
     """
 
     state: dict[str, bytes] = field(default_factory=dict)
@@ -36,12 +37,12 @@ class FirstFrames:
 
 
 def needs_first_frames(sensor: Sensor) -> bool:
-    """Return whether packets of a sensor need frames that may arrive after them."""
+    """Return whether the packets of a sensor are decoded with frames of other types."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
 def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
-    """Return the frames that are applied from the first packet of a file on.
+    """Return the frames to use before the first packet of a file.
 
     Args:
         sensor: the sensor that sent the frames.
@@ -80,7 +81,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
 def _find_reference(
     sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
-    """Return the first valid date for the clock in some frames, else None."""
+    """Return the first valid date in some frames; None if there is no valid date."""
     assert sensor.clock is not None
     table = get_codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:

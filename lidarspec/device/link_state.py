@@ -56,7 +56,11 @@ class LinkState:
         self.has_data = False
 
     def record_senders(self, *, is_sensor: bool) -> None:
-        """Record that datagrams arrived, from the sensor or only from other senders."""
+        """Record that datagrams arrived.
+
+        Args:
+            is_sensor: whether at least one of the datagrams is from the sensor.
+        """
         if is_sensor:
             self._only_others_since = None
         elif self._only_others_since is None:
@@ -144,9 +148,9 @@ class LinkState:
         return self._decoder.stats.bytes_in - self._framed_bytes
 
     def _is_frameless(self) -> bool:
-        """Return whether bytes have arrived for a long time without a frame.
+        """Return whether no frame was found for a long time although bytes have arrived.
 
-        False until more bytes than the longest frame have arrived.
+        The number of bytes must be larger than the longest frame.
         """
         if self._frameless_since is None:
             return False

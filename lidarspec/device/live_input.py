@@ -295,7 +295,11 @@ class LiveInput(DeviceInput):
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _set_own_endpoint(self, name: str) -> None:
-        """Tell the session this computer's address and port, if a command contains them."""
+        """Pass this computer's address and port to the session, if a command needs them.
+
+        Args:
+            name: the name of the command.
+        """
         command = self.sensor.commands.get(name)
         if command is not None and command.has_own_port:
             self._session.port = self._captures["data"].transport.own_port
@@ -390,10 +394,11 @@ class LiveInput(DeviceInput):
     def _pump(self, wait: float) -> None:
         """Decode data that arrives within `wait` seconds, and run the session.
 
-        Usually, the wait ends at the deadline of the current request. If this deadline passed more
-        than `MAX_PUMP_S` ago, this computer is overloaded and the reply may be in data that was
-        not read yet. The method then waits for the full time before the request times out.
+        The wait ends at the deadline of the session, if the deadline is earlier.
         """
+        # If the deadline passed more than `MAX_PUMP_S` ago, this computer is overloaded, and the
+        # reply may be in data that was not read yet. Wait for the full time before the request
+        # times out.
         with self._session_lock:
             deadline = self._session.deadline
         if deadline is None:
@@ -475,8 +480,8 @@ class LiveInput(DeviceInput):
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
 
-        The chunks may show that another sender is the sensor. Incomplete frames of the previous
-        sender are then discarded.
+        If another sender is selected as the sensor, incomplete frames of the previous sender are
+        discarded.
         """
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
@@ -546,7 +551,10 @@ class LiveInput(DeviceInput):
                 self._failure = error
 
     def _request_port_again(self) -> None:
-        """Repeat the opening commands, whose reply contains the port, after a pause."""
+        """Send the opening commands again, because a reply contains the port of the data.
+
+        Does nothing until `REPEAT_PAUSE_S` have passed since the last repetition.
+        """
         if time.monotonic() >= self._repeat_due_s:
             self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
             self._restart_sensor()

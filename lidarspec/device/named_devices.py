@@ -98,7 +98,10 @@ class NamedDevice:
         return configured
 
     def find_refusal(self) -> UsageError | None:
-        """Return the error if an untrusted file has this device; None if it is allowed."""
+        """Return the error for a device that only a trusted file may declare.
+
+        Returns None if the device is allowed.
+        """
         if self.is_trusted:
             return None
         folder = Path(self.file).parent

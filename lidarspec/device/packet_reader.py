@@ -1,6 +1,7 @@
 """Make packets of one type, and scans, from batches of frames.
 
-A `PacketReader` keeps the state that a batch of packets needs from the batches before it.
+The batches of a source are passed to one `PacketReader` in order. Decoding a packet may require
+state from earlier packets, which the reader stores.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class PacketReader:
         frame: the frame type; None for the data frame. If the sensor has several data frame types,
             None selects the type that arrives first.
         decoder: the decoder that finds the frames.
-        first: the frames that are used as if they had arrived before the first packet.
+        first: frames to use before the first packet.
 
     Attributes:
         last: the packets of the last batch.

@@ -123,12 +123,12 @@ class SenderFilter(SenderCheck):
         return self._owner
 
     def configure(self, sensor: Sensor) -> None:
-        """Continue with the configured sensor."""
+        """Replace the sensor by the configured sensor."""
         self._sensor = sensor
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Treat a sender as the sensor, unless the sensor's address is already certain."""
+        """Store the sender that is the sensor, if the sensor was not identified before."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
@@ -167,11 +167,10 @@ class SenderFilter(SenderCheck):
     def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
         """Return the frames from the ports of the sensor, and count the other frames.
 
-        Frames from other ports at the same address are those of other sensors.
+        Another port at the same address may belong to another sensor.
 
         Args:
-            sent: the type and the sender of each frame. If one sender sent all frames, each type is
-                listed once.
+            sent: the result of `frame_senders` for the frames.
             frames: frames from the address of the sensor.
         """
         count_before = len(self._other_senders)
@@ -222,7 +221,7 @@ class SenderFilter(SenderCheck):
         return sender == self._owner
 
     def _may_be_same_device(self, sender: Sender, owner: Sender) -> bool:
-        """Return whether a sender may be the sensor at another port."""
+        """Return whether `sender` and `owner` may be ports of the same device."""
         return sender[0] == owner[0] and sender not in self._other_senders
 
     def _find_frame_types(self, sender: Sender, chunk: Chunk) -> set[str]:
@@ -236,9 +235,9 @@ class SenderFilter(SenderCheck):
         return {item.frame for item in decoder.feed(chunk.data)}
 
     def _update_port(self, name: str, sender: Sender) -> None:
-        """Store `sender` as the current port of a frame type.
+        """Store the port from which the sensor currently sends a frame type.
 
-        If other ports send this type at the same time, they are added to `_other_senders`.
+        Ports that send the same type at the same time are added to `_other_senders`.
         """
         concurrent_port = self._find_concurrent_port(name, sender)
         if concurrent_port is not None:
@@ -255,14 +254,14 @@ class SenderFilter(SenderCheck):
 
 
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
-    """Return the type and the sender of each frame found in datagrams.
+    """Return (frame type, sender) of each frame in some datagrams.
 
-    If all datagrams have the same sender, each type is listed once. If a datagram has no known
-    sender, the result is empty.
+    If all datagrams have one sender, the result has one item for each frame type instead of each
+    frame. If the sender of a datagram is unknown, the result is empty.
 
     Args:
         chunks: the datagrams.
-        frames: the frames in them.
+        frames: the frames in the datagrams.
         end: the end of the last datagram, in bytes since the start of the input.
     """
     senders = {chunk.sender for chunk in chunks}

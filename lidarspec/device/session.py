@@ -150,10 +150,11 @@ class ExpectedReply:
     """The frames that can be the reply to one request.
 
     Attributes:
-        tables: the fields of each frame type that can be the reply: frame type -> path -> field.
+        tables: the frame types of the possible replies, with their fields: frame type -> path ->
+            field.
         values: the values that the reply must have: path -> value. Paths that a frame type does
             not have are ignored.
-        refusal: the frame type with which the sensor refuses; None if there is no such type.
+        refusal: the frame type of a refusal; None if the sensor sends no refusals.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
@@ -185,7 +186,7 @@ class ExpectedReply:
         ]
 
     def overlaps(self, other: ExpectedReply) -> bool:
-        """Return whether one frame could be this reply as well as another expected reply."""
+        """Return whether a frame could match both this and another expected reply."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -229,8 +230,9 @@ class _PendingCommand:
     """A command in progress.
 
     Attributes:
-        data: the bytes of the command. Until it is sent, values that are not known yet are missing.
-        arguments: its arguments, and the values that were filled in when it was requested.
+        data: the bytes of the command. Before the command is sent, the values that an earlier reply
+            provides are missing.
+        arguments: the arguments, and the values that were filled in when the command was requested.
         timeout: time from the first sending until the command fails, ns.
         sent: the times of all sendings, ns.
         wrong: a description of the last frame that had the type of the reply, but wrong values.
@@ -260,7 +262,7 @@ class _PendingCommand:
 
     @property
     def max_reply_delay(self) -> int:
-        """The maximum time from a sending of the command to a late reply, ns."""
+        """The maximum time between sending the command and a late reply, ns."""
         return 2 * max(self.timeout, _to_ns(self.command.timeout))
 
 
@@ -324,8 +326,8 @@ class Session:
     """The commands of one sensor on its links.
 
     Pass every arriving frame to `receive`, including the frames that `Decoder.idle` returns when
-    the link falls silent. If a device stops sending in the middle of a data frame, the decoder
-    takes the reply for the rest of this frame until `idle` is called.
+    the link falls silent. If a device stops in the middle of a data frame, the decoder finds the
+    reply after the incomplete frame only when `idle` is called.
 
     Attributes:
         sensor: the sensor.
@@ -468,9 +470,9 @@ class Session:
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Fail all requests and stop all heartbeats, because no reply can arrive.
+        """Fail all requests and stop all heartbeats.
 
-        Late replies to commands that were sent are still recognised.
+        If a reply arrives later, it is still recognised as late.
 
         Args:
             reason: the text of the error.
@@ -537,7 +539,7 @@ class Session:
         return get_codec(self.sensor.frames[frame]).schema.fields
 
     def _advance(self, link: str, now: int) -> None:
-        """Send queued requests, up to the first that waits for a reply or is held back."""
+        """Send the queued requests of a link, until a request has to wait."""
         line = self._lines[link]
         line.late_replies = [late for late in line.late_replies if late.until > now]
         while (ready := line.next_sending()) is not None and now >= ready:
@@ -639,12 +641,15 @@ class Session:
     def _free_link(
         self, line: _LinkQueue, request: _PendingCommand, *, reply_count: int, since: int
     ) -> None:
-        """Free the link of the current request for the next request.
+        """End the current request of a link, so that the next request can be sent.
 
-        A request may have been sent several times. Replies to it may still arrive late.
+        If the command was sent more often than replies have arrived, the missing replies are added
+        to `late_replies`.
 
         Args:
-            reply_count: number of replies that arrived, 0 or 1.
+            line: the queue of the link.
+            request: the current request.
+            reply_count: number of replies that have arrived, 0 or 1.
             since: the time at which the settling time of the device begins, ns.
         """
         line.current = None

@@ -109,7 +109,7 @@ class LimitedRecorder:
         return (self.last - self.first) / 1e9
 
     def contains(self, chunk: Chunk) -> bool:
-        """Return whether a received chunk is in the file."""
+        """Return whether a received chunk was written to the file."""
         if chunk.at is None:
             return True  # the time limit does not apply
         return self.last is not None and chunk.at <= self.last
@@ -246,22 +246,22 @@ class SourceRecording:
                     self._count_remaining(self.device, log)
 
     def _take_new_warnings(self, warnings: Iterable[str]) -> list[str]:
-        """Return the warnings that were not among those of the previous call."""
+        """Return the warnings that were not passed to the previous call."""
         by_text = {_NUMBERS.sub("", warning): warning for warning in warnings}
         new_warnings = [warning for text, warning in by_text.items() if text not in self._reported]
         self._reported = set(by_text)
         return new_warnings
 
     def _count_remaining(self, device: Device, log: LimitedRecorder) -> None:
-        """Count the packets that arrived before the end, but are not decoded yet."""
+        """Count the packets that are in the file, but were not decoded yet."""
         while self._count_next(device, log):
             pass
 
     def _count_next(self, device: Device, log: LimitedRecorder) -> bool:
-        """Count the next packets that are in the file.
+        """Count the next packets of the device that were written to the file.
 
         Returns:
-            False if no packet arrived in time, or if some arrived after the end.
+            False if there are no more packets in the file.
         """
         arrived = _read_arrival_times(device)
         if len(arrived) == 0:
@@ -378,8 +378,7 @@ class SourceRecording:
         """Update `elapsed`, and return whether a limit is reached.
 
         Args:
-            is_timed: whether the recording ends at the time limit; if not, only at the maximum
-                count.
+            is_timed: whether the time limit applies, in addition to the maximum count.
 
         Raises:
             SourceError: if the recorder has failed.
