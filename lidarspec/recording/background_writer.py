@@ -236,7 +236,7 @@ class BackgroundWriter:
     def wait_for_room(self) -> None:
         """Wait until there is memory for more records.
 
-        Readers of sources that can wait, such as files, call this regularly.
+        A caller that records a source that can wait, such as a file, calls this regularly.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
@@ -254,10 +254,10 @@ class BackgroundWriter:
         self._raise_failure()
 
     def discard(self) -> bool:
-        """Remove a closed file that contains no records.
+        """Remove the closed file, which contains no records.
 
         Returns:
-            False if the path still has a file, because an older file was kept.
+            False if the path still has an older file, which was not replaced.
         """
         if not self._file.replaces:
             with contextlib.suppress(OSError):
@@ -288,7 +288,8 @@ class BackgroundWriter:
 
         Args:
             record: the bytes of the record.
-            size: number of data bytes in the record; None if it is not counted as a record.
+            size: number of data bytes to add to `bytes`; None for a header or event, which is not
+                counted.
         """
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > MAX_WAITING_BYTES:

@@ -300,17 +300,16 @@ class Recording(ClosingContext):
         return self._records
 
     def seek(self, at: int) -> bool:
-        """Seek to shortly before the first record that was received at or after a time.
+        """Skip records that were received before a time.
 
-        The position is at most a few blocks before this record. Damage in skipped data is not
+        The last few blocks of earlier records are not skipped. Damage in skipped data is not
         counted.
 
         Args:
             at: ns since 1970.
 
         Returns:
-            False if the position is unchanged, because the record is near or behind, arrival times
-            are unknown, or the file is a pipe.
+            Whether records were skipped; always False for a pipe or without arrival times.
         """
         here = low = self.offset
         if not self._file.seekable():

@@ -24,7 +24,8 @@ class RecordingSwitch:
         folder: the folder of the files.
 
     Attributes:
-        trouble: description of the error when the recorder was last switched; "" for no error.
+        trouble: a message if the last call could not start or end a file, or if the file that it
+            ended was empty; else "".
         written: (path, number of data bytes) of each closed file.
     """
 

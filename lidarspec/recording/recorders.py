@@ -364,7 +364,9 @@ def _make_event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """Return the length of the record, or of the magic bytes, at an offset.
+    """Return the length of the record at an offset.
+
+    The magic bytes at the start of a recording count as a record.
 
     Args:
         data: a piece of a recording.
