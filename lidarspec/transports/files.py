@@ -89,7 +89,8 @@ class RecordingTransport(Transport):
         """Return the sensor of the recording, configured with the recorded options.
 
         Raises:
-            UsageError: if the recording names no sensor, or if an option must be passed again.
+            UsageError: if the recording names no sensor, or if an option cannot be restored and the
+                caller must pass it.
             UnknownSensor: if the sensor is not installed.
         """
         try:

@@ -48,8 +48,8 @@ class HostClock:
     def now_and_wall(self) -> tuple[int, int]:
         """Return the times of this clock and of the wall clock, ns since 1970.
 
-        Both are read at the same moment. If the thread is suspended between the readings, they are
-        repeated.
+        Both clocks are read at almost the same moment. If the thread is suspended between the two
+        readings, both clocks are read again.
         """
         closest: tuple[int, int, int] | None = None
         for _ in range(_READ_ATTEMPTS):
@@ -64,9 +64,9 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return the lead of the wall clock over this clock, in ns, if the wall clock was set.
+        """Return wall clock minus this clock in ns, if the wall clock was set.
 
-        Returns None if the lead has changed by at most 50 ms since the last result.
+        Returns None if the difference has changed by at most 50 ms since it was last returned.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns

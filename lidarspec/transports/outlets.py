@@ -360,10 +360,12 @@ class UdpLine(OutletLine):
         return False
 
     def _may_succeed_later(self, error: OSError) -> bool:
-        """Return whether sending again may succeed, after a pause if one is needed.
+        """Return whether sending a datagram again may succeed.
+
+        If the error requires a pause before the datagram is sent again, this waits.
 
         Raises:
-            SourceError: if it cannot succeed, and the user has named the receiver.
+            SourceError: if sending again cannot succeed, and the user has named the receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
             wait_ready([], [self._sockets[0]], POLL_S)

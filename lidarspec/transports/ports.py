@@ -95,7 +95,7 @@ def is_allowed(port: str) -> bool:
 
 
 def find_group(port: str) -> str:
-    """Return the group that may open a port; "" if unknown, or if only root may."""
+    """Return the user group that may open a port; "" for no group or an unknown group."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:

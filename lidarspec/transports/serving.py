@@ -98,7 +98,7 @@ class FairLock:
                 self._wake_first()
 
     def cancel(self, stop: threading.Event) -> None:
-        """Set `stop`, and wake the thread that waits with this event."""
+        """Set `stop`, and end the waiting of the thread that called `hold` with `stop`."""
         stop.set()
         with self._lock:
             if stop in self._tickets:
@@ -322,7 +322,7 @@ class Served(ClosingContext):
             raise failures[0]
 
     def delay(self, seconds: float) -> None:
-        """Hold back all data for `seconds`, and then send it at once."""
+        """Send no data for `seconds`, and then send the delayed data all together."""
         get_now = self._clock or time.monotonic_ns
         self._call_in_thread(lambda: self.device.delay_output(seconds, get_now()))
 
@@ -401,7 +401,10 @@ class Served(ClosingContext):
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Call the queued functions, after releasing the threads that wait for earlier calls."""
+        """Call the queued functions.
+
+        The threads that wait for a function are released in the next pass of the loop.
+        """
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

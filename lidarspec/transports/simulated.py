@@ -111,7 +111,7 @@ class SimulatedTransport(LiveTransport):
 
     @property
     def own_port(self) -> int | None:
-        """The declared port of the data, although a simulated sensor needs no port."""
+        """The port that the sensor declares for its data; None if it declares none."""
         link = self.sensor.links.get("data")
         return link.ports[0] if isinstance(link, Udp) and link.ports else None
 
@@ -126,8 +126,7 @@ class SimulatedTransport(LiveTransport):
     def _next_data_ns(self) -> float:
         """Return the time at which the device sends data again, ns; inf if unknown.
 
-        It is unknown for all links other than the data link, because only reading the data link
-        advances the device.
+        The time is known only on the data link, because reading this link advances the device.
         """
         if self._name == "data":
             deadline = self.device.deadline

@@ -99,7 +99,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
 
 
 def _list_opening_commands(sensor: Sensor) -> list[str]:
-    """Return the opening commands of a sensor that do more than set control lines."""
+    """Return the opening commands of a sensor that send a frame, by name."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
 

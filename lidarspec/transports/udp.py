@@ -584,9 +584,9 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
 
 def _find_command_address(address: SourceAddress, link: Udp) -> tuple[Sender | None, bool]:
-    """Return the address for commands on the data link, and whether it is for broadcasts.
+    """Return the address for commands on the data link, and whether to broadcast them.
 
-    The address is None if it is unknown until the sensor sends data.
+    The address is None if it is unknown before the sensor has sent data.
     """
     control = address.options.get("control", "")
     host, port = SourceAddress(control, "", control).host_and_port()
