@@ -146,7 +146,7 @@ class CellGrid:
         return self.codes.shape[1], self.codes.shape[0]
 
     def write(self, row: int, column: int, text: str, ink: int = PLAIN) -> None:
-        """Write text from a cell to the right. Characters outside the picture are omitted."""
+        """Write text that begins at a cell; omit characters outside the picture."""
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
@@ -249,7 +249,7 @@ class Canvas:
     def label(
         self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False
     ) -> bool:
-        """Write text from a cell to the right, if there is space for it.
+        """Write text that begins at a cell, if there is space for the text.
 
         Args:
             over: whether the text may hide points.

@@ -64,7 +64,7 @@ class LiveFrames:
         return np.sort(arrivals[arrivals > 0])
 
     def read(self, until: float) -> None:
-        """Read batches of frames, at least one, until a time or the end of the input.
+        """Read frames until a time or the end of the input, but at least one batch.
 
         Args:
             until: a time of `time.monotonic`.

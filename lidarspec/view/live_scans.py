@@ -45,8 +45,8 @@ class LiveScans:
             possible.
         speed: the speed of a played file, relative to the recorded speed.
         select: the scans to show; None for all.
-        ahead: seconds of recorded time that one read of a played file covers; None for the amount
-            that is read fastest.
+        ahead: about this many seconds of a played file are read at a time; None for the size that
+            is read fastest.
 
     Attributes:
         speed: the speed of a played file; it may be changed.
@@ -116,7 +116,7 @@ class LiveScans:
         return self.packets.time_ns
 
     def read(self, until: float) -> None:
-        """Read batches of packets, at least one, until a time or the end of the input.
+        """Read data and show scans until a time or the end of the input.
 
         Args:
             until: a time of `time.monotonic`.
@@ -151,7 +151,10 @@ class LiveScans:
         self.stop_clock()
 
     def stop_clock(self) -> None:
-        """Pause a played file. After the pause, the next scan is shown after one interval."""
+        """Pause a played file.
+
+        The interval to the next scan begins when playing continues.
+        """
         self._due = None
 
     def _read(self) -> None:
@@ -195,11 +198,11 @@ class LiveScans:
             raise self._sieve.make_missing_error()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
-        """Change the size of reads step by step, until a read has about `ahead` seconds of data.
+        """Double or halve the number of bytes to read at a time, if necessary.
 
         Args:
             packets: the packets of the last read.
-            ahead: the duration of the data to read at a time, in seconds.
+            ahead: the intended duration of the packets of one read, in seconds.
         """
         portion = self._portion
         duration_s = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9
@@ -216,7 +219,7 @@ class LiveScans:
         return RateMeter(self.device.stats, counts_losses=self.device.sensor.counts_losses)
 
     def _select_packets(self, packets: Packets) -> Packets:
-        """Return the packets with selected times."""
+        """Return the packets whose times are in the selected range."""
         if not self._select.is_timed:
             return packets
         is_selected = self._times.select_times(self._clock.read(packets))

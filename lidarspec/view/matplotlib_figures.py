@@ -332,10 +332,14 @@ class RateSeries:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edges of the time steps, (n + 1,) seconds, and the totals in them, (3, n).
+        """Return the totals of each time step.
 
         Steps are joined so that there are at most `MAX_TIME_BINS`. The last step is omitted,
         because it is incomplete.
+
+        Returns:
+            The edges of the steps, (n + 1,) seconds, and the numbers of packets, lost packets and
+            invalid frames in each step, (3, n).
         """
         if self._last < self.width:
             raise UsageError(

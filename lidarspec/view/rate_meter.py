@@ -160,7 +160,11 @@ class RateTally:
         return self._gap_sum > 0 and self._is_by_host
 
     def _packet_rate(self, duration: float | None) -> float | None:
-        """Return packets per second, by the times of the packets if they are known."""
+        """Return the packets per second; None if unknown.
+
+        Args:
+            duration: the duration in seconds, which is used if the packets have no times.
+        """
         if self._gap_sum:
             return self._gap_count / self._gap_sum
         if duration:

@@ -353,7 +353,7 @@ def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:
 
 
 def _can_keep_scale(needed: float, kept: float) -> bool:
-    """Return whether the scale of the previous scan can be kept.
+    """Return whether the scale of the previous scan is suitable for a new scan.
 
     Args:
         needed: the distance to show for the new scan, in metres.
