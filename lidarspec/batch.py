@@ -369,7 +369,7 @@ class Manifest:
         return True
 
     def has(self, path: str) -> bool:
-        """Return whether a file was in the folder at the beginning."""
+        """Return whether the folder contained a file before this run."""
         return normalise_path(path) in self._outputs
 
     def find_finished(self, piece: FilePiece) -> Record | None:

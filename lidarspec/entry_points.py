@@ -28,7 +28,7 @@ _FOLDERS = (".dist-info", ".egg-info")
 
 
 class _NonFolderPathError(Exception):
-    """A path that only importlib.metadata can search."""
+    """Only importlib.metadata can find the installed distributions."""
 
 
 class EntryPoint(NamedTuple):
@@ -79,7 +79,10 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def _iter_distributions() -> Iterator[str]:
-    """Yield the metadata folder of each installed distribution, one for each name."""
+    """Yield the metadata folder of each installed distribution.
+
+    If several distributions have the same name, the first on `sys.path` is used.
+    """
     if any(
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path

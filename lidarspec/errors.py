@@ -92,7 +92,7 @@ class PluginError(SpecError):
         """Return the error for an exception of a plugin's function.
 
         Args:
-            what: a description of the function, such as "points of data".
+            what: the text that names the function in the message, such as "points of data".
             function: the function. If no code of the plugin was running, the first line of this
                 function is the location.
         """

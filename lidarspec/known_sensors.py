@@ -103,10 +103,12 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 
 
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
-    """Return the rows of sensors that are installed exactly as described.
+    """Return the rows of the table that are correct for the installed distributions.
 
-    Their distribution is installed in the version of the row, and their entry points have the names
-    in the row.
+    A row is correct if the version and the names in the row are those of the entry points.
+
+    Args:
+        entries: the entry points of all installed sensors.
     """
     offered: dict[tuple[str, str], dict[str, set[str]]] = {}
     for entry in entries:
@@ -136,7 +138,7 @@ def list_described_sensors() -> list[KnownSensor] | None:
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
-    """Return the row of a sensor in the table of known sensors; None if it has none.
+    """Return the row of a sensor in the table of known sensors; None without a row.
 
     Args:
         name: an id or alias, in upper or lower case, with or without hyphens.
@@ -201,8 +203,8 @@ def unknown_sensor_error(
         name: an id or alias.
         installed: the ids of the installed sensors.
         aliases: alias -> id of an installed sensor.
-        failures: the plugins that failed to load, so that their sensors are unknown: distribution
-            -> reason.
+        failures: the plugins that failed to load, one of which may contain the sensor:
+            distribution -> reason.
     """
     row = find_known_sensor(name)
     if row is not None:

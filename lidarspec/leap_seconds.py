@@ -62,7 +62,13 @@ class LeapSeconds:
         return self.tai_minus_utc(utc_s) - TAI_MINUS_GPS_S
 
     def scale_offsets(self, utc_s: float) -> dict[str, int]:
-        """Return the seconds by which "utc", "tai" and "gps" are ahead of UTC at a time."""
+        """Return the offset of each time scale from UTC in seconds, by name.
+
+        The names are "utc", "tai" and "gps".
+
+        Args:
+            utc_s: the time at which the offsets are valid, seconds since 1970.
+        """
         return {
             "utc": 0,
             "tai": self.tai_minus_utc(utc_s),
@@ -97,7 +103,10 @@ BUILT_IN = LeapSeconds((0,), (CURRENT_TAI_OFFSET_S,))
 
 @functools.lru_cache(maxsize=1)
 def read_leap_seconds() -> LeapSeconds:
-    """Return this computer's table that expires last; without a table, `BUILT_IN`."""
+    """Return the table with the latest expiry date on this computer.
+
+    Returns `BUILT_IN` if this computer has no table.
+    """
     tables = list[LeapSeconds]()
     for path in _iter_files():
         try:
@@ -119,7 +128,7 @@ def parse_leap_seconds(text: str, path: str = "") -> LeapSeconds:
 
 
 def _iter_files() -> Iterator[Path]:
-    """Yield the paths of possible tables of this computer."""
+    """Yield the paths at which this computer may have a table."""
     folders = [Path(folder) for folder in zoneinfo.TZPATH]
     package = importlib.util.find_spec("tzdata")
     if package is not None and package.origin is not None:

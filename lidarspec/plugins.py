@@ -387,9 +387,10 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _find_owner(self, name: str) -> Home | None:
-        """Return the plugin that provides the sensor with a name; None if there is none.
+        """Return the plugin that provides the sensor with a name.
 
-        There is none if no plugin claims the name, or if several claim it and none owns it.
+        Returns None if no plugin claims the name, or if several plugins claim the name and no rule
+        decides between them.
         """
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
@@ -411,9 +412,13 @@ class Registry:
         return None
 
     def _find_same_names(self, home: Home, name: str) -> set[str]:
-        """Return the id and aliases of the sensor that a plugin registers under a name.
+        """Return all names under which a plugin registers a sensor.
 
-        If the sensor is not loaded, these are the names of its entry points.
+        If the sensor is not loaded, only the names of its entry points are known.
+
+        Args:
+            home: the plugin.
+            name: one of the names.
         """
         entries = self._offered.get(home, [])
         values = {entry.value for entry in entries if entry.name == name}
@@ -967,7 +972,7 @@ def load_hooks(entry: EntryPoint) -> Registry:
     """Return a registry with the hooks of one entry point.
 
     Raises:
-        SpecError: if its plugin cannot be loaded.
+        SpecError: if the plugin cannot be loaded.
     """
     hooks = Registry()
     plugin_name = f"{entry.distribution}:{entry.module}"

@@ -172,10 +172,12 @@ def hash_ends(path: str) -> str:
 
 
 def upload(local: Path, url: str) -> None:
-    """Copy a file or folder to a store, where a file appears when it is complete.
+    """Copy a local file or folder to a store.
+
+    A single file is not visible in the store before it is complete.
 
     Raises:
-        SourceError: if that fails.
+        SourceError: if the copy fails.
     """
     system = find_file_system(url)
     with _convert_failures(url):

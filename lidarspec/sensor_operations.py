@@ -95,8 +95,8 @@ class Sensor(SensorDescription):
                 fields are then in their units, and other fields unchanged.
 
         Raises:
-            WireError: if the bytes are not such a frame. The error has the sensor, the offset, the
-                field path, and the expected and actual value.
+            WireError: if the bytes are not a valid frame of the type. The error has the sensor, the
+                offset, the field path, and the expected and actual value.
         """
         from lidarspec.frames.parse import parse
 

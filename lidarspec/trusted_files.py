@@ -67,13 +67,13 @@ def find_distrust(path: Path) -> str:
 
 
 def describe_sharing(status: os.stat_result, others: int) -> str:
-    """Return why a file is not only the user's own, such as "belongs to user 0"; else "".
+    """Return why other users can access a file, such as "belongs to user 0".
 
-    On Windows, the result is always "".
+    Returns "" if no other user can, and always on Windows.
 
     Args:
         status: the status of the file.
-        others: the permissions that other users must not have, as mode bits.
+        others: mode bits that the file must not have.
     """
     if os.name == "nt":
         return ""
