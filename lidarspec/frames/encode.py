@@ -214,9 +214,7 @@ class _Encoder:
         if parts is None:
             raise self._make_missing_error(node.axis)
         if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
-            raise self._make_value_error(
-                self._make_shown_path(node.axis), "a list of its parts", parts
-            )
+            raise self._make_value_error(self._make_shown_path(node.axis), "a list of parts", parts)
         around = {}
         for ref in node.outer:
             value = self.read(ref.path)
@@ -273,7 +271,7 @@ class _Encoder:
         if value is None:
             value = {}
         if not isinstance(value, Mapping):
-            raise self._make_value_error(shown, "a mapping of its fields", value)
+            raise self._make_value_error(shown, "a mapping of field names to values", value)
         for child in node.members:
             path = f"{node.path}.{child.name}".strip(".")
             below = f"{shown}.{child.name}".strip(".")
@@ -293,7 +291,7 @@ class _Encoder:
                 return
             raise MissingField(shown, place=self._place)
         if not isinstance(value, list | tuple | bytes):
-            raise self._make_value_error(shown, "a list of its elements", value)
+            raise self._make_value_error(shown, "a list of elements", value)
         if len(value) != count:
             raise UsageError(f"{self._place}: {shown}: expected {count} elements, got {len(value)}")
         for index, element in enumerate(value):
@@ -315,7 +313,9 @@ class _Encoder:
                 else:
                     below = f"{below}.{key}".strip(".")
                     if found is not None and not isinstance(found, Mapping):
-                        raise self._make_value_error(below, "a mapping of its fields", found)
+                        raise self._make_value_error(
+                            below, "a mapping of field names to values", found
+                        )
                     found = None if found is None else found.get(key)
             if part.bits.flag and found is not None:
                 found = int(bool(found))
@@ -326,7 +326,7 @@ class _Encoder:
         if array is None:
             return None
         if not isinstance(array, list | tuple | bytes):
-            raise self._make_value_error(shown, "a list of its elements", array)
+            raise self._make_value_error(shown, "a list of elements", array)
         if index >= len(array):
             raise MissingField(shown, place=self._place)
         return array[index]
@@ -475,9 +475,7 @@ class _Encoder:
             array = get_member(self._given, axis, None)
             if array is None:
                 return self._make_missing_error(axis)
-            return self._make_value_error(
-                self._make_shown_path(axis), "a list of its elements", array
-            )
+            return self._make_value_error(self._make_shown_path(axis), "a list of elements", array)
         return self._make_missing_error(path)
 
     def _make_missing_error(self, path: str) -> MissingField:

@@ -181,8 +181,7 @@ class Count:
     def __post_init__(self) -> None:
         if self.bits < 1 or not 0 <= self.first < 1 << self.bits:
             raise SpecError(
-                "Count(bits, first) requires at least one bit, and a first number that fits"
-                " in its bits"
+                "Count(bits, first): `bits` must be at least 1, and `first` from 0 to 2**bits - 1"
             )
 
     def at(self, index: int) -> int:
@@ -226,7 +225,8 @@ class Template:
                 raise SpecError(f"Template({self.text!r}): expected names in braces, got {name!r}")
         if not names or len(names) != len(set(names)) or not self.text.isascii():
             raise SpecError(
-                f"Template({self.text!r}) requires an ASCII text with names in braces, each once"
+                f"Template({self.text!r}): expected an ASCII text with one or more different names"
+                " in braces"
             )
 
     @functools.cached_property

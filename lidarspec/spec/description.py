@@ -194,7 +194,7 @@ class Frame:
                 )
         if self.data and self.clock is not None:
             raise SpecError(
-                "a data frame uses the sensor's clock: pass clock= to the Sensor", path="clock"
+                "a data frame cannot have its own clock: pass clock= to the Sensor", path="clock"
             )
         if self.wire is not None:
             check_wire_form(self.wire)

@@ -463,7 +463,7 @@ class Parts(layer.Partition):
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
-            raise layer.MismatchError(path, 0, "a list of its parts", repr(obj), "value")
+            raise layer.MismatchError(path, 0, "a list of parts", repr(obj), "value")
         built = layer.ParsedParts()
         next_size = self._make_size_rule(context, path)
         for index, part in enumerate(obj):
@@ -476,7 +476,7 @@ class Parts(layer.Partition):
             stream.write(data)
         if next_size(built) != 0:
             raise RangeError(
-                f"the frame announces more parts than the {len(built)} given parts", path=path
+                f"the value has {len(built)} parts, but the frame announces more parts", path=path
             )
         return built
 

@@ -234,12 +234,11 @@ class SensorDescription:
         if function is not None:
             return function
         if self.imu_frames:
-            having = f"{', '.join(self.imu_frames)} have"
+            with_imu = ", ".join(self.imu_frames)
+            reason = f"this frame type has no IMU samples; frame types with IMU samples: {with_imu}"
         else:
-            having = "no frame type of the sensor has"
-        raise SpecError(
-            f"this frame type has no IMU samples; {having} IMU samples", path=frame, sensor=self.id
-        )
+            reason = "no frame type of the sensor has IMU samples"
+        raise SpecError(reason, path=frame, sensor=self.id)
 
     def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
         """Return the path of the parts of a frame that have a `points` or `imu` function.
@@ -354,8 +353,8 @@ def _check_reported(sensor: SensorDescription, name: str) -> None:
         if opening in sensor.commands
     ):
         raise SpecError(
-            "only the data link may have port=`reported`. The port must then be in the reply to a"
-            " command in `on_open`, which must be sent over another link",
+            "only the data link may have port=`reported`. A command in `on_open` that is sent over"
+            " another link must provide the port",
             path=f"links.{name}",
             sensor=sensor.id,
         )
@@ -400,7 +399,7 @@ def _check_facts(sensor: SensorDescription) -> None:
     for name, frame in sensor.frames.items():
         if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
             raise SpecError(
-                f"{frame.endless.reason}; frames without an end can only be sent in datagrams",
+                f"{frame.endless.reason}. A frame without an end must be sent as a datagram",
                 path=f"{name}.{frame.endless.path}".strip("."),
                 sensor=sensor.id,
                 rule=frame.endless.rule,
@@ -466,7 +465,8 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
         raise SpecError("provides requires a reply", path=f"commands.{name}.provides")
     if command.needed and not any(other.provides for other in sensor.commands.values()):
         raise SpecError(
-            f"no argument is named {min(command.needed)!r}, and no command has `provides`",
+            f"the value {min(command.needed)!r} is unknown: no argument has this name, and no"
+            " command has `provides`",
             path=f"commands.{name}.values",
             sensor=sensor.id,
         )
@@ -489,7 +489,7 @@ def _check_clock(sensor: SensorDescription) -> None:
     _check_names(sensor, "clock.reference", clock.reference[:1], sensor.frames)
     if clock.wraps_at is None or callable(clock.source):
         raise SpecError(
-            "reference requires a clock made of fields, with `wraps_at`",
+            "`reference` requires a clock that consists of fields and has `wraps_at`",
             path="clock.reference",
             sensor=sensor.id,
         )
@@ -632,7 +632,7 @@ def _check_cut(sensor: SensorDescription, degrees: object) -> None:
     )
     if not has_angle:
         raise UsageError(
-            f"{sensor.id}: cut cannot be set, because its scans are not cut at an angle"
+            f"{sensor.id}: cut cannot be set, because its scans do not end at an angle"
         )
     if (
         isinstance(degrees, bool)

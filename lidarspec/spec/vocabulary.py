@@ -92,7 +92,7 @@ class AlongAxis(NDArrayOperatorsMixin):
         if array.ndim != len(axes):
             raise SpecError(
                 f"cannot combine an array of shape {array.shape} with numbers along"
-                f" {', '.join(axes)}: name its axis with along(...)"
+                f" {', '.join(axes)}: name the axis of the array with along(...)"
             )
         return AlongAxis(tuple(axes.values()), array)
 

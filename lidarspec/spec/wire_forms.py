@@ -485,11 +485,13 @@ class Tokens:
     def __post_init__(self) -> None:
         if len(self.start) != 1 or len(self.sep) != 1 or not self.end:
             raise SpecError(
-                "start and sep of tokens must each be one byte, and end at least one byte",
+                "Tokens: `start` and `sep` must be one byte each, and `end` at least one byte",
                 path="wire",
             )
         if len({self.start, self.sep, self.end[:1]}) < 3:
-            raise SpecError("start, separator and end of tokens must differ", path="wire")
+            raise SpecError(
+                "Tokens: `start`, `sep` and `end` must begin with different bytes", path="wire"
+            )
         if self.base not in (10, 16):
             raise SpecError(f"base must be 10 or 16, not {self.base}", path="wire")
 
@@ -861,8 +863,8 @@ class Echoes:
         room = self.most * self.size
         if len(characters) % room:
             raise SpecError(
-                f"the number of characters after the head must be a multiple of {room}"
-                f" ({self.most} echoes of {self.size} characters), got {len(characters)}",
+                f"expected a multiple of {room} characters after the head ({self.most} echoes of"
+                f" {self.size} characters), got {len(characters)}",
                 path="wire",
             )
         echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
@@ -907,8 +909,8 @@ class SixBits:
             or min(each.size, each.most) < 1
         ):
             raise SpecError(
-                "the mark between echoes must be one character that is not a digit; size and"
-                " most must be at least 1",
+                "the mark between echoes must be one character that is not a digit, and `size` and"
+                " `most` must be at least 1",
                 path="wire",
             )
 
@@ -1025,13 +1027,13 @@ class Lines:
         object.__setattr__(self, "head", tuple(self.head))
         if self.width < 1 or min(self.head, default=1) < 1 or not 0 <= self.bare <= len(self.head):
             raise SpecError(
-                "width and all numbers of head must be at least 1, and bare at most the count of"
-                " these numbers",
+                "`width` and the numbers in `head` must be at least 1, and `bare` must be from 0 to"
+                " the length of `head`",
                 path="wire",
             )
         if self.numbers is not None and self.numbers.echoes is not None and not self.head:
             raise SpecError(
-                "numbers with echoes require a head: pass head= to Lines",
+                "the numbers have echoes, which requires a head: pass head= to Lines",
                 path="wire",
             )
 

@@ -417,19 +417,19 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
         (Prefixed(Int8ub, GreedyRange(GreedyBytes)), "GreedyBytes has no end in a stream"),
         (
             Array(2, Aligned(4, Int8ub)),
-            "a rebuilt frame loses the padding of Aligned, unless Aligned is a named member",
+            "a rebuilt frame loses the padding of Aligned: make Aligned a named member",
         ),
         (
             Array(2, FixedSized(4, Int8ub)),
-            "FixedSized loses bytes that its content does not read, unless it is a named member",
+            "the field 'rest' / GreedyBytes, or make FixedSized a named member",
         ),
         (
             Array(2, Prefixed(Int8ub, Int16ub)),
-            "Prefixed loses bytes that its content does not read, unless it is a named member",
+            "Prefixed loses bytes that its content does not read",
         ),
         (
             Union(0, "a" / Int16ub, "b" / Int8ub),
-            "Union parses the same bytes in several ways and builds only one of them",
+            "Union parses the same bytes as several fields, but builds one field",
         ),
         (
             Prefixed(Int8ub, NullStripped(GreedyBytes)),
@@ -479,12 +479,12 @@ def test_constructs_that_print_skip_or_stop_are_refused(part: Any, instead: str)
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
         (Transformed(Int16ub, invert, 2, invert, 2), "in `points`"),
         (Array(2, CString("ascii")), "use an array of structs"),
-        (Computed(lambda found: int(found.k) * 2), "use an expression with this"),
+        (Computed(lambda found: int(found.k) * 2), "use an expression such as this"),
         (
             Array(2, Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub)))),
             "Parts(struct, count)",
         ),
-        (Array(2, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct"),
+        (Array(2, PrefixedArray(Int8ub, Int8ub)), "named members of a Struct"),
     ],
 )
 def test_unsupported_constructs_get_a_suggestion(part: Any, instead: str) -> None:

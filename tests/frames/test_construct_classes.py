@@ -481,12 +481,12 @@ PLAIN: dict[str, Case] = {
         "n" / Int8ub,
         "a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Bytes(this._.n)),
         frames="014b01 004b",
-        reason="a PrefixedArray or FocusedSeq must be a named",
+        reason="PrefixedArray and FocusedSeq must be named",
     ),
     "FocusedSeq in an array": case(
         "a" / Array(2, FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub)),
         frames="4b014b02",
-        reason="a PrefixedArray or FocusedSeq must be a named",
+        reason="PrefixedArray and FocusedSeq must be named",
     ),
     "VarInt in an array": case(
         "a" / Array(2, VarInt),
@@ -517,7 +517,9 @@ PLAIN: dict[str, Case] = {
         reason="transforms bytes",
     ),
     "Transformed by a function": case(
-        "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
+        "a" / Transformed(TWO, flip, 2, flip, 2),
+        frames="0102",
+        reason="each frame must have the same bit fields",
     ),
     "VarInt as a count": case(
         "n" / VarInt, "d" / Bytes(this.n), frames="026162 00", reason="not a number of fixed size"
@@ -601,7 +603,7 @@ def test_frames_are_found_in_datagrams_and_streams(name: str) -> None:
     packets = ours.decode(frames)
     assert len(packets) == len(frames)
     if one.is_rest:
-        with pytest.raises(SpecError, match="can only be sent in datagrams"):
+        with pytest.raises(SpecError, match="must be sent as a datagram"):
             of_links(ours, Serial(9600))
         assert len(ours.decode(b"".join(frames))) == 0
         return
@@ -753,7 +755,7 @@ def test_adapters_are_applied_in_points() -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
-    "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare one"),
+    "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare a single field"),
     "Seek": (lambda: construct.Seek(4), "outside the frame"),
     "Pointer": (lambda: construct.Pointer(1, Byte), "outside the frame"),
     "Flag": (lambda: construct.Flag, "use a BitStruct"),

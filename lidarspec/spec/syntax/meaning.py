@@ -313,7 +313,7 @@ class _Builder:
         )
         value = self.node(con.subcon, inside)
         size = tree.size(value)
-        reason = "RawCopy cannot be in an array, or contain or follow a part of unknown size"
+        reason = "RawCopy cannot be used in an array, or if its offset or size is unknown"
         unknown = tree.Untraced(f"{info.path}: {reason}", "?")
         start = None if place.offset is None else place.offset()
         end = tree.combine("+", start, size)
@@ -430,7 +430,7 @@ class _Builder:
             elif not isinstance(value, tree.Symbol):
                 reason = f"the expression has the constant value {value!r}"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
-                reason = "an expression uses a named value as a number"
+                reason = "an expression uses an Enum field as a number"
             elif fraction is not None and not may_be_fraction:
                 reason = f"the result of an expression with {fraction!r} is not always an integer"
             else:
@@ -463,7 +463,7 @@ class _Builder:
             elif isinstance(key, tree.Ref) and isinstance(odd[0], str):
                 reason = f"{key.path} has no value named {odd[0]!r}"
             else:
-                reason = f"the case {odd[0]!r}, which is not an integer"
+                reason = f"the case {odd[0]!r} is not an integer"
             path = place.info.path
             key = tree.Untraced(f"{path}: {reason}", _format_expression(con.keyfunc, path))
         if isinstance(key, tree.Untraced):
@@ -601,8 +601,8 @@ class _Builder:
             return tree.Opaque(place.name, place.info, kind, _OPAQUE_REASONS[kind], (element,))
         if not isinstance(size, int) or not size:
             reason = (
-                "the number of elements is unknown, because they differ in size: use"
-                " Parts(element, within=...)"
+                "the number of elements is unknown, because the elements differ in size:"
+                " use Parts(element, within=...)"
             )
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.bytes_left, size), element)
@@ -759,7 +759,8 @@ class _Builder:
                 return tree.Check(place.name, info.path, info.axes, condition)
             if asked:
                 reason = (
-                    f"{info.path}: the condition uses {asked[0].path} of another array or frame"
+                    f"{info.path}: the condition uses {asked[0].path}, which is in another array or"
+                    " frame"
                 )
             else:
                 reason = f"{info.path}: the value of the condition may exceed 64 bits"
@@ -779,7 +780,7 @@ class _Builder:
                 place.name,
                 place.info,
                 type(con).__name__,
-                "a checksum around a part that is not a struct",
+                "Checksummed must contain a Struct",
                 (body,),
             )
         prefix = f"{place.info.path}." if place.info.path else ""
@@ -891,8 +892,8 @@ class _Builder:
             fields = None
         if fields is None:
             reason = (
-                "a bit block contains values that are not plain bits: declare the bits, and"
-                " convert them in `points`"
+                "each frame must have the same bit fields, which must be integers: declare the"
+                " bits, and convert them in `points`"
             )
             return tree.Opaque(
                 place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True
@@ -1119,8 +1120,8 @@ _OPAQUE_REASONS = {
         " or plausible=lambda f: ..."
     ),
     "Computed": (
-        "a Python function calculates the value from other fields: use an expression with this,"
-        " such as this.a * 2 + 1"
+        "a Python function calculates the value from other fields: use an expression such as"
+        " this.a * 2 + 1"
     ),
     "Peek": "Peek reads a part without a fixed size: declare the bytes of the part as a field",
     "Tell": "Tell is used in Parts: use SizeOf for the length of a part",
@@ -1129,9 +1130,9 @@ _OPAQUE_REASONS = {
     "VarInt": _VARIABLE_REASON.format("VarInt"),
     "ZigZag": _VARIABLE_REASON.format("ZigZag"),
     "FocusedSeq": (
-        "a PrefixedArray or FocusedSeq must be a named member of a Struct:"
-        " Struct('points' / PrefixedArray(...)). Its parts, except the value, must have a fixed"
-        " size. Only the count of an array may use fields"
+        "PrefixedArray and FocusedSeq must be named members of a Struct, as in"
+        " Struct('points' / PrefixedArray(...)). Parts other than the value and its"
+        " count must have a fixed size, and must not depend on other parts"
     ),
     "Prefixed": "Prefixed must be a named member of a Struct: Struct('part' / Prefixed(...))",
     "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",
@@ -1141,7 +1142,7 @@ _OPAQUE_REASONS = {
     "NullTerminated": (
         "the fields after a text with a terminator have no fixed offset: use Bytes(n) for the text"
     ),
-    "Terminated": "Terminated expects the end of the datagram: leave it out",
+    "Terminated": "Terminated expects the end of the datagram: remove Terminated",
     "RepeatUntil": (
         "the fields after RepeatUntil have no fixed offset: use Array with a count, or Parts"
     ),

@@ -43,8 +43,8 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Union: (
         "LS109",
         (
-            "Union parses the same bytes in several ways and builds only one of them: declare"
-            " one of them"
+            "Union parses the same bytes as several fields, but builds one field: declare a"
+            " single field"
         ),
     ),
     construct.Padded: (
@@ -54,15 +54,18 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Aligned: (
         "LS106",
         (
-            "a rebuilt frame loses the padding of Aligned, unless Aligned is a named member of a"
-            " Struct: Struct('part' / Aligned(4, ...))"
+            "a rebuilt frame loses the padding of Aligned: make Aligned a named member of a Struct,"
+            " as in Struct('part' / Aligned(4, ...))"
         ),
     ),
     construct.Slicing: (
         "LS106",
         "Slicing loses elements of its array: use the Array without Slicing",
     ),
-    construct.Indexing: ("LS106", "Indexing keeps one element and loses the others: use the Array"),
+    construct.Indexing: (
+        "LS106",
+        "Indexing loses elements of its array: use the Array without Indexing",
+    ),
     construct.Pointer: (
         "LS112",
         "Pointer reads outside the frame: declare fields in the order of the wire",
@@ -161,7 +164,7 @@ def _check_ends(
     below = children(con)
     endless: SpecError | None = None
     if con is construct.Terminated:
-        reason = "Terminated expects the end of a stream: leave it out"
+        reason = "Terminated expects the end of a stream: remove Terminated"
         endless = SpecError(reason, path=path, rule="LS111")
         if not is_last:
             raise endless
@@ -194,10 +197,10 @@ def _check_ends(
         if isinstance(con, BoundedPart | construct.NullTerminated):
             named = ""
         else:
-            named = ", unless it is a named member of a Struct"
+            named = f", or make {name} a named member of a Struct"
         reason = (
-            f"{name} loses bytes that its content does not read{named}: end the content with a"
-            " field for them, 'rest' / GreedyBytes"
+            f"{name} loses bytes that its content does not read: end the content with the field"
+            f" 'rest' / GreedyBytes{named}"
         )
         raise SpecError(reason, path=path, rule="LS106")
     return endless
@@ -292,8 +295,8 @@ def _check_measures(
     )
     if is_number and measures_by_path.setdefault(path, measure) != measure:
         raise SpecError(
-            "the branches have different scales or units: give the field another name in each"
-            " branch",
+            "the branches have different scales or units: give the field a different name in"
+            " each branch",
             path=path,
         )
     for child in children(con):

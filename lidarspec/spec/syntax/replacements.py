@@ -121,7 +121,7 @@ class MeasuredStruct(Struct):  # type: ignore[misc]
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         obj = {} if obj is None else obj
         if not isinstance(obj, dict):
-            raise MismatchError(path, 0, "a mapping of its fields", repr(obj), "value")
+            raise MismatchError(path, 0, "a mapping of field names to values", repr(obj), "value")
         for con in self.subcons:
             if not con.flagbuildnone and con.name not in obj:
                 raise MismatchError(f"{path} -> {con.name}", 0, "a value", "none", "missing")
@@ -194,7 +194,7 @@ class IndexedArray(Array):  # type: ignore[misc]
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
         if not isinstance(obj, list | tuple | bytes):
-            raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
+            raise MismatchError(path, 0, "a list of elements", repr(obj), "value")
         if len(obj) != count:
             raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
         return _build_elements(self, obj, stream, context, path)
@@ -223,7 +223,7 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
-            raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
+            raise MismatchError(path, 0, "a list of elements", repr(obj), "value")
         return _build_elements(self, obj, stream, context, path)
 
 
