@@ -180,7 +180,7 @@ class PointCloud:
             ValueError: with ``copy=False``, since x, y and z are separate columns.
         """
         if copy is False:
-            raise ValueError("x, y and z of a PointCloud are separate columns, so xyz is a copy")
+            raise ValueError("xyz must be copied, because x, y and z are separate columns")
         if dtype is None:
             return self.xyz
         return self.xyz.astype(dtype, copy=False)
@@ -223,10 +223,10 @@ class PointCloud:
             if wrong[0] < columns:
                 reason = f"occurs {int(counts[numbers == wrong[0]][0])} times"
             else:
-                reason = f"does not fit into {columns} columns"
+                reason = f"is not below {columns}"
             raise UsageError(
-                f"column {wrong[0]} {reason}: pass only the points of one revolution, and the"
-                " number of columns of a revolution"
+                f"the column number {wrong[0]} {reason}: pass the points of a single revolution,"
+                " and the number of columns of a revolution"
             )
         place = np.full(columns, -1)
         place[self.column[::column_size]] = np.arange(self.shape[0])

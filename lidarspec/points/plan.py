@@ -119,7 +119,9 @@ class Plan:
         result, self.tape = graph.trace(function, sample)
         self._schema = schema = sample.table.schema
         if not isinstance(result, Polar | Cartesian):
-            raise UntraceableError(f"the function returns a {type(result).__name__}")
+            raise UntraceableError(
+                f"`points` returns a {type(result).__name__}, not Polar or Cartesian"
+            )
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
@@ -147,7 +149,7 @@ class Plan:
             is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
         ):
             raise UntraceableError(
-                f"several points share {'coordinates' if self.exact else 'a range'}"
+                f"several points share the same {'coordinates' if self.exact else 'range'}"
             )
         self.positive = list[Node]()
         named = {

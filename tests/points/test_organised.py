@@ -113,9 +113,9 @@ def test_points_without_a_grid_are_refused() -> None:
     for wrong, said in (
         (
             lambda: cloud_of(frame(0), frame(0)).organise(TURN),
-            "column 0 occurs 2 times",
+            "the column number 0 occurs 2 times",
         ),
-        (lambda: cloud.organise(20), "column 20 does not fit into 20 columns"),
+        (lambda: cloud.organise(20), "the column number 20 is not below 20"),
         (
             lambda: cloud[cloud.valid].organise(TURN),
             "requires organised points with column numbers",

@@ -246,9 +246,8 @@ class Compiler:
             )
         )
         table = self._make_table(node, leaf, field_window, kind)
-        bits = (len(table) - 1).bit_length()
         return self.program.add_step(
-            f"{node.path or source.path}: table of {len(table)} by {bits} bits",
+            f"{node.path or source.path}: table of {len(table)} values",
             kind,
             lambda run, out: table.take(index(run), out=out, mode="wrap"),
             index,
@@ -380,7 +379,9 @@ class Compiler:
             np.multiply(full(execution), factor, out=out)
             np.add(before(execution), out, out=out)
 
-        return self.program.add_step(f"add {factor:.6g} times", "double", run, before, full)
+        return self.program.add_step(
+            f"add a value multiplied by {factor:.6g}", "double", run, before, full
+        )
 
     def _compile_call(self, node: Node, kind: str) -> int:
         """Compile a call that has no method of its own; NumPy evaluates it unchanged."""
