@@ -364,9 +364,8 @@ class FrameClock:
             )
         if faults.follows and not self._writer.can_follow_dates:
             raise UsageError(
-                f"the clock of {self._sensor.id} cannot count {faults.follows.upper()}, because"
-                f" it wraps at {self._writer.period_ns / 1e9:g} s, and a day is no multiple of"
-                " this period"
+                f"the clock of {self._sensor.id} cannot count {faults.follows.upper()}: it wraps"
+                f" at {self._writer.period_ns / 1e9:g} s, and a day is not a multiple of this time"
             )
 
     def check_status(self) -> None:
@@ -494,8 +493,8 @@ class StatusWriter:
         locked_states = {choice.state.locked for choice in self._choices}
         if not locked_states >= {True, False}:
             raise UsageError(
-                f"the clock of {sensor.id} cannot lose its lock: its status needs a value for a"
-                " locked clock, and one for an unlocked clock"
+                f"the clock of {sensor.id} cannot lose its lock: its status must have values for"
+                " both a locked clock and an unlocked clock"
             )
 
     def write(self, table: CompiledTable, states: NDArray[np.int64], follows: str) -> None:

@@ -68,7 +68,7 @@ class Faults:
             if not 0 <= value <= high:
                 raise OutOfRange(name, value, 0, high, place="faults")
         if self.rotor not in ("", BLOCKED):
-            raise UsageError(f"invalid rotor {self.rotor!r}: expected {BLOCKED!r} or nothing")
+            raise UsageError(f"invalid rotor {self.rotor!r}: expected {BLOCKED!r}")
 
 
 def parse_faults(options: Mapping[str, str]) -> Faults:

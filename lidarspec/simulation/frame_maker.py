@@ -157,7 +157,7 @@ class FrameMaker:
             data = self._coder.encode(struct)
             if data is None:
                 raise SpecError(
-                    f"{self.engine.frame.wire} cannot encode these values",
+                    f"the wire form {self.engine.frame.wire} cannot encode the simulated values",
                     path="simulation",
                     sensor=self._sensor,
                 )
@@ -284,7 +284,7 @@ class FrameMaker:
         given = ", ".join(
             f"{path} = {values[path]}" for path in self._layout_fields if path in values
         )
-        reason = f"with {given} the frame exceeds {self._limit} bytes (max_length)"
+        reason = f"with {given}, the frame is longer than max_length ({self._limit} bytes)"
         if left_out:
             reason = (
                 f"sweep must return {left_out[0]!r}, because the length of the frame depends on it"

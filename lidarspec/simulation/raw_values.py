@@ -33,7 +33,7 @@ class PartRows(CompiledTable):
     def __init__(self, frames: CompiledTable, path: str) -> None:
         parts = frames.schema.split_part_path(path)
         if parts is None or parts[2]:
-            raise SpecError("the frame has no such parts", path=path)
+            raise SpecError("the frame has no parts with this path", path=path)
         self.place = parts[:2]
         self.frames = frames
         own, self.which = frames.parts(*self.place)

@@ -1140,8 +1140,8 @@ def check_clock_faults(sensor: Sensor, faults: ClockFaults) -> None:
     sent = [name for name in status_frames if name in periodic]
     if not sent:
         raise UsageError(
-            f"{sensor.id} cannot lose its lock, because its status is in {status_frames[0]!r}"
-            " frames, which the simulated sensor does not send"
+            f"the clock of {sensor.id} cannot lose its lock, because the status of the clock is in"
+            f" {status_frames[0]!r} frames, which the simulated sensor does not send"
         )
     others.find_clock(sent[0]).check_status()
 

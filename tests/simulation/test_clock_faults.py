@@ -344,7 +344,7 @@ def test_a_frame_without_points_cannot_lose_a_lock_that_it_does_not_report() -> 
     states = {0: ClockState("no fix", False), 3: ClockState("fix", True)}
     for sensor, reason in (
         (make_receiver(ClockStatus("rate", states, frame="rate_reply")), "does not send"),
-        (make_receiver(ClockStatus("quality", {3: ClockState("fix", True)})), "needs a value"),
+        (make_receiver(ClockStatus("quality", {3: ClockState("fix", True)})), "must have values"),
         (RECEIVER, "does not declare the status"),
     ):
         with pytest.raises(UsageError, match=reason):
@@ -431,7 +431,7 @@ def test_a_clock_that_wraps_follows_if_its_period_is_a_share_of_a_day() -> None:
     # 1,785,283,205 s since 1970 are 29 July 2026, 00:00:05.
     position = next(vlp16.parse(item.data) for item in found if item.frame == "position")
     assert bytes(position.nmea).startswith(b"$GPRMC,000005,A,,,,,,,290726,")
-    with pytest.raises(UsageError, match="a day is no multiple of this period"):
+    with pytest.raises(UsageError, match="a day is not a multiple of this time"):
         simulate(SHAPES["shape-columns"], 1, clock=parse_clock_faults("utc"))
 
 

@@ -264,7 +264,7 @@ def test_sensors_that_cannot_be_simulated_give_a_reason() -> None:
         simulate(replace(sensor, points=lambda f: Cartesian(f.samples.distance, 0, 0)), 1)
     with pytest.raises(SpecError, match="sweep must return 'size', because the length"):
         simulate(replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0})), 1)
-    with pytest.raises(SpecError, match="with size = 500 the frame exceeds 99 bytes"):
+    with pytest.raises(SpecError, match="with size = 500, the frame is longer than max_length"):
         simulate(
             replace(sized.SENSOR, simulation=Simulation(lambda i: {"angle": 0, "size": 500})), 1
         )
