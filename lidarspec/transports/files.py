@@ -391,8 +391,8 @@ def open_file(
         log = find_log_kind(path, start)
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
-                f"{name} is {log.description}{' in a compressed file' * (file is not plain)},"
-                " which can only be read from an uncompressed file: pass its path"
+                f"{name} is {log.description}{' in a compressed file' * (file is not plain)}:"
+                " pass the path of an uncompressed file"
             )
         refuse_container(name, start)
         if log is not None and is_remote(path):

@@ -108,7 +108,7 @@ class HttpTransport(LiveTransport):
                 raise ValueError(f"the reply is longer than {self._link.largest} bytes")
             if reply.length:
                 raise ValueError(
-                    f"{reply.length} bytes of the reply are missing, or it took longer than"
+                    f"the reply lacks {reply.length} bytes, or took longer than"
                     f" {self._link.timeout:g} s"
                 )
             is_redirection = 300 <= reply.status < 400

@@ -337,7 +337,8 @@ class Served(ClosingContext):
         """
         if self._clock is None:
             raise UsageError(
-                "the time of this port cannot be advanced: open it with virtual_time=True"
+                "the port runs in real time: to advance its time, open the port with"
+                " virtual_time=True"
             )
         self._clock.advance(seconds)
         limit = time.monotonic() + _LISTENER_TIMEOUT_S

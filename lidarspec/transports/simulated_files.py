@@ -120,7 +120,7 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     if not is_started and not device.commands_received:
         return UsageError(
             f"nothing was written, because the simulated {sensor.id} sends only replies to"
-            " commands: run sim without --to, and send commands to it"
+            " commands: run sim without --to, and send commands to the simulated sensor"
         )
     recognized = ", ".join(device.commands_received) or "no command"
     missed = [
