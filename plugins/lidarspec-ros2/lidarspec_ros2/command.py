@@ -56,11 +56,12 @@ def ros2(
     options: Sequence[str],
     calibration: str | None,
 ) -> None:
-    """Publish the scans of a sensor as a ROS 2 node, until interrupted or at the end of a file.
+    """Run a ROS 2 node that publishes the scans of a sensor.
 
-    Options after --ros-args are those of ROS: parameters (-p frame_id:=front), a parameter file
-    (--params-file), names (-r __node:=front, -r scan:=front/scan). The node is configured and
-    activated when it starts. The reference lists its parameters.
+    The node runs until it is interrupted or the file ends. It is configured and activated when it
+    starts. Options after --ros-args are those of ROS: parameters (-p frame_id:=front), a parameter
+    file (--params-file), names (-r __node:=front, -r scan:=front/scan). The reference lists the
+    parameters of the node.
     """
     parameters = {
         "source": source,
@@ -91,7 +92,7 @@ def import_ros() -> None:
     except ImportError as error:
         text = f"ROS 2 not found ({error})"
         raise UsageError(
-            f"{text}: source it, such as `. /opt/ros/jazzy/setup.bash`, or run:"
+            f"{text}: run its setup script, such as `. /opt/ros/jazzy/setup.bash`, or run:"
             f" {install_command('lidarspec-ros2', extra='ros2')}"
         ) from None
 

@@ -56,7 +56,7 @@ class Parameter:
 #: Descriptions of the fields of `Mount`.
 _MOUNT_TEXTS = {
     **{
-        axis: f"Position of the sensor: metres {way} the origin of the carrier."
+        axis: f"Distance of the sensor {way} the origin of the carrier, metres."
         for axis, way in (("x", "in front of"), ("y", "left of"), ("z", "above"))
     },
     **{
@@ -98,8 +98,8 @@ PARAMETERS = (
     Parameter(
         "publish_tf",
         False,
-        "Publish the mount as the transform from parent_frame to frame_id on /tf_static, and do"
-        " not transform points.",
+        "Publish the mount as the transform from parent_frame to frame_id on /tf_static, instead"
+        " of transforming the points.",
     ),
     Parameter("parent_frame", "base_link", "The frame_id of the carrier, for publish_tf."),
     Parameter(
@@ -113,7 +113,7 @@ PARAMETERS = (
     Parameter(
         "angle_min",
         0.0,
-        "First angle of the topic scan, radians. If it equals angle_max, all angles are published.",
+        "First angle of each LaserScan, radians. If it equals angle_max, all angles are published.",
         -10,
         10,
         live=True,
@@ -121,7 +121,7 @@ PARAMETERS = (
     Parameter(
         "angle_max",
         0.0,
-        "Last angle of the topic scan, radians. If it is below angle_min, one revolution is added.",
+        "Last angle of each LaserScan, radians. If it is below angle_min, one revolution is added.",
         -10,
         10,
         live=True,
@@ -135,7 +135,7 @@ PARAMETERS = (
     Parameter(
         "range_min",
         0.0,
-        "Returns nearer than this range are dropped, metres.",
+        "Shortest range, metres. Nearer returns are dropped.",
         0,
         _MAX_RANGE_M,
         live=True,
@@ -143,7 +143,7 @@ PARAMETERS = (
     Parameter(
         "range_max",
         0.0,
-        "Returns beyond this range are dropped, metres. 0: the sensor's range limit.",
+        "Longest range, metres. Farther returns are dropped. 0: the sensor's range limit.",
         0,
         _MAX_RANGE_M,
         live=True,
@@ -151,8 +151,8 @@ PARAMETERS = (
     Parameter(
         "scan_ring",
         -1,
-        "The ring that is published on the topic scan, if the sensor has several rings. -1: no"
-        " ring is selected.",
+        "The ring that is published as LaserScan, if the sensor has several rings. -1: no ring is"
+        " selected.",
         -1,
         1 << 16,
         live=True,
@@ -160,7 +160,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_min",
         0.0,
-        "Lowest z of the points on the topic scan, metres. Only sensors with several rings use it.",
+        "Lowest z of the points in each LaserScan, metres. Ignored for sensors with a single ring.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
         live=True,
@@ -168,7 +168,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_max",
         0.0,
-        "Highest z of the points on the topic scan, metres. If it equals scan_z_min, both limits"
+        "Highest z of the points in each LaserScan, metres. If it equals scan_z_min, both limits"
         " are ignored.",
         -_MAX_OFFSET,
         _MAX_OFFSET,
@@ -203,7 +203,7 @@ PARAMETERS = (
         live=True,
     ),
     Parameter(
-        "publish_packets", False, "Publish the packets on the topic packets, as they were received."
+        "publish_packets", False, "Publish each received packet, unchanged, on the topic packets."
     ),
     Parameter(
         "qos",
@@ -213,7 +213,7 @@ PARAMETERS = (
     Parameter(
         "replay_speed",
         1.0,
-        "Speed of a file relative to the recording. 0: as fast as possible.",
+        "Replay speed of a file. 1: the recorded speed. 0: as fast as possible.",
         0,
         1000,
     ),

@@ -243,8 +243,8 @@ class Topics:
         self._max_cloud_bytes = None
         self._node.get_logger().warning(
             f"clouds of {format_megabytes(size)} may be lost, because the shared memory was made"
-            f" for clouds of up to {format_megabytes(limit)}; name the sensor when the node"
-            " starts, or set qos:=reliable"
+            f" for clouds of up to {format_megabytes(limit)}; set the parameter sensor when the"
+            " node starts, or set qos:=reliable"
         )
 
 
