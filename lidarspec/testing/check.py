@@ -153,8 +153,8 @@ def _find_folder_target(folder: Path) -> CheckTarget:
     ]
     if elsewhere:
         raise SourceError(
-            f"the installed {name} is not the one in {folder}: its module is {elsewhere[0]};"
-            f" pip install -e {folder}"
+            f"the installed {name} contains the module {elsewhere[0]}, which is not in {folder}:"
+            f" run pip install -e {folder}"
         )
     return _find_distribution_target(entries)
 
@@ -223,7 +223,7 @@ def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
         if plugin.rule == "LS005" and plugin.failed_sensor in names
     ]
     return [
-        Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point)
+        Finding("LS005", f"{plugin.distribution}: {plugin.error}", plugin.entry_point)
         for plugin in refused
     ]
 
@@ -233,7 +233,7 @@ def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
     return [
         Finding(
             "LS005",
-            f"the installed {plugin.distribution} has the same id ({plugin.entry_point})",
+            f"the installed {plugin.distribution} has a sensor with this id ({plugin.entry_point})",
             "",
             sensor.id,
         )
@@ -683,7 +683,7 @@ def _iter_reference_facts(subject: SensorUnderTest) -> Iterator[tuple[str, str]]
     if missing:
         yield (
             "vectors",
-            f"{missing}; vectors with points in two quadrants would verify these values",
+            f"{missing}; to verify these values, add vectors with points in two quadrants",
         )
     yield (
         "vendor_axes",
@@ -706,9 +706,7 @@ def _make_report(
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))
     if not sensor.frames:
-        report.skipped["all properties"] = (
-            "the sensor has no frames until it is configured with its file"
-        )
+        report.skipped["all properties"] = "the sensor has no frames without its configuration file"
         return report
     watch(f"{sensor.id}: declaration", 0)
     report.findings += check_declaration(subject)

@@ -192,9 +192,9 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
             if name in subject.sensor.simulation.answers:
                 raise
             cause = f"{error.path}: {error.reason}".removeprefix(": ")
-            what = f"the reply can only be simulated with answers= of the Simulation: {cause}"
+            what = f"the reply cannot be simulated without answers= in the Simulation: {cause}"
             raise ViolationError("LS604", what, f"commands.{name}") from error
-        require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
+        require(reply.confirmed, "LS604", "the simulated sensor sends no reply", f"commands.{name}")
         _check_learned_options(subject, name, reply)
         return
     decides = callable(subject.sensor.simulation.answers.get(name))

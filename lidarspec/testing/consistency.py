@@ -177,11 +177,11 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
             continue
         wrong = np.abs(_wrap_to_pi(moved - sense * shift * radians))
         worst = float(wrong.max(initial=0))
-        turn = f"{' and '.join(angles)} turned by {shift:g} {info.unit}"
+        turn = f"a turn of {' and '.join(angles)} by {shift:g} {info.unit}"
         require(
             worst <= MAX_BACK_STEP_RAD,
             "LS504",
-            f"{turn}: the direction of a point differs from the expected direction by"
+            f"after {turn}, the direction of a point differs from the expected direction by"
             f" {np.rad2deg(worst):.1f} degrees",
             f"{name}.points",
         )

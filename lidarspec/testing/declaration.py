@@ -108,9 +108,9 @@ def _check_sensor(sensor: Sensor) -> Findings:
         if not getattr(sensor, name).strip():
             yield "LS211", f"{name} is empty", ""
     if "data" not in sensor.links:
-        yield "LS211", "link 'data' is missing", "links"
+        yield "LS211", "the link 'data' is missing", "links"
     if sensor.points is not None and not sensor.has_points:
-        yield "LS211", "points is declared, but no frame has data=True", "frames"
+        yield "LS211", "`points` is declared, but no frame has data=True", "frames"
     if sensor.range_limits is not None:
         low, high = sensor.range_limits
         if not 0 <= low < high:
@@ -240,7 +240,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
 def _check_frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     engine = get_codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
-        yield "LS114", f"the frame is a {type(frame.struct).__name__}", name
+        yield "LS114", f"the frame must be a Struct, not a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
         reason = getattr(engine, "reason", "the layout of the frame cannot be computed")
         if NAME_IS_COMPARED in reason:
@@ -412,11 +412,11 @@ def _check_plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findi
     if is_expression(answer):
         yield (
             "LS207",
-            f"plausible returns {answer!r}, an expression of construct",
+            f"`plausible` returns {answer!r}, which is an expression of construct",
             f"{name}.plausible",
         )
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
-        yield "LS207", f"plausible returns {answer!r} for every frame", f"{name}.plausible"
+        yield "LS207", f"`plausible` returns {answer!r} for every frame", f"{name}.plausible"
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
@@ -482,7 +482,7 @@ def _check_sync(
     chance = MAX_SYNC_SHARE + 4 * (MAX_SYNC_SHARE / len(matching)) ** 0.5
     share = expected if expected > MAX_SYNC_SHARE else share
     if expected > MAX_SYNC_SHARE or share > chance:
-        what = f"the constant bytes also occur at {share:.1%} of the offsets in the content"
+        what = f"the constant bytes occur at {share:.1%} of the offsets in the content"
         yield "LS204", what, name
 
 
@@ -501,8 +501,8 @@ def _check_strength(
         yield (
             "LS206",
             (
-                f"the constants and checksums have only {weakest} bits, and it declares neither"
-                " plausible nor confirm"
+                f"the constants and checksums have only {weakest} bits, and the frame type"
+                " declares neither `plausible` nor `confirm`"
             ),
             name,
         )

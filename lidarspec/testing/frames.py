@@ -163,7 +163,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
         if path == other and is_number and not are_equal(before, after):
             raise ViolationError(
                 "LS303" if is_cut(before, after) else "LS302",
-                f"{before!r} becomes {after!r}",
+                f"the value {before!r} becomes {after!r} when the parsed frame is built again",
                 f"{name}.{path}",
             )
 
@@ -285,12 +285,15 @@ def _raise_changed_bytes(
     if difference is None:
         was, became = (part[offset : offset + 1].hex() for part in (data, built))
         raise ViolationError(
-            code, f"byte {offset} of {len(data)} changes from {was} to {became}", name
+            code,
+            f"byte {offset} of {len(data)} changes from {was} to {became} when the parsed frame is"
+            " built again",
+            name,
         )
     path, before, after = difference
     raise ViolationError(
         "LS303" if is_cut(before, after) else code,
-        f"{before!r} becomes {after!r}",
+        f"the value {before!r} becomes {after!r} when the parsed frame is built again",
         f"{name}.{path}",
     )
 
@@ -394,7 +397,7 @@ def _check_edit(
     require(
         subject.sensor.build(name, again) == built,
         "LS302",
-        f"a frame with an edited {path} is parsed and built again, and has different bytes",
+        f"after {path} was edited, parsing the frame and building it again gives different bytes",
         f"{name}.{path}",
     )
 

@@ -269,13 +269,13 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     require(
         azimuth <= (MAX_SWEEP_AZIMUTH_RAD if along else MAX_RANDOM_AZIMUTH_RAD),
         "LS502",
-        f"an azimuth is {azimuth:.4g} rad",
+        f"an azimuth of {azimuth:.4g} rad is too large",
         where,
     )
     require(
         not along or elevation <= np.pi / 2 + 1e-6,
         "LS502",
-        f"an elevation is {elevation:.4g} rad",
+        f"an elevation of {elevation:.4g} rad is too large",
         where,
     )
 
@@ -307,7 +307,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
             ).points()
         except SpecError as error:
             raise ViolationError(
-                "LS503", f"a frame with {path} = 1: {error.reason}", f"{name}.{path}"
+                "LS503", f"in a frame with {path} = 1: {error.reason}", f"{name}.{path}"
             ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
             continue
@@ -376,13 +376,13 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
         words = {1: "counter-clockwise", -1: "clockwise"}
         subject.picture[f"{name}: sense"] = f"{words[sense]} as {path} grows, seen from above"
         subject.picture[f"{name}: first beam"] = (
-            f"at azimuth {np.rad2deg(first) + 0:.1f} deg where {path} is 0 (0 is ahead, 90 is left)"
+            f"at azimuth {np.rad2deg(first) + 0:.1f} deg if {path} is 0 (0 is ahead, 90 is left)"
         )
         axes = subject.sensor.vendor_axes
         expected = _find_axis_sense(axes, first) if axes else 0
         message = (
-            f"points turn {words[sense]} if {path} grows, but angles in vendor_axes"
-            f" {', '.join(axes or ())} turn {words.get(expected)}"
+            f"if {path} increases, the points turn {words[sense]}; with vendor_axes"
+            f" {', '.join(axes or ())}, they must turn {words.get(expected)}"
         )
         is_proven = name in subject.placed
         require(is_proven or expected in (0, sense), "LS511", message, f"{name}.points")

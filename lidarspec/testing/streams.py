@@ -69,12 +69,16 @@ def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
     data = material.make_input(subject.sensor, subject.conversation(rounds=1))
     first = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
     second = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
-    require(len(first) == len(second), "LS415", "two runs give different numbers of points")
+    require(
+        len(first) == len(second),
+        "LS415",
+        "decoding the same bytes again gives another number of points",
+    )
     for name, column in first.columns.items():
         require(
             column.tobytes() == second.columns[name].tobytes(),
             "LS415",
-            f"two runs give different values of {name}",
+            f"decoding the same bytes again gives other values of {name}",
             f"{subject.sensor.data_frame}.points",
         )
 

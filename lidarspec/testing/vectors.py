@@ -279,13 +279,13 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
         if path in (named or free) and (named or match.evidence_bits >= PROOF_BITS):
             fits = f"{_describe_match(match, len(frames[0]))} matches every vector"
             raise ViolationError(
-                "LS212", f"{fits}, but no Checksummed verifies it", f"{name}.{path}"
+                "LS212", f"{fits}, but Checksummed does not verify this field", f"{name}.{path}"
             )
     unsaid = [path for path in named if not fields[path].docs.startswith(NOT_CHECKED)]
     require(
         not unsaid,
         "LS212",
-        "the field has the name of a checksum, but no Checksummed verifies it",
+        "the field is named like a checksum, but Checksummed does not verify this field",
         f"{name}.{''.join(unsaid[:1])}",
     )
 
@@ -339,7 +339,7 @@ def _needs_class(match: ChecksumMatch) -> bool:
 def _describe_match(match: ChecksumMatch, length: int) -> str:
     """Describe a checksum, the bytes that it covers, and the byte order of its field."""
     if match.place.size > 1:
-        order = f", in a field that is {match.order}-endian,"
+        order = f", stored {match.order}-endian,"
     else:
         order = ""
     if _needs_class(match):
@@ -413,7 +413,9 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
     except LidarSpecError as error:
         raise ViolationError("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(content, list):
-        raise ViolationError("LS702", "the file is not a list of vectors", str(subject.vectors))
+        raise ViolationError(
+            "LS702", "the file does not contain a list of vectors", str(subject.vectors)
+        )
     own_entries: dict[str, Any] = {}
     for index, vector in enumerate(content):
         entry_key = f"vectors[{index}]"
@@ -473,8 +475,8 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
     family = subject.family
     ids = [named] if isinstance(named, str) else named
     message = (
-        f"several sensors share this file ({', '.join(family)}), so the vector must name one:"
-        f' "sensor": "{subject.sensor.id}"'
+        f"several sensors share this file ({', '.join(family)}), so the vector must name its"
+        f' sensor: "sensor": "{subject.sensor.id}"'
     )
     require(ids or len(family) < 2, "LS702", message, entry_key)
     unknown_ids = [name for name in ids if family and name not in family]

@@ -67,7 +67,7 @@ def test_measured_values_are_listed_beside_references() -> None:
     lines = ran("check", "ldrobot-stl27l", "--max-examples", "3").output.splitlines()
     assert lines == [
         lines[0],
-        "  data: first beam: at azimuth 0.0 deg where start_angle is 0 (0 is ahead, 90 is left)",
+        "  data: first beam: at azimuth 0.0 deg if start_angle is 0 (0 is ahead, 90 is left)",
         "  data: range: the field can represent 0.001 .. 65.535 m; range_limits are 0.03 .. 25 m",
         lines[3],
         "  data: sense: clockwise as start_angle grows, seen from above",
@@ -80,7 +80,7 @@ def test_measured_values_are_listed_beside_references() -> None:
     unproven = ran("check", STRANGER, "--max-examples", "3").output
     assert (
         "  vectors: there is no file with golden vectors;"
-        " vectors with points in two quadrants would verify these values"
+        " to verify these values, add vectors with points in two quadrants"
     ) in unproven
 
 
@@ -98,7 +98,8 @@ def test_a_file_with_the_id_of_an_installed_sensor_names_its_plugin(tmp_path: Pa
     ]
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
     said = (
-        "the installed lidarspec-camsense has the same id (lidarspec.sensors = lidarspec_camsense)"
+        "the installed lidarspec-camsense has a sensor with this id"
+        " (lidarspec.sensors = lidarspec_camsense)"
     )
     assert loading["findings"][0]["what"] == said
     assert all(finding["line"] for finding in loading["findings"])
@@ -134,9 +135,8 @@ def test_a_folder_with_another_copy_of_an_installed_distribution_is_refused(tmp_
         '[project]\nname = "lidarspec-ldrobot"\n', encoding="utf-8"
     )
     message = ran("check", tmp_path, code=3).stderr
-    assert (
-        f"the installed lidarspec-ldrobot is not the one in {tmp_path}: its module is " in message
-    )
+    assert "the installed lidarspec-ldrobot contains the module " in message
+    assert f", which is not in {tmp_path}: run pip install" in message
     assert f"pip install -e {tmp_path}" in message
 
 

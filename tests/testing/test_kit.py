@@ -422,7 +422,7 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
 def test_vectors_of_several_sensors_name_their_sensor() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = list_lacking(sound.sensor(), known, "broken-one", "broken-two")
-    assert 'so the vector must name one: "sensor": "broken-one"' in asked[0]
+    assert 'so the vector must name its sensor: "sensor": "broken-one"' in asked[0]
     asked = list_lacking(
         sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
     )
@@ -482,7 +482,7 @@ def test_a_checksum_in_the_wrong_byte_order_is_reported() -> None:
     swapped = sound.frame(Checksummed(sound.struct(sum=Int16ub), field="sum", algorithm=Sum(16)))
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     assert (
-        "Sum(16) over all other bytes, in a field that is little-endian,"
+        "Sum(16) over all other bytes, stored little-endian,"
         in list_lacking(sound.sensor(swapped), known)[0]
     )
 
@@ -506,7 +506,7 @@ def test_the_checksum_that_is_offered_is_as_wide_as_its_field() -> None:
         for text in list_lacking(data(Crc(16, 0x1021)), vectors)
         if text.startswith("LS703 vectors[0]")
     }
-    assert said == "Sum(16) over all other bytes, in a field that is big-endian, fits"
+    assert said == "Sum(16) over all other bytes, stored big-endian, fits"
 
 
 @pytest.mark.parametrize("samples", [3, 200], ids=["short", "long"])
@@ -520,7 +520,7 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     vectors = [{"frame": "data", "hex": data.hex(), "source": "made up"} for data in examples]
     said = (
         "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes,"
-        " in a field that is little-endian, matches every vector"
+        " stored little-endian, matches every vector"
     )
     assert list_lacking(sound.sensor(plain), vectors)[0].startswith(said)
     assert not any(text.startswith("LS212") for text in list_lacking(sound.sensor(sealed), vectors))
@@ -574,7 +574,7 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
-        "LS604 commands.ask: the reply can only be simulated with answers= of the Simulation:"
+        "LS604 commands.ask: the reply cannot be simulated without answers= in the Simulation:"
         " page: cannot be simulated"
     )
 
