@@ -303,7 +303,7 @@ class Registry:
             owners = ", ".join(":".join(other) for other in others)
             plugin = replace(
                 plugin,
-                error=f"{lost[0]}: another sensor has this id already: that of {owners}",
+                error=f"{lost[0]}: this id is already used by {owners}",
                 rule="LS005",
                 failed_sensor=lost[0],
             )
@@ -356,8 +356,8 @@ class Registry:
         names = {other.name for other in self._offered[home] if other.value == entry.value}
         if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"the entry point {entry.name!r} loads {entry.value}, but the sensor has neither"
-                " this id nor this alias",
+                "the name of an entry point must be the id or an alias of its sensor, not"
+                f" {entry.name!r} ({entry.value})",
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
@@ -724,7 +724,7 @@ def named_owners() -> dict[str, str]:
                 ' such as acme-x1 = "acme-lidars"'
             )
     except LidarSpecError as error:
-        warnings.warn(f"{error}; its [owners] are ignored", stacklevel=2)
+        warnings.warn(f"{error}; all [owners] in this file are ignored", stacklevel=2)
         return {}
     return named
 
@@ -816,7 +816,7 @@ def _replace_checksum(frame: Frame, algorithm: Any) -> Frame:
     struct = prepare(frame.struct)
     seal = next(iter_seals(struct), None)
     if seal is None:
-        raise SpecError("the hook returns a checksum for a frame type that declares none")
+        raise SpecError("the hook returns a checksum for a frame type that declares no checksum")
     seal.algorithm = algorithm
     return replace(frame, struct=struct)
 
@@ -1051,8 +1051,8 @@ def no_sensors_error(path: str = "") -> SpecError:
         path: the file; "" if the caller names it.
     """
     return SpecError(
-        "the file has no function that returns its sensors: add a function"
-        " lidarspec_sensors, decorated with @hookimpl, that returns them, such as [SENSOR]",
+        "the file declares no sensors: add a function lidarspec_sensors, decorated with"
+        " @hookimpl, that returns a list such as [SENSOR]",
         path=path,
         rule="LS006",
     )

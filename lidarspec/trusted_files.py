@@ -113,7 +113,7 @@ def trust(folder: str | Path) -> Path:
     if not allowed.is_dir() or len(str(allowed).splitlines()) > 1:
         raise UsageError(f"{folder} is not a folder")
     if reason := find_distrust(allowed / "."):
-        raise UsageError(f"{reason}; other users could run programs as you")
+        raise UsageError(f"other users could run programs as you, because {reason}")
     file = user_folder() / TRUSTED
     if not is_trusted(allowed):
         with system_errors(file):

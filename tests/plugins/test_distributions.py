@@ -29,7 +29,7 @@ REPORTS = {
     "misspelt = lidarspec_broken.misspelt": "unknown hook 'lidarspec_sensor'",
     "unmarked = lidarspec_broken.unmarked": "lidarspec_sensors lacks @hookimpl",
     "duplicate = lidarspec_broken.duplicate": (
-        "acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
+        "acme-x1: this id is already used by acme-lidars:acme_lidars"
     ),
     "raises = lidarspec_broken.raises": "ZeroDivisionError",
     "no-sensor = lidarspec_broken.no_sensor": "must return sensors, got str",

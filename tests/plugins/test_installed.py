@@ -262,7 +262,7 @@ def test_the_first_of_two_plugins_with_one_id_wins(
     assert sorted(found.sensors()) == ["acme-x1", "acme-x2", "acme-x3"]
     assert [(plugin.error, plugin.sensors) for plugin in found.plugins] == [
         ("", ("acme-x1", "acme-x2")),
-        ("acme-x2: another sensor has this id already: that of dist:acme", ("acme-x3",)),
+        ("acme-x2: this id is already used by dist:acme", ("acme-x3",)),
     ]
 
 
@@ -271,8 +271,8 @@ def test_the_first_of_two_plugins_with_one_id_wins(
     [
         (
             "liar-x2 = liar",
-            "liar-x1: the entry point 'liar-x2' loads liar:liar_x2, but the sensor has"
-            " neither this id nor this alias",
+            "liar-x1: the name of an entry point must be the id or an alias of its sensor, not"
+            " 'liar-x2' (liar:liar_x2)",
         ),
         ("odd-x1 = odd", "lidarspec_sensors must return sensors, got int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),
@@ -298,7 +298,7 @@ def test_a_sensor_cannot_take_an_id_from_a_module_that_is_always_loaded(
     assert found.sensor("acme-x2").model == "again"
     assert [plugin.error for plugin in found.plugins] == [
         "",
-        "acme-x2: another sensor has this id already: that of dist:again",
+        "acme-x2: this id is already used by dist:again",
     ]
 
 
@@ -364,7 +364,7 @@ def test_the_owner_of_an_id_has_it_and_the_other_keeps_the_rest(
         (
             stranger,
             ("acme-x3",),
-            "acme-x2: another sensor has this id already: that of lidarspec-acme:acme",
+            "acme-x2: this id is already used by lidarspec-acme:acme",
         ),
         ("lidarspec-acme", ("acme-x1", "acme-x2"), ""),
     ]
@@ -381,7 +381,7 @@ def test_whom_the_user_names_comes_before_the_vendor(plugins: dict[str, SimpleNa
     }
     assert [plugin.error for plugin in found.plugins] == [
         "",
-        "acme-x2: another sensor has this id already: that of my-fork:again",
+        "acme-x2: this id is already used by my-fork:again",
     ]
 
 
@@ -393,7 +393,7 @@ def test_owners_that_cannot_be_read_are_warned_of(
         monkeypatch.setenv(name, str(tmp_path))
     (file := own_settings()).parent.mkdir()
     file.write_text(text, encoding="utf-8")
-    with pytest.warns(UserWarning, match=rf"{file}: .*; its \[owners\] are ignored"):
+    with pytest.warns(UserWarning, match=rf"{file}: .*; all \[owners\] in this file are ignored"):
         assert named_owners() == {}
 
 
@@ -433,8 +433,8 @@ def test_an_id_without_owner_is_an_error_only_when_used(
         found.sensor("acme-x2")
     assert sorted(found.sensors()) == ["acme-x1", "acme-x3"]
     assert [(plugin.sensors, plugin.error) for plugin in found.plugins] == [
-        (("acme-x3",), "acme-x2: another sensor has this id already: that of two-lidars:acme"),
-        (("acme-x1",), "acme-x2: another sensor has this id already: that of one-lidars:again"),
+        (("acme-x3",), "acme-x2: this id is already used by two-lidars:acme"),
+        (("acme-x1",), "acme-x2: this id is already used by one-lidars:again"),
     ]
     assert "acme-x2" not in found
     assert "acme-x3" in found

@@ -96,7 +96,7 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "import a_library_that_nobody_has": "a_library_that_nobody_has",
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
-        "": "the file has no function that returns its sensors",
+        "": "the file declares no sensors",
         (
             "from lidarspec.spec import hookimpl\n@hookimpl\n"
             "def lidarspec_sensors():\n    return [1 / 0]"
