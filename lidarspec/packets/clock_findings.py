@@ -71,7 +71,9 @@ FINDING_TYPES = MappingProxyType(
             "the clock has no valid date, expected {epoch}", CONNECT_SOURCE
         ),
         "lock_lost": FindingType("lost its lock: {state}", CHECK_MASTER),
-        "restart": FindingType("restarted, so its time began anew", "check its power supply"),
+        "restart": FindingType(
+            "the sensor restarted, which reset its clock", "check its power supply"
+        ),
         "leap_second": FindingType(
             "stepped by {value:+.3f} s at a leap second",
             "use --time host for the data around the leap second",

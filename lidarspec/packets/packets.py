@@ -399,8 +399,8 @@ def _nested_dtype(
         here = prefix + name
         if len(_list_forms(schema, here)) > 1:
             raise SpecError(
-                "this is a value in some frames, and a struct or an array in others: read each"
-                " of its columns by its full name",
+                "the field is a value in some frames, and a struct or an array in others: read"
+                " each column of the field by its full name",
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]

@@ -132,8 +132,8 @@ class Header:
             configured: Sensor = installed.configure(**options)
         except UsageError as error:
             raise UsageError(
-                f"pass the options of the recorded sensor again, as in -s {self.sensor} -O"
-                f" NAME=VALUE: {error}"
+                f"{error}. Pass the options of the recorded sensor again, as in -s {self.sensor} -O"
+                " NAME=VALUE"
             ) from None
         return configured
 
