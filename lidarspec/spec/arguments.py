@@ -201,14 +201,14 @@ _SAFE_VALUE = r"[\w.~:+-]*"
 class Template:
     """A text in `Command.values` with names in braces, which are replaced by values.
 
-    An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is an argument
-    of the command whose path is the field of the template, or a value that an earlier reply
-    provided (`Command.provides`). `own_address` is this computer's address as seen by the sensor,
-    `own_port` the port at which it expects the data. Values consist of ASCII letters, digits and
-    ``_.~:+-``.
+    An example is ``Template("/cmd/start?handle={handle}&port={own_port}")``. A name is a value
+    that an earlier reply provided (`Command.provides`), or an argument of the command that is
+    declared with the path of this field. `own_address` is this computer's address as seen by the
+    sensor, and `own_port` is the port at which this computer expects the data. Values consist of
+    ASCII letters, digits and ``_.~:+-``.
 
     Raises:
-        SpecError: for a text that is not ASCII, has no names, or has braces around anything but a
+        SpecError: if the text is not ASCII, contains no names, or has text in braces that is not a
             name.
     """
 

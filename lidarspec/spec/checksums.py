@@ -481,7 +481,7 @@ def _compute_wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, dat
 def _make_single_word_xor(algorithm: WordXor) -> Single:
     """Return a fast function that computes a `WordXor`.
 
-    It XORs whole groups of words, and then splits the result into words.
+    The function XORs groups of words, and then splits the result into words.
     """
     head = algorithm.head
     groups = algorithm.groups

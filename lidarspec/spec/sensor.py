@@ -177,7 +177,7 @@ class SensorDescription:
 
     @cached_property
     def main_frames(self) -> tuple[str, ...]:
-        """The names of the data frames; without points, of all incoming frames."""
+        """The names of the data frames, or of all incoming frames if there are no points."""
         return self.data_frames or tuple(self.incoming)
 
     @cached_property

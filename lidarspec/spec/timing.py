@@ -1,4 +1,4 @@
-"""Rules that a sensor declares for the ends of scans, clocks and packet counters.
+"""Declarations about the clock, the packet counter and the scans of a sensor.
 
 A `Clock` declares how the time of a packet is read, and from which epoch it counts (`EPOCHS`). Many
 sensors also send the state of their clock. A `ClockStatus` declares the field with the state, and

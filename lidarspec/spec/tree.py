@@ -484,7 +484,10 @@ def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> Field
 
 
 def fraction_in(formula: Formula) -> str | float | None:
-    """Return a "/" or a float in a formula, whose value may be a fraction; else None."""
+    """Return the first "/" or float in a formula; None if the formula has neither.
+
+    The value of a formula with one of them may be a fraction.
+    """
     for part in iter_subformulas(formula):
         if isinstance(part, float):
             return part
@@ -595,9 +598,9 @@ class Ending:
     """The end of bytes of variable size: a mark, or the end of the datagram.
 
     Attributes:
-        size: the number of bytes before the end as a field, to be used in formulas.
+        size: a field for the number of bytes before the end, to which formulas refer.
         mark: the bytes of the mark, such as a terminator; b"" if the bytes end with the datagram.
-            Only multiples of the size of the mark are tried as its offset.
+            The offset of a mark of n bytes is a multiple of n.
         mask: the bits of each byte that are compared with the mark.
         is_content: whether the mark belongs to the content, as in a number of variable size.
     """
@@ -795,7 +798,7 @@ class PartSequence:
             else None.
         within: the total size of all parts in bytes; None if it is not declared.
         outer: the fields of the outer frame that formulas of the parts use.
-        total: the total size of all parts as a field, to be used in formulas of later fields.
+        total: a field for the total size of all parts, to which later formulas refer.
         is_array: whether the parts are the elements of an array that differ in size. The fields of
             the elements are then columns of the outer frame.
     """

@@ -1,4 +1,4 @@
-"""Functions for `points` functions, in addition to NumPy's ufuncs.
+"""Functions that `points` functions can call, in addition to NumPy's ufuncs.
 
 They handle angles, the order of values in the stream, and tables. The functions accept NumPy arrays
 and the columns that the engine passes to `points`. For a column, they take the borders of packets

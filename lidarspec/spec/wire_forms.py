@@ -351,7 +351,7 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
     """Read the fields of a frame.
 
     Args:
-        size: the size of the frame, including the mark of one byte at its end; None if the end is
+        size: the size of the frame with its end mark, which counts as one byte; None if the end is
             missing.
     """
     struct = b""
@@ -373,7 +373,7 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
 
 
 def find_next_offsets(places: Offsets, offsets: Offsets, none: int) -> Offsets:
-    """Return for each offset the first of `places` that is not before it, (n,).
+    """Return, for each offset, the first of `places` at or after the offset, (n,).
 
     Args:
         places: the offsets of some bytes, ascending.
@@ -639,7 +639,7 @@ def _write_decimal(value: np.floating[Any], form: str) -> bytes:
 
 
 class _TokenReader:
-    """Reads the tokens of one frame; all numbers are converted when it is made.
+    """Reads the tokens of one frame. The constructor converts all numbers.
 
     Args:
         data: the frame, up to the end of the last token.

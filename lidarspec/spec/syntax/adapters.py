@@ -53,8 +53,8 @@ class Trial:
         valid: the raw values that can be decoded.
         values: the decoded values.
         failed: whether some raw values cannot be decoded.
-        lost: a raw value that decoding and encoding change, and the raw value that results; None if
-            no value changes.
+        lost: a raw value that changes when it is decoded and encoded, and the changed value; None
+            if no value changes.
     """
 
     valid: tuple[Any, ...]
@@ -82,7 +82,7 @@ def make_int_adapter(con: Construct) -> tree.Adapter | None:
 
 @functools.lru_cache(maxsize=4096)
 def without_int_adapters(con: Construct) -> Construct:
-    """Return a copy of a bit block with integers in place of adapters of integers."""
+    """Return a copy of a bit block without the adapters of its integers."""
     if make_int_adapter(con) is not None:
         return without_int_adapters(con.subcon)
     if not isinstance(con, Subconstruct | construct.Struct):

@@ -344,10 +344,10 @@ class ExactFloat(FormatField):  # type: ignore[misc]
 
 
 class NamedEnum(construct.Enum):  # type: ignore[misc]
-    """An Enum that gives expressions its name, in parsed and in built frames.
+    """An Enum that gives expressions its name, both in parsed and in built frames.
 
-    construct's Enum gives expressions the number if the frame is built from the number. The key of
-    a Switch would then match no case.
+    If a frame is built from the number, construct's Enum gives expressions the number. The key of a
+    Switch would then match no case.
     """
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -359,8 +359,7 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 class RawPart(Construct):  # type: ignore[misc]
     """A part with its bytes and offsets, like construct's RawCopy.
 
-    It is built from its `value`. construct's RawCopy is built from its `data`, so that changes of
-    the `value` in a parsed frame have no effect.
+    `build` uses `value`. construct's RawCopy uses `data` instead, and ignores a changed `value`.
     """
 
     def __init__(self, subcon: Construct) -> None:
@@ -511,7 +510,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
 
     @property
     def levels_up(self) -> int:
-        """How many levels above the struct of this field the part is."""
+        """The number of steps to outer structs in `of`."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
@@ -657,7 +656,7 @@ class Partition(Construct):  # type: ignore[misc]
         count: the number of parts, or None.
         size: the size of the first part in bytes, or None.
         within: the total size of all parts in bytes, or None.
-        following: an expression that gives the size of the next part, by fields of the part; or
+        following: an expression of the fields of a part, which gives the size of the next part; or
             None.
         limit: the maximum size of a frame, in bytes.
     """

@@ -300,7 +300,7 @@ def _is_pascal_string(con: Construct) -> bool:
 
 
 def _distribute_xor(con: Construct) -> Construct:
-    """Apply the ProcessXor of a struct to each of its members instead.
+    """Apply the ProcessXor of a struct to each member of the struct.
 
     Returns the construct unchanged if it is not a ProcessXor of a struct, or if the bytes of a
     member are not known.
@@ -541,7 +541,8 @@ def is_greedy(
     """Return whether a part reads all bytes that are available.
 
     Args:
-        kinds: the greedy constructs. A part that ends in one of them is greedy as well.
+        kinds: the constructs that read all bytes. A part that ends with such a construct also reads
+            all bytes.
     """
     if isinstance(con, kinds):
         return True
