@@ -252,7 +252,8 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
         times: the times of these packets, (k,).
-        before: a time for each packet, used up to the first packet that has a time, (n,).
+        before: a time for each packet, (n,). It is used for packets before the first packet that
+            has a time.
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):

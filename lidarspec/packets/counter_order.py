@@ -328,12 +328,11 @@ class CounterOrder:
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
         """Correct a counter that contradicts the clock.
 
-        If it continues the previous counter that contradicted the clock, the sensor has reset its
-        counter, and the counter is kept.
+        If the counter continues the previous counter that contradicted the clock, the sensor has
+        reset its counter. The counter is then returned unchanged.
 
         Returns:
-            How many places the packet is ahead of the newest packet, by the clock; and the
-            corrected counter.
+            How many places the packet is ahead of the newest packet, by the clock; and the counter.
         """
         ahead = max(round(by_clock), 1)
         suspect = self._suspect

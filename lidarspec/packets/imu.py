@@ -65,7 +65,7 @@ class ImuSamples:
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 
     def shift(self, ns: int) -> ImuSamples:
-        """Return the samples with times that are later by some nanoseconds."""
+        """Return the samples with `ns` added to their times."""
         return ImuSamples(self.time_ns + ns, self.angular_velocity, self.linear_acceleration)
 
     def turn(self, rotation: NDArray[np.float64]) -> ImuSamples:
@@ -152,7 +152,7 @@ class WaitingSamples:
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Keep only the samples that were added last, so that memory is limited if no scan ends.
+        """Keep only the samples that were added last, so that memory is limited.
 
         Samples are dropped when more than twice `most` are stored.
 

@@ -124,7 +124,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of a frame type have a field.
 
-    Returns True if the field is missing in all frame types, so that reading it raises the error.
+    Returns True if no frame type has the field, so that reading the field raises an error.
     """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [
