@@ -138,7 +138,7 @@ class EndFinder:
         return self._cut * full
 
     def _is_leap(self, step: float) -> bool:
-        """Return whether a step over a scan end is much larger than the previous one."""
+        """Return whether the step at a scan end is much larger than at the previous end."""
         last = self._last_step
         self._last_step = step
         return last > 0 and step > max(MIN_TURNS_AWAY, 2 * last)
@@ -298,8 +298,8 @@ def first_points(points: EvaluatedPoints) -> Indices:
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
     """Return counts, summed over all axes after the first `axis_count` axes.
 
-    All values along an axis with zero stride are equal, so they are multiplied instead of summed,
-    which is faster.
+    Along an axis with zero stride, all values are equal. The first value is multiplied by their
+    number, which is faster than a sum.
     """
     times = 1
     while counts.ndim > axis_count:

@@ -108,9 +108,9 @@ class Selection:
 
     @property
     def is_counted(self) -> bool:
-        """Whether scans are counted from the first scan of the source on.
+        """Whether all scans have to be counted, from the first scan of the source.
 
-        This is required if scans are selected by index, by time or by step.
+        This is the case if scans are selected by index, by time or by step.
         """
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
@@ -385,7 +385,7 @@ class ScanSelector:
     def make_missing_error(self) -> UsageError:
         """Return the error to raise if no scan was selected.
 
-        The error states the number or the times of the scans of the source.
+        The error states how many scans the source has, or at which times.
         """
         if self._seen == 1:
             number = "1 scan"
