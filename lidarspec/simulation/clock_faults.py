@@ -8,10 +8,10 @@ texts are supported:
 |---|---|
 | `utc`, `tai`, `gps` | the clock follows the time of the computer in this time scale |
 | `drift=50ppm` | it is fast by 50 millionths of the time since power-on |
-| `step=0.2s@10s` | it jumps forward by 0.2 s, 10 s after power-on; negative: back |
-| `pps@10s` | it counts a pulse twice: one second ahead |
+| `step=0.2s@10s` | it jumps forward by 0.2 s, 10 s after power-on, or back if it is negative |
+| `pps@10s` | it counts a pulse twice, and is then one second ahead |
 | `leap@10s` | it repeats a second, as UTC does in a leap second |
-| `unlock=5s@10s` | its status is "not locked" for 5 s; without a duration, for ever |
+| `unlock=5s@10s` | its status is "not locked" for 5 s, or for ever if no duration is given |
 | `restart@10s` | it starts again as after power-on, without a date and not locked |
 """
 

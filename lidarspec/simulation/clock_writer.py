@@ -605,7 +605,7 @@ def _shift_raw(
 
 
 def _get_encoding(info: FieldInfo) -> tuple[str, float, float, int, str]:
-    """Return the properties of a field that are equal in all times of one clock."""
+    """Return the properties that are the same for all time fields of one clock."""
     return info.unit, info.scale, info.offset, info.bits, info.kind
 
 

@@ -165,7 +165,7 @@ class FrameMaker:
         return frames
 
     def _encode_texts(self, values: Values) -> Values:
-        """Return values in which texts are encoded, and the sizes of texts are added."""
+        """Return values with encoded texts, and with the sizes of these texts."""
         result = dict(values)
         for path, info in self._decoded.items():
             value = result.get(path)

@@ -146,7 +146,8 @@ class Measurement:
         sensor: the sensor.
         frame: the frame type.
         table: example frames, in which the fields with ranges are searched.
-        given: paths of the fields that `sweep` gives. Only ranges among them are changed.
+        given: paths of the fields that `sweep` gives. Of these fields, only ranges are
+            changed.
 
     Raises:
         SpecError: if no fields that determine the ranges are found, and the sensor has no `encode`.
@@ -564,7 +565,7 @@ def _solve(slopes: Floats, aims: Floats) -> Floats:
 
 
 def _get_table_name(frame: str, table: CompiledTable) -> str:
-    """Return the name of the frame type or parts in a table."""
+    """Return the name of the frame type, or of the parts, in a table."""
     if isinstance(table, PartRows):
         return ".".join(filter(None, (frame, *table.place)))
     return frame
