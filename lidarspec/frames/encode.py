@@ -332,7 +332,7 @@ class _Encoder:
         return array[index]
 
     def _add_value(self, info: FieldInfo, path: str, shown: str, value: Any, size: int) -> None:
-        """Add one value to the values of its field.
+        """Check one value of a field, and store it for encoding.
 
         Args:
             shown: the path with indices, for error messages.

@@ -186,7 +186,7 @@ class CompiledTable:
         return max((group.layout.lengths.get(axis, 0) for group in self.groups), default=0)
 
     def _get_elements(self, axis: str) -> _Elements:
-        """Return the elements of an array with elements of different sizes; cached."""
+        """Return the elements of an array as `_Elements`. The result is cached."""
         if axis not in self._arrays:
             table, owners = self.parts(axis)
             counts = np.bincount(owners, minlength=len(self)).astype(np.intp)
@@ -302,13 +302,13 @@ class CompiledTable:
         return CompiledTable(self.schema, groups)
 
     def find_parts(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
-        """Find the parts at a path in the frames of each group that has such parts.
+        """Find the parts at a path in all frames.
 
         The result is cached, because the clock, the points and each kind of parts use it.
 
         Returns:
-            For each group with such parts, a tuple of the group, the buffer that contains the
-            frames of the group, and the parts in these frames.
+            A tuple for each group of frames that has parts: the group, the buffer that contains
+            these frames, and the parts.
         """
         if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
@@ -370,7 +370,7 @@ class CompiledTable:
 
 @dataclass(frozen=True, eq=False)
 class _Elements:
-    """The elements of an array, which have different sizes, as a table of parts.
+    """The elements of an array, which may differ in size, as a table of parts.
 
     Attributes:
         table: the elements of all frames, in stream order.
@@ -432,8 +432,8 @@ def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Layout
     """Return parts in stream order as `LayoutRows`.
 
     Args:
-        parts: parts that have one layout and one buffer, and the indices of these parts in the
-            table.
+        parts: pairs of parts and the indices of these parts in the table. All parts have one layout
+            and one buffer.
     """
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])

@@ -111,8 +111,8 @@ class Leaf:
         strides: the distance from one element to the next along each array, in bytes. An array
             inside a bit block has no stride.
         wire: the dtype with byte order if NumPy can read the field directly, else None.
-        elements: if `wire` is None, the bits of each element of the array inside the bit block, or
-            of the field if the bit block has no array.
+        elements: the bits of the field if `wire` is None. For an array inside a bit block, the bits
+            of each element of the array.
         size: the size of one element, or of the bit block that contains the field, in bytes.
     """
 

@@ -625,9 +625,8 @@ class _ValueClasses:
 
     Attributes:
         limits: the lowest and the highest value of the field.
-        rises: from this value on, a larger value never makes the frame shorter. If such a value
-            makes the frame too long, all larger values do so as well. None if no such value is
-            known.
+        rises: above this value, a larger value never makes the frame shorter. None if no such value
+            is known.
     """
 
     limits: tuple[int, int]
@@ -815,7 +814,7 @@ class _CandidateSet:
         return there, values
 
     def add_refuted(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
-        """Add the candidates to `refuted` in which a constant of the node is wrong."""
+        """Add a candidate to `refuted` if a constant of the node is wrong in it."""
         if node.constants:
             self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
 

@@ -167,9 +167,9 @@ class TextSize(MeasuredSize):
     def _find_sizes_together(
         self, buffer: NDArray[np.uint8], starts: Offsets, ends: Offsets
     ) -> NDArray[np.int64]:
-        """Return the result of `_find_sizes` for texts at offsets in equal steps.
+        """Return the result of `_find_sizes` for several texts, found by one search.
 
-        The offsets of the texts differ by multiples of the size of the end mark.
+        The offsets of the texts must differ by multiples of the size of the end mark.
         """
         step = len(self.ending.mark)
         begin = int(starts.min())

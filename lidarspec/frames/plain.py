@@ -27,7 +27,7 @@ MAX_BUILDS = 4
 
 
 def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any, int]:
-    """Parse the frame at the start of the bytes; return its values and its size.
+    """Parse the frame at the start of `data`; return the values and the size of the frame.
 
     Raises:
         construct.ConstructError: if the bytes do not begin with a frame.
@@ -93,7 +93,7 @@ def _add_code_names(value: Any, path: str, schema: Schema) -> Any:
 
 
 def list_plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
-    """Return the fields of the frame at the start of some bytes; None if parsing fails."""
+    """Return the fields of the frame at the start of `data`; None if parsing fails."""
     try:
         values = frame.prepared.parse(data, _verify=False)
     except Exception:  # an expression of the struct may raise anything
@@ -136,10 +136,10 @@ def _iter_fields(
 
 
 def _has_spans(value: Any, start: int, end: int) -> bool:
-    """Return whether a value is a struct that knows the offsets of its members.
+    """Return whether a value is a struct with the offsets of its members in the frame.
 
-    Returns False if construct has decoded the bytes of the struct first, because the offsets then
-    refer to the decoded bytes.
+    Returns False if construct has decoded the bytes of the struct first. The offsets then refer to
+    the decoded bytes.
     """
     if not isinstance(value, dict) or not value.get("_spans"):
         return False

@@ -301,7 +301,7 @@ def _plan_words(
 
 
 def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
-    """Return the XOR of some words of each row, (n,)."""
+    """Return the XOR of the selected words of each row, (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     if len(which):
         total[:] = columns[which[0]]
@@ -445,9 +445,10 @@ def _compute_narrow(
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
-    """Return a word for each row, from which the register is the same as from the row.
+    """Return one word for each row, (n,).
 
-    The result is (n,). The polynomial `poly` must have eight bits.
+    The register after the word is the same as the register after the row. The polynomial `poly`
+    must have eight bits.
     """
     shares = _assign_sums(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))

@@ -171,9 +171,10 @@ class Schema:
 
     @cached_property
     def separate_parts(self) -> Mapping[str, PartSequence]:
-        """The sequences of parts by path, without those that are arrays.
+        """The sequences of parts that are not arrays, by path.
 
-        The elements of such an array differ in size (`PartSequence.is_array`).
+        An array with elements of different sizes is a sequence of parts as well
+        (`PartSequence.is_array`).
         """
         return {axis: node for axis, node in self.parts.items() if not node.is_array}
 

@@ -40,7 +40,10 @@ MAX_SHOWN_BYTES = 12
 
 
 class _Undecoded(Decoded):
-    """The decoded bytes of a frame that is sent as the bytes of its struct."""
+    """The result for a frame that is sent as the bytes of its struct.
+
+    An offset in the struct is the same offset in the frame.
+    """
 
     @property
     def offsets(self) -> list[int]:
@@ -90,7 +93,7 @@ class Coder:
         return values
 
     def find_size(self, data: bytes) -> int | None:
-        """Return the size of the frame at the start of some bytes.
+        """Return the size of the frame at the start of `data`.
 
         Returns None if the size has to be found by the layout, or if the end of the frame is
         missing.
@@ -120,7 +123,7 @@ class _FieldFinder:
 
 
 def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
-    """Return the fields with known offsets at a node, and the offset after them."""
+    """Return the fields that are known at a node of the header tree, and their end."""
     if isinstance(node.result, Layout):
         return tuple(node.result.leaves.values()), node.result.size
     if isinstance(node.leaf, Leaf):
@@ -373,10 +376,9 @@ def _find_element_types(
 
 @functools.lru_cache(maxsize=256)
 def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the offset of each element, ascending, and the index of its field.
+    """Return the offset of each element, and the index of the field that contains it.
 
-    The elements are those of all fields. A bit block is one element, with the index of its first
-    field.
+    The offsets are ascending. A bit block counts as one element of its first field.
     """
     offsets = [np.zeros(0, np.intp)]
     owners = [np.zeros(0, np.intp)]
