@@ -1,8 +1,8 @@
 """Find the frames in a byte stream or in datagrams.
 
 The frames are returned as `Frames`, which has an array for each property of the frames. All other
-bytes are counted. These modules use no clock, port or thread, and no input bytes raise an
-exception. Modules in reading order:
+bytes are counted and raise no exception. These modules use no clock, port or thread. Modules in
+reading order:
 
 * `results`: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
 * `plausibility`: checks many candidates of one layout at once.

@@ -58,7 +58,7 @@ def sort_datagrams(
 
 
 class _DatagramBatch:
-    """Checks some datagrams, once for each set of active types.
+    """Checks a batch of datagrams, once for each set of active types.
 
     Args:
         regular_frames: the result of checking the datagrams as frames of one type and layout; None

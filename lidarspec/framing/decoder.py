@@ -134,9 +134,9 @@ class Decoder:
         return self._assembly is not None
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
-        """Return the frames that these bytes complete, in stream order.
+        """Decode more input; return the frames that are now complete, in stream order.
 
-        No input bytes raise an exception.
+        Invalid bytes are counted, and raise no exception.
 
         Args:
             data: the next bytes of the stream, or one datagram.
@@ -161,7 +161,7 @@ class Decoder:
         return self.idle()
 
     def frames(self, data: Data, at: int | None = None) -> list[Frames]:
-        """Return the frames that these bytes complete, in stream order.
+        """Decode more input; return the frames that are now complete, in stream order.
 
         This is `feed` with arrays as the result, which is faster for many frames.
 

@@ -147,9 +147,10 @@ class CompiledCodec(Codec):
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
     ) -> list[Group]:
-        """Refuse candidates that are too long, and all candidates in a stream.
+        """Refuse datagrams that are longer than the largest frame of the type.
 
-        This is used for frame types that extend to the end of the datagram.
+        This is used for frame types that extend to the end of the datagram. Such frames do not
+        exist in a stream, so all candidates in a stream are refused.
         """
         is_fitting = np.zeros(len(offsets), np.bool_)
         if stops is not None:

@@ -491,9 +491,9 @@ def _find_bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
 
 
 def _find_window(leaves: Iterable[Leaf]) -> tuple[int, int]:
-    """Return the offset of the first byte of some fields, and the offset after the last.
+    """Return the start and the end of the byte range that contains the fields.
 
-    For arrays, these are the offsets of the first elements.
+    If a field is in an array, its first element counts.
     """
     spans = [leaf.byte_span for leaf in leaves]
     if spans:

@@ -181,7 +181,7 @@ def _count_needed(
 
 
 def _begins_with(marks: Marks, data: bytes) -> bool:
-    """Return whether the given bytes of a frame agree with the constants of a type."""
+    """Return whether the first bytes of a frame agree with the constants of a type."""
     return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
 

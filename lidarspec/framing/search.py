@@ -186,9 +186,9 @@ class _FrameWalk:
                 self._mode.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
-        """Extend the last accepted run, and return the new end of the run.
+        """Extend the run that ends at `position`, and return the new end of the run.
 
-        If the run did not end at `position`, nothing changes, and `position` is returned.
+        Returns `position` if no run ends there, or if the run does not continue.
         """
         if self._mode.run_end != self._base + position:
             return position
@@ -249,8 +249,7 @@ def count_rejected(
     counted if its type is declared before the type of the frame.
 
     Args:
-        stays: pairs of an offset and the value of `SearchState.after` that applies after this
-            offset, in order.
+        stays: pairs of an offset and the value of `SearchState.after` after this offset.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])

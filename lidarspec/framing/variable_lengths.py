@@ -266,7 +266,7 @@ def _iter_by_size(sizes: Offsets) -> Iterator[Offsets]:
 
 
 def _gather_rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
-    """Return `size` bytes from each offset on, (n, size).
+    """Return rows of `size` bytes, one for each start offset, (n, size).
 
     Bytes after the end of the buffer are 0.
     """

@@ -89,7 +89,7 @@ class WeakRuns:
     def _jumps(self) -> list[Indices]:
         """For each row, the rows that are 1, 2, 4, 8 ... frames later in its run, (n,) each.
 
-        If the run ends before, the array has the last row of the run. The last array has the last
+        If the run is too short, the array has the last row of the run. The last array has the last
         row of every run.
         """
         count = len(self.frames)
