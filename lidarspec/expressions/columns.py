@@ -498,7 +498,7 @@ def align(
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Cut each axis of the arrays to its shortest length, so that they broadcast.
+    """Cut the arrays to the shortest length along each axis, so that they broadcast.
 
     Axes of length 1 are not changed. The lengths differ if there are no packets: a column of
     variable length is then empty, but a table of the plugin is not.
@@ -656,7 +656,7 @@ def align_points(
 
     Raises:
         SpecError: if coordinates belong to different arrays of the frame or have different lengths,
-            or if plain arrays vary along an axis, but no field does.
+            or if only plain arrays vary along an array of the frame.
     """
     anchor = Column(
         np.zeros((1,) * (1 + batch.table.schema.depth())),

@@ -358,7 +358,7 @@ class TracedFields:
 
 
 def _check_raw(schema: Schema, path: str) -> None:
-    """Raise UntraceableError unless a field is sent as a number."""
+    """Raise UntraceableError if a field is not sent as a number."""
     if path in schema.derived:
         raise UntraceableError(f"{path} is not sent; it is computed from other fields")
     if schema.find_sequence(path) is not None:
@@ -437,11 +437,11 @@ def make_sample(batch: Batch, group: LayoutRows) -> Batch:
 
 
 def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
-    """Yield the nodes in the graph of some values, each once.
+    """Yield each node in the expressions `values` once.
 
     Args:
         values: nodes, traced columns, or constants, which have no nodes.
-        into: a function that returns whether the arguments of a node are visited as well.
+        into: a function that returns whether to visit the arguments of a node.
     """
     seen = set[Node]()
     waiting = [get_node(value) for value in values]
