@@ -49,7 +49,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
     Raises:
         SourceError: if the file cannot be written.
-        UsageError: if the path is a folder that contains other files than those of an export.
+        UsageError: if the path is a folder with files that are not from an export.
     """
     refuse_foreign_files(path)
     remove_abandoned(path)
@@ -70,7 +70,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_foreign_files(folder: Path) -> None:
-    """Raise UsageError if a folder contains other files than those of an export.
+    """Raise UsageError if a folder contains files that are not from an export.
 
     Replacing the folder would delete these files.
     """
