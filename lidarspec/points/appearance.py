@@ -143,7 +143,7 @@ def find_reach(cloud: PointCloud) -> float:
 def fit_to_points(points: PointCloud, look: CloudAppearance) -> CloudAppearance:
     """Return a copy of `look` in which the central 98 % of the points fill a top view.
 
-    The picture is extended to the sensor, unless this makes the points more than 7 % smaller.
+    The picture is extended to the sensor if this makes the points at most 7 % smaller.
     """
     low, high = find_bounds(points[points.valid])
     with_sensor = np.minimum(low, 0.0), np.maximum(high, 0.0)

@@ -44,10 +44,10 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
 
 def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Return a kernel if it saves time, given the number of points so far.
+    """Return a kernel if it saves time, which requires many points.
 
-    The points of `frames` are counted first. Returns None if a kernel saves no time, or if Numba is
-    missing or fails.
+    The function counts the points. Returns None if a kernel saves no time, or if Numba is missing
+    or fails.
     """
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width

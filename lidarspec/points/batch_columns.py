@@ -230,8 +230,8 @@ class BatchColumns(ColumnSource):
         """Return a column of the points from `start` to `stop`, in stream order.
 
         Args:
-            values: an array for each layout, with the values of all points in the packets of
-                `_packet_range` that have this layout.
+            values: for each layout, the values of all points in its packets. The packets are those
+                of `_packet_range`.
         """
         if self._is_regular:
             skipped = start % self._plan.width

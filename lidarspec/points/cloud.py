@@ -283,8 +283,8 @@ class PointCloud:
         """Return a structured array (N,) with PCL's layout.
 
         The fields are x y z intensity ring time, and the itemsize is 32. Missing columns are 0. If
-        the cloud has columns in `extra`, they follow from byte 32 on, each aligned to its size, and
-        the itemsize is a multiple of 16.
+        the cloud has columns in `extra`, they begin at byte 32, each aligned to its size, and the
+        itemsize is a multiple of 16.
         """
         names = [name for name in STRUCTURED.names or () if self.has_column(name)]
         self.load(*names, *self.extra)

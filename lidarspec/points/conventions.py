@@ -290,7 +290,7 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
     """Return the directions of the x, y and z axes of a sensor's points.
 
-    The axes are the REP-103 axes, unless the vendor's axes are configured.
+    The axes are the REP-103 axes, or the vendor's axes if these are configured.
     """
     if sensor.options.get("frame") == "vendor":
         wanted = sensor.vendor_axes

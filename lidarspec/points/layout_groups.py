@@ -52,8 +52,8 @@ class PlainValues:
     def read_raw(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
         """Return the raw integers of a field, (n, ...).
 
-        The integers are those of packets `first` to `stop - 1`. Returns None unless the node is an
-        integer field without scale that every packet has.
+        The integers are those of packets `first` to `stop - 1`. Returns None if the node is not an
+        integer field, if the field has a scale, or if a packet lacks the field.
         """
         if node.kind == "field":
             info = self._table.schema.fields.get(node.path)
@@ -137,8 +137,8 @@ class GroupPoints:
 
         Args:
             name: the part, for example "range".
-            first, stop: the packets from `first` to `stop - 1`; a `stop` of None means all packets
-                from `first` on.
+            first: the index of the first packet.
+            stop: the index after the last packet; None for the end of the group.
 
         Returns:
             An array of shape (stop - first, *plan.shape). It is float64, except for a column of

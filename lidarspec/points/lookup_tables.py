@@ -109,7 +109,8 @@ def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
-    Returns None unless the expression depends on a single field of one or two bytes.
+    Returns None if the expression depends on several fields, or on a field that is not in one or
+    two bytes.
     """
     source = get_only_field(node)
     if source is not None:

@@ -80,7 +80,7 @@ def byte_at(context, array, index):
 
 @intrinsic
 def word_at(context, array, index):
-    """Return eight bytes from an index on, little-endian."""
+    """Return the little-endian integer in the eight bytes at an index."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -97,7 +97,7 @@ def word_at(context, array, index):
 
 @intrinsic
 def four_at(context, array, index):
-    """Return four bytes from an index on, little-endian."""
+    """Return the little-endian integer in the four bytes at an index."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -230,7 +230,7 @@ def cos_sin(angle):
 
 @njit(forceinline=True, error_model="numpy")
 def modulo(a, b):
-    """Return `np.mod`; if a is between -b and b, no division is needed."""
+    """Return `np.mod(a, b)`, without a division if a is between -b and b."""
     if 0.0 <= a < b:
         return a
     if -b <= a < 0.0:

@@ -116,7 +116,7 @@ def kernel(rows, size, spans, table, start, found):
 def _compute_along_rows(
     algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D
 ) -> NDArray[np.uint64]:
-    """Return the CRCs of some bytes of each row, (n,).
+    """Return the CRC of the covered bytes of each row, (n,).
 
     Args:
         spans: the covered bytes, as pairs of the first offset and the offset after the last.

@@ -483,7 +483,7 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return the code that looks up an angle of one field; None without a table.
+        """Return the code that looks up an angle of one field; None if there is no table.
 
         The table is float32 if this is precise enough.
         """
