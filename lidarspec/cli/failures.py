@@ -99,8 +99,8 @@ def _format_message(error: Exception) -> str:
 def _find_next_command(error: Exception, command: str, verb: str) -> str:
     """Return the command to suggest after an error.
 
-    If a sensor is unknown and a plugin fails to load, it is `lidarspec plugins`, because that
-    plugin may provide the sensor.
+    If a sensor is unknown and a plugin fails to load, the plugin may provide the sensor. The
+    command is then `lidarspec plugins`.
     """
     from lidarspec.plugins import registry
 

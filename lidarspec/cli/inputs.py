@@ -240,7 +240,7 @@ def refuse_overwriting(
 def _iter_read_files(argument: str | Path | Sensor | None) -> Iterator[str | int]:
     """Yield the files that an argument of a verb may name; 0 for standard input.
 
-    Some of them may not exist, because each part of the argument that could be a path is returned.
+    Each part of the argument that could be a path is yielded, so some of the files may not exist.
     """
     if isinstance(argument, Sensor):
         yield from (

@@ -197,7 +197,11 @@ def _format_range(sensor: Sensor) -> str:
 
 
 def _format_unit(sensor: Sensor, path: str) -> str:
-    """Return ", " and the unit of a field, "frame.path"; "" if it has no unit."""
+    """Return a comma and the unit of a field, such as ", m"; "" without a unit.
+
+    Args:
+        path: the field, as "frame.path".
+    """
     from lidarspec.frames.schema import make_schema
 
     frame, _, field = path.partition(".")
