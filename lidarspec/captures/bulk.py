@@ -257,7 +257,7 @@ class CapturedDatagrams:
         return b"".join(map(self.data, range(len(self))))
 
     def of(self, origin: Origin) -> CapturedDatagrams:
-        """Return the datagrams from one address, or from one port of this address."""
+        """Return the datagrams from a requested sender."""
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]

@@ -191,7 +191,7 @@ class CaptureReader(ClosingContext):
         return self._datagrams
 
     def skip_until(self, time_ns: int) -> bool:
-        """Seek to shortly before the first datagram that was captured at a time or later.
+        """Skip datagrams that were captured before a time, if the file can seek.
 
         Skipped datagrams are not counted. A datagram with a skipped fragment is lost.
 
@@ -199,7 +199,7 @@ class CaptureReader(ClosingContext):
             time_ns: ns since 1970.
 
         Returns:
-            Whether seeking was possible.
+            Whether datagrams were skipped.
         """
         return self._form is not None and seek_time(self._source, self._form, time_ns)
 

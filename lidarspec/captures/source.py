@@ -174,9 +174,9 @@ class BufferedInput:
         return have >= size
 
     def _move_unread(self, have: int) -> None:
-        """Move the unread bytes to the start of a buffer, and use this buffer.
+        """Move the unread bytes to the start of the buffer, or to another buffer.
 
-        It is another buffer if the current one has a view, or is too small.
+        Another buffer is used if the current buffer has a view, or is too small.
         """
         size = len(self.storage) - SLACK_BYTES
         tail = self.storage[self.at : self.at + have]
