@@ -271,7 +271,7 @@ def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
 
 
 def _evaluate_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
-    """Return the median time per packet, in ns, that a sensor's `pace` expects."""
+    """Return the median of the times per packet that `pace` calculates, in ns."""
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
@@ -288,7 +288,7 @@ def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
 
 
 def _read_model_names(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return the model names in the first frames with the field `info["model"]`."""
+    """Return the model names in the first frames that contain a model name."""
     if "model" not in sensor.reported:
         return []
     frame, _, path = sensor.reported["model"].paths[0].partition(".")
