@@ -94,9 +94,9 @@ class DeviceInput(Protocol):
                 self.info_frames = {**self.info_frames, role: item}
 
     def _lacks_values(self, role: str, item: Found) -> bool:
-        """Return whether a frame has less information than the stored frame.
+        """Return whether a frame lacks information that the stored frame has.
 
-        This is possible only for frames with optional parts.
+        The result is False for a frame type without optional parts.
         """
         earlier = self.info_frames.get(role)
         if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
