@@ -206,7 +206,7 @@ class FrameRecorder(BackgroundWriter):
             self._write_frames(self._decoder.feed(chunk.data, self._at))
 
     def _write_frames(self, frames: list[Found]) -> None:
-        """Write frames, and the bytes outside frames before them.
+        """Write frames, and the received bytes outside these frames, in order.
 
         Bytes that may belong to an incomplete frame are kept for the next call.
         """
