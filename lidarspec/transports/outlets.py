@@ -112,7 +112,9 @@ class OutletLine:
         raise NotImplementedError
 
     def redirect(self, host: str, port: int) -> None:
-        """Send to another address from now on; only lines that send datagrams do this.
+        """Change the address to which datagrams are sent.
+
+        Lines without datagrams ignore this.
 
         Args:
             host: the address; "" for the same address as before.
@@ -324,7 +326,7 @@ class UdpLine(OutletLine):
     def _listen_for_commands(self) -> None:
         """Receive commands from now on.
 
-        If the listener is on this computer, its SOURCE gets the port to send commands to.
+        If the data is sent to this computer, the port for commands is added to `local_source`.
         """
         self.takes_commands = True
         if self._host == LOCALHOST:

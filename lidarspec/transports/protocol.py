@@ -264,7 +264,7 @@ class LiveTransport(Transport):
     def addressed(self) -> bool:
         """Whether `write` has a destination.
 
-        It has none only if the source sends datagrams and the address of the sensor is unknown.
+        False for a source of datagrams while the address of the sensor is unknown.
         """
         return True
 

@@ -162,8 +162,8 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
 
     Args:
         address: the SOURCE.
-        sensor: the sensor that decodes the data. It is simulated with its options if the SOURCE has
-            its id or no id. Otherwise, the sensor with the id in the SOURCE is simulated.
+        sensor: the sensor that decodes the data. If the SOURCE has no id, or the id of this sensor,
+            this sensor is simulated with its options.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.
