@@ -631,7 +631,7 @@ def _is_large(piece: FilePiece) -> bool:
 def _check_format(to: str) -> None:
     """Check that the library of a format is installed, before any input is read.
 
-    To do so, an empty file is written.
+    The check writes an empty file.
     """
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(ValueError, IndexError):
         write(Path(folder) / f"none.{to}", [])

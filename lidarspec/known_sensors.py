@@ -40,8 +40,8 @@ class Signature(NamedTuple):
     """The constant bytes at the start of a data frame, and the size of the frame.
 
     Attributes:
-        sync: hexadecimal digits of each byte, ".." for a byte that is not constant, separated by
-            spaces.
+        sync: the bytes as hexadecimal text, such as "54 .. 2c"; ".." is a byte that is not
+            constant.
         size: the size of the frame in bytes; 0 if it varies.
     """
 

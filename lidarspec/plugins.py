@@ -1048,7 +1048,7 @@ def no_sensors_error(path: str = "") -> SpecError:
     """Return the error for a file without a hook that returns sensors.
 
     Args:
-        path: the file; "" if the caller names it.
+        path: the file; "" for a message without the file.
     """
     return SpecError(
         "the file declares no sensors: add a function lidarspec_sensors, decorated with"
