@@ -134,7 +134,7 @@ def _make_field(
 
     Args:
         keys: the keys of the field.
-        pairs: pairs of a bit of the block and its weight.
+        pairs: (bit of the block, weight) for each bit of the value.
         flag: whether the field is parsed as False or True.
     """
     width = len(pairs)

@@ -99,7 +99,7 @@ class Simulation:
         directions: a function of the frame number i that returns the azimuths and elevations of the
             points of the frame, radians, as two arrays that broadcast to the points of a frame.
             Needed for `Cartesian` points.
-        effects: by command, a function that returns the sweep to use after the command. The
+        effects: for each command, a function that returns the sweep to use after the command. The
             arguments of the function are the sweep so far and the number of the next frame. The new
             sweep counts frames from 0. Only for a sensor, not for a frame type.
         date: a function of seconds since 1970 that returns physical values, by path, of fields that

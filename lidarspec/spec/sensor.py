@@ -279,7 +279,7 @@ class SensorDescription:
 
     @property
     def announces_port(self) -> bool:
-        """Whether a command in `on_open` contains the port of this computer for the data."""
+        """Whether a command in `on_open` contains this computer's port for the data."""
         return any(self.commands[name].has_own_port for name in self.on_open)
 
     @property
@@ -562,7 +562,7 @@ class Configure:
         return self.types.get(name, OptionType()).accepts(value)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Return the options of an untrusted file, with whole paths.
+        """Check the options of an untrusted file, and return them with whole paths.
 
         Valid values are numbers, words, learned content, and paths of files in `folder` or below
         it.

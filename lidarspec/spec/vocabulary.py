@@ -321,7 +321,7 @@ def take(table: Array, index: Array) -> Array:
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
     """Return the row of a table for each index, in the shape of `index`.
 
-    For an index that is out of range, it is the last row, which contains nan.
+    An index that is out of range gives the last row, which contains nan.
     """
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 

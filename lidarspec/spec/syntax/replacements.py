@@ -575,7 +575,7 @@ class CountField(Subconstruct):  # type: ignore[misc]
 class BoundedPart(Subconstruct):  # type: ignore[misc]
     """A part that is parsed from `length` bytes.
 
-    A built part has the size of its values.
+    `build` ignores `length`, and writes all bytes of the given values.
     """
 
     def __init__(self, length: Any, subcon: Construct) -> None:

@@ -667,7 +667,7 @@ def is_independent(con: Construct, kinds: tuple[type, ...] = _INDEPENDENT_KINDS)
 
 
 def to_public(parsed: Any) -> Any:
-    """Return a parsed object for users, without private entries, with `EnumValue`s."""
+    """Return a parsed object without private entries, and with `EnumValue`s."""
     if isinstance(parsed, dict):
         return Container(
             {name: to_public(value) for name, value in parsed.items() if not name.startswith("_")}
