@@ -180,11 +180,11 @@ class ClockEpoch:
     def _find_nearest_time(self, reading: int, seconds: float) -> int:
         """Return the time at which the clock shows a reading, ns since 1970.
 
-        The clock shows each reading repeatedly. The result is the time nearest to a date.
+        The clock shows each reading repeatedly. The result is the time nearest to `seconds`.
 
         Args:
             reading: the reading, ns.
-            seconds: the date, seconds since 1970.
+            seconds: a date, seconds since 1970.
         """
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 

@@ -155,7 +155,7 @@ class Packets:
 
     @property
     def frame_type(self) -> str:
-        """The frame type of the packets, or for parts, of the frames that contain them."""
+        """The frame type of the packets; for parts, the type of the frames around them."""
         return self.frame.partition(".")[0]
 
     def count(self, array: str) -> NDArray[np.intp]:

@@ -55,7 +55,7 @@ def _to_sizes(values: Any, count: int) -> NDArray[np.int64]:
 
 
 def describe_incomplete_groups(count: int) -> str:
-    """Return a sentence about the number of incomplete groups, `incomplete_returns`."""
+    """Return a sentence that states the number of incomplete groups."""
     if count == 1:
         return "1 group of packets lacks a return, because packets were lost"
     return f"{count} groups of packets lack a return, because packets were lost"
