@@ -413,7 +413,7 @@ class Measurement:
 
 
 class PointPlacement(Measurement):
-    """Writes Cartesian points into frames: for each beam, the point that it hits.
+    """Writes the coordinates of the point that each beam hits into frames.
 
     Raises:
         SpecError: if no directions are declared, or no field determines the coordinates of a point.
