@@ -375,7 +375,7 @@ class CLayout:
     def _iter_members(self, entry: CEntry) -> Iterator[CEntry]:
         """Yield an entry for each member of a struct.
 
-        Each entry has the start of the struct. The caller replaces it.
+        The entries have the start of the struct instead of the start of the member.
         """
         node = entry.node
         if isinstance(node, tree.Sealed):
@@ -554,7 +554,7 @@ def _write_count(layout: CLayout, axis: str) -> Iterator[str]:
 
 
 def _write_field(layout: CLayout, path: str) -> Iterator[str]:
-    """Yield the C functions of a field, for its value, its presence and unit conversions."""
+    """Yield the C functions of a field: for value, presence and unit conversions."""
     ways = find_accesses(layout, path)
     name = layout.name(path, "")
     first = ways[0]

@@ -247,7 +247,7 @@ def as_block(node: tree.Node) -> tree.Node:
 
 
 def _make_part_name(part: tree.Part) -> str:
-    """Return the name of a part in the type of its block."""
+    """Return the name of a part of a bit block in the block's Kaitai type."""
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
@@ -292,7 +292,7 @@ def _find_bit_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _find_starts(bits: BitField, suffix: str) -> set[int]:
-    """Return the position at which the field begins, calculated from each segment.
+    """Return the positions at which the field begins, calculated from each segment.
 
     If all segments give the same position, Kaitai can read the field as consecutive bits.
     """
