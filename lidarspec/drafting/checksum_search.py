@@ -162,7 +162,7 @@ class ChecksumWithConstant(Checksum):
         return (1 << self.width) - 1
 
     def _combine(self, values: Values) -> Values:
-        """Return values of the other checksum combined with the constant."""
+        """Return values of the base checksum combined with the constant."""
         constant = np.uint64(self.constant)
         if isinstance(self.base, Xor | WordXor):
             return values ^ constant
