@@ -270,7 +270,7 @@ def _measure_size(path: Path) -> int:
 
 
 def _count_packets(contents: FileContents, opened: Transport) -> None:
-    """Count the packets at the beginning of a file, and find the first and last time."""
+    """Count packets at the beginning of a file; find the first and last arrival time."""
     flows = dict[tuple[Sender | None, Sender | None], PacketFlow]()
     bytes_left = MAX_BEGINNING_BYTES
     chunks = opened.chunks()

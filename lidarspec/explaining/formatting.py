@@ -327,7 +327,7 @@ class FieldDifference:
 
     @property
     def change(self) -> str:
-        """The signed change of the field's number as text; "" for any other field."""
+        """The signed change of a number as text; "" if the field is not a plain number."""
         if (
             not self.before
             or not self.after
