@@ -428,7 +428,10 @@ def _find_function(frame: str, name: str, sensor: Sensor | None) -> Location | N
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield (kind, name, line) of each text that may be a key, a frame type or a sensor."""
+    """Yield (kind, name, line) of each text that may name a part of a sensor.
+
+    The kind is "key" for the key of a dict, "frame" for a frame type, or "sensor" for an id.
+    """
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):

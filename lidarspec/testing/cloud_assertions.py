@@ -74,7 +74,7 @@ def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS
 
 
 def _find_extents(cloud: PointCloud) -> NDArray[np.float32]:
-    """Return the larger of range and coordinates of each point, at least 1 m."""
+    """Return the largest of range, x, y and z of each point, at least 1 m."""
     lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
     with np.errstate(invalid="ignore"):
         size = np.nanmax(np.abs(lengths), axis=0, initial=0).astype(np.float32)

@@ -1,7 +1,7 @@
 """Checks that the parts of a declaration agree: angles, points, clock and times.
 
-Packets are made from the sensor's `sweep`. Some of them come late in the sweep, because the first
-packets seldom cross the full circle, and seldom reach the time at which the clock wraps.
+Packets are made from the sensor's `sweep`. Some packets are far into the sweep, because the first
+packets seldom cross the full circle or reach the time at which the clock wraps.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _turn_angles(
 def _read_azimuths(
     subject: SensorUnderTest, name: str, values: Mapping[str, Any]
 ) -> NDArray[np.float64] | None:
-    """Return the azimuths of a packet with these values; None if it is invalid."""
+    """Return the azimuths of a packet with these values; None for an invalid packet."""
     try:
         frame = FrameMaker(subject.sensor, name).frame(values)
         packets = decode_frames(

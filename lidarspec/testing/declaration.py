@@ -459,7 +459,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
 def _check_sync(
     subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCodec
 ) -> Findings:
-    """Yield a finding if the frame's first constants are frequent in payloads."""
+    """Yield a finding if the first constants of a frame often occur in payloads."""
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:

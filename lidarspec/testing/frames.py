@@ -319,7 +319,7 @@ def build_if_valid(subject: SensorUnderTest, name: str, values: Any) -> bytes | 
 
 
 def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> None:
-    """Check that drawn values of fields are the same after building and parsing."""
+    """Check that random values of fields are the same after building and parsing."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
     sensor = subject.sensor

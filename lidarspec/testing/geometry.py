@@ -198,7 +198,7 @@ def calculate_directions(
     """Return the azimuths and elevations of packets as `points` calculates them.
 
     The angles are not reduced to one full circle. If `points` returns Cartesian coordinates, the
-    result has the directions that the simulation declares, or is None if it declares none.
+    result has the directions that the simulation declares; None if there are none.
     """
     packets = packets.with_points
     batch = packets.batch()

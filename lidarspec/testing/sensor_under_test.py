@@ -52,8 +52,8 @@ def mutate(
     Bytes are changed, dropped, doubled, inserted, or overwritten.
 
     Args:
-        words: byte strings that are inserted or that overwrite other bytes, such as values at the
-            edge of a range, or parts of other inputs.
+        words: byte strings to insert or to write over existing bytes, for example values at the
+            edge of a range.
         offsets: offsets for half of the changes, for example the offsets of fields. By default, all
             offsets are random.
     """

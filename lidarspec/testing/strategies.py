@@ -327,7 +327,7 @@ def _boxes(draw: DrawFn) -> Box:
 def _join_frames(sensor: Sensor, packets: list[bytes]) -> Any:
     """Return data frames as the data link transmits them.
 
-    If data frames are only valid after another frame, that frame is the first.
+    If data frames must follow a frame of another type, a frame of this type is the first.
     """
     announced = [make_opening_frame(sensor), *packets]
     if sensor.datagrams:

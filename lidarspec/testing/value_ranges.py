@@ -93,7 +93,7 @@ class LayoutRanges:
         return self._make_rows([self.repair(values, kept)]).tobytes()
 
     def _rebase(self, values: Mapping[str, Values]) -> LayoutRanges | None:
-        """Return new ranges with a `base` that has these values; None if none is found."""
+        """Return ranges with a `base` that has these values; None if no base is found."""
         fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
         for path, value in values.items():
             elements = itertools.cycle(value.flat)
