@@ -36,7 +36,7 @@ def lidarspec_verbs() -> list[click.Command]:
 
 @hookimpl
 def lidarspec_source(url: str, sensor: Sensor | None) -> Transport | None:
-    """Return the transport of a topic's packets, ``ros2:/TOPIC``."""
+    """Return the transport for a URL ``ros2:/TOPIC``; None for any other URL."""
     scheme, _, topic = url.partition(":")
     if scheme != "ros2":
         return None
