@@ -339,7 +339,7 @@ class Broadcast:
             self.news()
 
     def _update_scan(self) -> bool:
-        """Show the newest scan, and return whether there is a new one."""
+        """Update the shown scan, and return whether there is a new scan."""
         feed = self._feed
         if feed.scan is None or feed.number == self._seen_count:
             return False

@@ -436,7 +436,7 @@ def _read_command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """Return the name of a command, and its non-empty arguments as text.
 
     Raises:
-        UsageError: if the request has no such values.
+        UsageError: if the name is missing, or if the arguments are not texts.
     """
     name = request.get("command")
     arguments = request.get("arguments", {})

@@ -3,7 +3,8 @@
 A decoder passes its input, and the frames that it has found, to `RecentBytes` (a
 `DecoderObserver`). Both are stored unchanged, up to a limit, so that reading is not slowed down.
 The bytes of a frame are copied only on request. Bytes that the decoder has skipped are copied at
-once, because their input is soon dropped. They are explained when a page requests it.
+once, because their input is soon dropped. Skipped bytes are explained when a page requests their
+explanation.
 """
 
 from __future__ import annotations
@@ -271,7 +272,7 @@ class RecentBytes:
             self._input_size -= inputs.popleft().size
 
     def _keep_skipped(self, frames: Frames) -> None:
-        """Store the bytes that were skipped before some of these frames."""
+        """Store the bytes that the decoder skipped before these frames."""
         ends = frames.offsets + frames.sizes
         previous_ends = np.concatenate([[self._end], ends[:-1]])
         for index in np.flatnonzero(frames.gaps).tolist()[-MAX_DAMAGED:]:

@@ -72,7 +72,7 @@ def remove_stale_folders() -> None:
 
 
 def _make_folder() -> tuple[Path, int | None]:
-    """Return a new folder, and the descriptor that locks it."""
+    """Return a new folder, and the file descriptor that locks the folder."""
     while True:
         path = Path(tempfile.mkdtemp(prefix=PREFIX))
         if sys.platform == "win32":
