@@ -402,7 +402,7 @@ def older_sweep(i: int) -> dict[str, float]:
 
 
 def make_request(mode: str, **more: Any) -> Command:
-    """Return a command; its acknowledgement has the same mode.
+    """Return a command whose acknowledgement has the same mode as the command.
 
     The command is sent again if no reply arrives, because a repetition has no further effect.
     """

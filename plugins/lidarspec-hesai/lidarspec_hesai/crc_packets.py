@@ -3,12 +3,12 @@
 The models are QT128, Pandar128, OT128, JT128 and AT128.
 
     EE FF  major minor  status reserved | lasers blocks first_return dis_unit return_num flags
-    2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [,
-    signature]
+    2 x [azimuth, channels], CRC [, functional safety], tail [, sequence] [, IMU], CRC
+    [, signature]
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h). The bytes that each CRC
-covers were found in a capture of a QT128. They are assumed to be the same for the other models,
-where CRCs are not verified.
+covers were found in a capture of a QT128. The same bytes are assumed for the other models, whose
+CRCs are not verified.
 """
 
 from __future__ import annotations

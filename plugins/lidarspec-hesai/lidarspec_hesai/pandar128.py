@@ -227,9 +227,10 @@ def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return, by id, how to recognize the other models that send these packets.
+    """Return, by id, how to recognize the models that send these packets.
 
-    Their packets have another status. `own` is the id of this model.
+    The models are recognized by the status in their packets. `own` is the id of this model, which
+    is left out.
     """
     others = {
         "hesai-pandar128": Relative(

@@ -1,7 +1,7 @@
 """Shared by all packets of the family: date, return modes, points of a shot.
 
-Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which
-reproduces its published clouds).
+Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry; it
+reproduces the point clouds that nebula publishes).
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def make_command(code: str, **more: Any) -> Command:
 
 
 def make_commands(rates: tuple[int, int]) -> Mapping[str, Command]:
-    """Return the commands of a unit; `rates` has its lowest and its highest speed in rpm."""
+    """Return the commands of a unit; `rates` are the lowest and highest speed in rpm."""
     return {
         "get_calibration": make_command(
             "get_calibration", learns=lambda reply: {"calibration": bytes(reply.payload)}

@@ -167,7 +167,12 @@ URG_ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 
 
 def list_orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """Return all commands of a scanner that sends scans of this kind."""
+    """Return the commands of a scanner that sends scans of this kind.
+
+    Returns:
+        name -> (letters of the command, number of characters after the letters, arguments of
+        `Command`).
+    """
     scans = {
         "start": (SCAN_COMMANDS[kind][0].encode(), 13, {"starts": True}),
         "get_scan": (SCAN_COMMANDS[kind][1].encode(), 10, {}),

@@ -473,8 +473,8 @@ def make_setter(
     Args:
         frame: the frame of the request.
         name: a key of `PARAMETERS`.
-        values: fixed values by their field in the parameter.
-        args: argument -> its field in the parameter, and its range.
+        values: the fixed values, by the name of a field in the parameter.
+        args: for each argument, the name of a field in the parameter and the range.
         more: further arguments of `Command`.
     """
     all_values = {

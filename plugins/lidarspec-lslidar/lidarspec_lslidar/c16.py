@@ -1,7 +1,7 @@
 """LSLIDAR C16 with packets of 1212 bytes: a rotating lidar with 16 lasers over UDP.
 
 Numbers are little-endian. A previous edition of the C16 sends packets of 1206 bytes, which are the
-same as those of a Velodyne except for their angles. They are not supported.
+same as those of a Velodyne except for their angles. These packets are not supported.
 
 Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
 manual of the C32 for the offsets of the device information. The lasers fire at intervals of 3.125

@@ -302,12 +302,12 @@ def make_imu_frame(samples: int, rotation: Rotation) -> Frame:
 
 
 def sample_times(samples: int, i: int) -> dict[str, Any]:
-    """Return the times of samples in simulated packet i, 100 packets a second."""
+    """Return the times of the samples in simulated packet i, at 100 packets a second."""
     return {"samples.timestamp": (i + np.arange(samples) / samples) * 10_000_000}
 
 
 def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
-    """Return the IMU measurements in the axes of the sensor: rad/s, m/s2 and seconds.
+    """Return the IMU measurements in rad/s, m/s2 and seconds, in the sensor's axes.
 
     Args:
         path: the array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single

@@ -1,10 +1,10 @@
-"""Recognize the layout of packets from their content, because they do not declare it.
+"""Recognize the layout of packets from their content.
 
-Several layouts have the same packet length, for example 32 pixels of 16 bytes, 64 pixels of 8 bytes
-and 128 pixels of 4 bytes. If the tried layout has too many pixels, every second or fourth range is
-actually another field. The mean ranges of four adjacent rows then differ. Among layouts with the
-same number of pixels, the first one in `PROFILES` whose unused bits are 0 in most pixels is used.
-Some layouts cannot be distinguished.
+Packets do not declare their layout. Several layouts have the same packet length, for example 32
+pixels of 16 bytes, 64 pixels of 8 bytes and 128 pixels of 4 bytes. If the tried layout has too many
+pixels, every second or fourth range is actually another field. The mean ranges of four adjacent
+rows then differ. Among layouts with the same number of pixels, the first one in `PROFILES` whose
+unused bits are 0 in most pixels is used. Some layouts cannot be distinguished.
 
 In LEGACY, the number of columns per revolution is determined from the encoder. In other profiles,
 it is estimated from the largest column number and the time between columns. The estimate assumes
@@ -96,7 +96,7 @@ def estimate_turn(columns: Bytes2D, profile: str) -> int:
 
 
 def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
-    """Return the columns, (n * 16, bytes); None if their headers are not valid."""
+    """Return the columns of packets, (n * 16, bytes); None if a header is invalid."""
     has_header = profile != "LEGACY"
     if has_header and not (packets[:, 0] == 1).all():
         return None

@@ -82,7 +82,7 @@ GRAVITY = 9.80665
 
 
 def make_firing_times(*times: float) -> Any:
-    """Return the time from a block's azimuth to each laser's firing, (blocks, lasers).
+    """Return how long after a block's azimuth each laser fires, (blocks, lasers).
 
     The result is in seconds. `times` has the firing time of each group of eight lasers in a pair of
     blocks, in microseconds.

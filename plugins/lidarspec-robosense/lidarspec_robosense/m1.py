@@ -203,7 +203,7 @@ def pace(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Polar:
-    """Return range and direction as sent; the sent angles have REP-103 axes.
+    """Return the sent ranges and directions, which have REP-103 axes.
 
     The column of a point is the number of its firing in the frame. The two returns of a firing have
     the same column and ring.

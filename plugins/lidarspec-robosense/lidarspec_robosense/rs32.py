@@ -1,6 +1,6 @@
 """RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP.
 
-Their DIFOP packets have the first layout, see `rotor`.
+Their DIFOP packets have the first of the layouts that `rotor` describes.
 
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); ros_rslidar (the angles of an

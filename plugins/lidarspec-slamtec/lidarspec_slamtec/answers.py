@@ -2,8 +2,8 @@
 
 Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0 for one reply, 1 for an endless
 stream) and a type. A single reply and its descriptor are one frame. The descriptor of a stream is a
-frame of its own. After it, the announced kind of data frames is searched for until another
-descriptor arrives.
+frame of its own. After this frame, the decoder searches for the announced kind of data frames until
+another descriptor arrives.
 
 Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response";
 configuration keys and the widths of their values from the vendor's SDK (sl_lidar_cmd.h).

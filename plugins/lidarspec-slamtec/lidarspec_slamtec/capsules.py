@@ -2,8 +2,8 @@
 
 The angles of the other points are computed with the start angle of the next capsule: point k of N
 is at ``start + (next start - start) * k / N``, minus a compensation. The points of a capsule have
-no direction if the next capsule is missing, or if it has the bit S, which marks the first capsule
-after a start.
+no direction if the next capsule is missing or has the bit S, which marks the first capsule after a
+start.
 
 All four kinds of capsules begin with two bytes. Each of these bytes has a sync nibble (A or 5) and
 a nibble of the checksum, which is the XOR of all following bytes.

@@ -3,20 +3,20 @@
 An HQ capsule has a CRC-32, but a node has no checksum. A node is valid if S and its inverse differ,
 the check bit is 1 and the angle is below 360 degrees. This is true for 17.6 % of all random
 sequences of five bytes. Nodes are therefore accepted only in runs of `CONFIRM` nodes without a gap.
-The table shows how many nodes were accepted that were not sent, if runs of 1, 6, 8 or 10 nodes are
-required. 10 is the selected value:
+The table shows the number of false nodes, i.e. accepted nodes that were not sent, if runs of 1, 6,
+8 or 10 nodes are required. 10 is the selected value:
 
     random bytes, 8 MiB                          865 530    1 192      32       0
     express capsules, 2 MiB                      227 743    3 767     551     159
     dense capsules, 2 MiB                        167 960    6 243   1 133     132
     ultra capsules, 2 MiB                        135 276        0       0       0
     HQ capsules, 2 MiB                           133 149        0       0       0
-    joining nodes in the middle of one, 300 x        135        9       0       0
+    beginning in the middle of a node, 300 x         135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
 If distances hardly change, every cabin of a capsule has the same bits, which explains the numbers
 in rows two and three. Nodes are searched for only after the descriptor 81. Capsules are therefore
-searched for nodes only if a later descriptor was lost. The nodes in the last row continue an
+searched for nodes only if a later descriptor was lost. The false nodes in the last row continue an
 accepted run at a shifted offset, which no run length prevents. Of 419,430 nodes that were sent,
 411,423 are found with runs of 1, and 395,728 with runs of 10. The distances in the streams have a
 noise of a few millimetres. A test repeats this with less data.
@@ -114,7 +114,7 @@ def hq_points(f: Fields) -> Polar:
 
 
 def node_sweep(i: int) -> Mapping[str, Any]:
-    """Return the values of simulated node i, 360 per revolution."""
+    """Return the values of simulated node i; a revolution has 360 nodes."""
     start = int(i % NODES_PER_TURN == 0)
     return {
         "head.start": start,
@@ -124,6 +124,6 @@ def node_sweep(i: int) -> Mapping[str, Any]:
 
 
 def hq_sweep(i: int) -> Mapping[str, Any]:
-    """Return the values of simulated capsule i, ten per revolution."""
+    """Return the values of simulated capsule i; a revolution has ten capsules."""
     indices = (i * HQ_NODES + np.arange(HQ_NODES)) % HQ_NODES_PER_TURN
     return {"nodes.angle": indices * 360 / HQ_NODES_PER_TURN, "nodes.flag.start": indices == 0}

@@ -329,7 +329,7 @@ def date_values(i: int, rate: float) -> dict[str, Any]:
 
 
 def pvt_sweep(i: int) -> dict[str, Any]:
-    """Return the values of simulated solution i, of five a second.
+    """Return the values of simulated solution i, at five solutions a second.
 
     The receiver moves northward at 1 m/s from the manual's position.
     """

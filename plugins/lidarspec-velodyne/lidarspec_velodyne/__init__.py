@@ -4,10 +4,10 @@ Spinning lidars with 16 to 128 lasers over UDP.
 
 Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and
 ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
-focal distances. Lasers have vertical offsets, which result from the focal distance. They are
-documented for the VLP-16 (11.2 mm at -15 degrees). ros-drivers and nebula ignore them, so their z
-differs from this module by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm
-(VLS-128).
+focal distances. Lasers have vertical offsets, which result from the focal distance. The offsets are
+documented for the VLP-16 (11.2 mm at -15 degrees). ros-drivers and nebula ignore the offsets, so
+their z differs from that of this module by up to 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C)
+and 27 mm (VLS-128).
 
 Sources contradict each other on the firing times of a VLS-128. In ros-drivers, one idle slot
 follows eight groups, and the first firing is 8.7 us before the packet's time. In velodyne_decoder,

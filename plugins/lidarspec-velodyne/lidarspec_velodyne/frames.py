@@ -200,7 +200,7 @@ def nmea_seconds(f: Fields) -> Any:
     Sentences are ignored while the clock is not locked to the PPS.
 
     Returns:
-        The time for the packet with the sentence, nan for all further packets, (n,).
+        The time for the packet with the sentence, nan for all other packets, (n,).
     """
     is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
     seconds = np.full(len(is_locked), np.nan)

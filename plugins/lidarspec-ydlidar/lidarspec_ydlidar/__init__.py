@@ -128,7 +128,7 @@ def make_points_function(sample_format: SampleFormat) -> Callable[[Fields], Poin
 
 
 def points(f: Fields, sample_format: SampleFormat) -> Polar:
-    """Return points at equal angular steps from FSA to LSA.
+    """Return points at equal steps from the first angle (FSA) to the last angle (LSA).
 
     On models that measure by triangulation, angles are corrected by an amount that depends on the
     distance ("angle analysis").
