@@ -371,7 +371,7 @@ def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]
     """Return the raw value and the description of a field.
 
     If the field is in repeated parts, the value of the first part that has the field is returned.
-    Without such a part, the value is "".
+    If no part has the field, the value is "".
     """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
