@@ -553,7 +553,7 @@ class LiveInput(DeviceInput):
     def _request_port_again(self) -> None:
         """Send the opening commands again, because a reply contains the port of the data.
 
-        Does nothing until `REPEAT_PAUSE_S` have passed since the last repetition.
+        Does nothing if the commands were repeated less than `REPEAT_PAUSE_S` ago.
         """
         if time.monotonic() >= self._repeat_due_s:
             self._repeat_due_s = time.monotonic() + REPEAT_PAUSE_S
