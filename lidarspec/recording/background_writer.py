@@ -236,7 +236,7 @@ class BackgroundWriter:
     def wait_for_room(self) -> None:
         """Wait until there is memory for more records.
 
-        A caller that records a source that can wait, such as a file, calls this regularly.
+        Call this regularly when the source can wait, such as a file.
 
         Raises:
             SourceError: if the file cannot be written, or the disk is too slow.
