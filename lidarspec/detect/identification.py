@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,12 +33,20 @@ from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.detect.uninstalled_sensors import suggest_installation
 from lidarspec.device.named_devices import find_device
 from lidarspec.drafting.checksum_search import search
-from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
+from lidarspec.errors import (
+    CommandError,
+    LidarSpecError,
+    SpecError,
+    UsageError,
+    WireError,
+    suggest,
+)
 from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import VALID, Found, Frames, pack_found
 from lidarspec.packets.packets import Packets
@@ -531,7 +540,8 @@ def _score_each(
 ) -> list[Score]:
     """Return the scores of the sensors that fit.
 
-    If several sensors have identical frames, the bytes are decoded only once.
+    If several sensors have identical frames, the bytes are decoded only once. A sensor with a
+    faulty description is ignored with a warning.
 
     Args:
         candidates: the sensors.
@@ -547,7 +557,11 @@ def _score_each(
             ),
         )
         if frames not in shared:
-            shared[frames] = rate(sensor)
+            try:
+                shared[frames] = rate(sensor)
+            except SpecError as error:
+                warnings.warn(f"{sensor.id} is ignored: {error}", stacklevel=2)
+                shared[frames] = None
         if (score := shared[frames]) is not None:
             shared[sensor.id] = replace(
                 score,
@@ -575,6 +589,8 @@ def _score(
     items += decoder.finish()
     count = sum(decoder.stats.frames.get(name, 0) for name in sensor.main_frames)
     if not count:
+        if failure := decoder.stats.failure(sensor.id):
+            warnings.warn(str(failure), stacklevel=2)
         return None
     share = 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in
     return Score(sensor, share, count, tuple(items))
@@ -867,18 +883,29 @@ def find_nearest_fault(data: bytes) -> WireError | None:
 
 
 def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
-    """Return whether the bytes are exactly one valid and plausible frame of a type."""
+    """Return whether the bytes are exactly one valid and plausible frame of a type.
+
+    No bytes are a frame of a type with a faulty description.
+    """
     frame = sensor.frames[name]
     if not 0 < len(data) <= frame.max_length:
         return False
-    engine = get_codec(frame)
-    if any(
-        offset >= len(data) or data[offset] & mask != value
-        for offset, (mask, value) in engine.prefix.items()
-    ):
+    try:
+        codec = get_codec(frame)
+        if not _has_prefix(codec, data):
+            return False
+        survey = codec.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+    except SpecError:
         return False
-    survey = engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
     return bool(survey.status[0] == VALID and survey.sizes[0] == len(data))
+
+
+def _has_prefix(codec: Codec, data: bytes) -> bool:
+    """Return whether bytes begin with the constants of a frame type."""
+    return not any(
+        offset >= len(data) or data[offset] & mask != value
+        for offset, (mask, value) in codec.prefix.items()
+    )
 
 
 def _begins_like_frame(fault: WireError) -> bool:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import SpecError
+from lidarspec.errors import LidarSpecError, PluginError, SpecError
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
@@ -139,6 +140,8 @@ class FormCoder(Coder):
         tree: the layouts of the struct.
         prefix: the bytes before the first number that are the same in all frames, by offset.
 
+    All methods raise `PluginError` if a plugin's wire form raises an exception.
+
     Raises:
         SpecError: if the fields of the struct do not have computable offsets.
     """
@@ -166,17 +169,18 @@ class FormCoder(Coder):
                 break
             texts.append([known.get(place) for place in range(offset, offset + run.size)])
             offset += run.size
-        begins = self.form.begins(texts)
+        with _form_errors(self.form.begins):
+            begins = tuple(self.form.begins(texts))
         return {offset: byte for offset, byte in enumerate(begins) if byte is not None}
 
     def decode(self, data: bytes) -> Decoded:
-        size = self.form.find_end(data[: self._limit])
+        size = self.find_end(data[: self._limit])
         if not data:
             decoded = Decoded(b"", [], 0)
         elif size > 0:
             decoded = self.decode_whole(data[:size])
         else:
-            decoded = self.form.decode(data, _FieldFinder(self.tree))
+            decoded = self.decode_whole(data)
         return replace(decoded, problem=self._find_problem(data, size, decoded))
 
     def decode_whole(self, data: bytes) -> Decoded:
@@ -184,10 +188,19 @@ class FormCoder(Coder):
 
         If the bytes are invalid, the `reason` of the result's `problem` may be empty.
         """
-        return self.form.decode(data, _FieldFinder(self.tree))
+        with _form_errors(self.form.decode):
+            decoded = self.form.decode(data, _FieldFinder(self.tree))
+            if not isinstance(decoded, Decoded):
+                raise TypeError(f"returned {type(decoded).__name__}, expected Decoded")
+        return decoded
+
+    def find_end(self, data: bytes) -> int:
+        """Return the size of the frame at the start of some bytes, as `WireForm.find_end` does."""
+        with _form_errors(self.form.find_end):
+            return int(self.form.find_end(data))
 
     def find_size(self, data: bytes) -> int | None:
-        size = self.form.find_end(data[: self._limit])
+        size = self.find_end(data[: self._limit])
         if size > 0:
             return size
         return None
@@ -207,7 +220,8 @@ class FormCoder(Coder):
         layout = self.tree.find_node(struct, is_whole_frame=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
-        data = self.form.encode(struct, list_runs(layout))
+        with _form_errors(self.form.encode):
+            data = bytes(self.form.encode(struct, list_runs(layout)))
         decoded = self.decode(data)
         if decoded.problem is None and decoded.struct == struct:
             return data
@@ -224,9 +238,9 @@ class FormCoder(Coder):
             part = rows[:, begin : begin + int(run.sizes.sum())]
             begin += part.shape[1]
             if isinstance(run, NumberRun):
-                largest = np.array(
-                    [self.form.largest(size) for size in run.sizes.tolist()], np.uint64
-                )
+                with _form_errors(self.form.largest):
+                    sizes = run.sizes.tolist()
+                    largest = np.array([self.form.largest(size) for size in sizes], np.uint64)
                 for row in part:
                     values = _wrap_values(run.from_bytes(row.tobytes()), largest)
                     if isinstance(self.form, DrawsValues):
@@ -269,6 +283,23 @@ class FormCoder(Coder):
         got = data[offset : offset + MAX_SHOWN_BYTES]
         reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"
         return Problem(offset, reason, path=path, expected=expected, got=got)
+
+
+@contextmanager
+def _form_errors(method: Callable[..., Any]) -> Iterator[None]:
+    """Convert exceptions of a method of a plugin's wire form to `PluginError`.
+
+    Exceptions of lidarspec's own wire forms are not converted, because they are bugs.
+    """
+    try:
+        yield
+    except LidarSpecError:
+        raise
+    except Exception as error:
+        if method.__module__.partition(".")[0] == "lidarspec":
+            raise
+        what = f"wire form, {method.__qualname__}"
+        raise PluginError.of(error, what, function=method) from error
 
 
 def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:

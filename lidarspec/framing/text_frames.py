@@ -20,7 +20,7 @@ from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
 from lidarspec.spec.description import Frame
-from lidarspec.spec.wire_forms import NO_END, find_ends
+from lidarspec.spec.wire_forms import NO_END, NO_FRAME, BulkEnds
 
 #: The maximum number of candidates of a piece that are stored with their structs.
 MAX_REMEMBERED = 64
@@ -60,28 +60,60 @@ class TextCodec(Codec):
         if stops is None:
             stops = np.full(len(offsets), len(buffer))
         stops = np.minimum(offsets + self.frame.max_length, stops)
-        sizes = find_ends(self._coder.form, buffer, offsets, stops)
+        errors = list[PluginError]()
+        sizes, is_failed = self._find_ends(buffer, offsets, stops, errors)
         number_needed = np.where(sizes == NO_END, self.frame.max_length, self._prefix_size)
         status = np.where(offsets + number_needed > stops, SHORT, LENGTH).astype(np.uint8)
+        status[is_failed] = PLUGIN
         is_complete = (sizes > 0) & (status != SHORT)
         sizes[~is_complete] = 0
         frames = Frames(buffer, repeat(kind, len(offsets)), offsets, sizes, status=status)
         self._found = {}
         if is_complete.any():
-            self._check_whole(frames, np.flatnonzero(is_complete).tolist(), status, sums)
+            self._check_whole(frames, np.flatnonzero(is_complete).tolist(), status, errors, sums)
+        frames.errors = tuple(errors)
         return frames
 
+    def _find_ends(
+        self,
+        buffer: NDArray[np.uint8],
+        offsets: NDArray[np.intp],
+        stops: NDArray[np.intp],
+        errors: list[PluginError],
+    ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Return the size of the frame at each offset, and for which of them the plugin failed.
+
+        The size is `NO_END` or `NO_FRAME` if there is none.
+        """
+        form = self._coder.form
+        is_failed = np.zeros(len(offsets), np.bool_)
+        if isinstance(form, BulkEnds):
+            return form.find_ends(buffer, offsets, stops), is_failed
+        sizes = np.full(len(offsets), NO_FRAME, np.intp)
+        for index, (offset, stop) in enumerate(zip(offsets.tolist(), stops.tolist(), strict=True)):
+            try:
+                sizes[index] = self._coder.find_end(buffer[offset:stop].tobytes())
+            except PluginError as error:
+                errors.append(error)
+                is_failed[index] = True
+        return sizes, is_failed
+
     def _check_whole(
-        self, frames: Frames, which: Sequence[int], status: NDArray[np.uint8], sums: Sums | None
+        self,
+        frames: Frames,
+        which: Sequence[int],
+        status: NDArray[np.uint8],
+        errors: list[PluginError],
+        sums: Sums | None,
     ) -> None:
         """Check complete candidates; equal candidates are decoded once.
 
         Args:
-            frames: all candidates. Errors of the plugin are added to this object.
+            frames: all candidates.
             which: the indices of the candidates to check.
             status: the status of all candidates, which is updated.
+            errors: errors of the plugin are added to this list.
         """
-        errors = list[PluginError]()
         decode = functools.lru_cache(MAX_REMEMBERED)(functools.partial(self._decode, errors=errors))
         structs = dict[int, bytes]()
         for index in which:
@@ -97,7 +129,6 @@ class TextCodec(Codec):
             if refusal.error is not None:
                 errors.append(refusal.error)
                 status[owners[where]] = PLUGIN
-        frames.errors = tuple(errors)
         self._found = {
             frames.data(index): struct
             for index, struct in structs.items()
@@ -117,9 +148,9 @@ class TextCodec(Codec):
             if decoded.problem.is_checksum:
                 return CHECKSUM, None
             refusal = self._coder.find_refusal(decoded.struct)
-        except SpecError:
-            raise
         except Exception as error:
+            if isinstance(error, SpecError) and not isinstance(error, PluginError):
+                raise
             errors.append(PluginError.of(error, "struct"))
             return PLUGIN, None
         if refusal is not None and refusal.error is not None:

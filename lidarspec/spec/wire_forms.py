@@ -315,20 +315,6 @@ class DrawsValues(Protocol):
         """
 
 
-def find_ends(
-    form: WireForm, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets
-) -> Offsets:
-    """Return the size of the frame at each offset, as `BulkEnds.find_ends` does.
-
-    For a wire form without `find_ends`, `find_end` is called for each candidate.
-    """
-    if isinstance(form, BulkEnds):
-        return form.find_ends(buffer, offsets, stops)
-    spans = zip(offsets.tolist(), stops.tolist(), strict=True)
-    sizes = [form.find_end(buffer[offset:stop].tobytes()) for offset, stop in spans]
-    return np.array(sizes, np.intp)
-
-
 class RunReader(Protocol):
     """Reads the fields of one frame in order."""
 

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from construct import Array, Int8ub, Int16ub, Struct, this
 
+import lidarspec as ls
 from lidarspec import Sensor, SpecError
+from lidarspec.detect import identification
+from lidarspec.detect.sample_bytes import SampleBytes
+from lidarspec.errors import PluginError
+from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Decoded, Frame, NumberRun, Problem, Serial, TextRun, WireForm
 from lidarspec.testing.check import CheckTarget, iter_reports
 from tests.shapes import SHAPES
@@ -36,6 +41,18 @@ class HexLines(WireForm):
         return b":" + struct.hex().encode() + b"\n"
 
 
+STATE = Frame(Struct("id" / Int8ub, "value" / Int16ub), max_length=20, wire=HexLines())
+SENSOR = Sensor(
+    "acme-hex",
+    vendor="Acme",
+    model="Hex",
+    frames={"state": STATE},
+    links={"data": Serial(9600)},
+    status="manual",
+    source="invented",
+)
+
+
 def test_frames_are_found_whatever_the_split() -> None:
     struct = Struct("count" / Int8ub, "ranges" / Array(this.count, Int16ub))
     frame = Frame(struct, data=True, max_length=600, wire=HexLines())
@@ -56,19 +73,8 @@ def test_frames_are_found_whatever_the_split() -> None:
 
 
 def test_it_is_checked_like_a_shipped_one() -> None:
-    struct = Struct("id" / Int8ub, "value" / Int16ub)
-    frame = Frame(struct, max_length=20, wire=HexLines())
-    sensor = Sensor(
-        "acme-hex",
-        vendor="Acme",
-        model="Hex",
-        frames={"state": frame},
-        links={"data": Serial(9600)},
-        status="manual",
-        source="invented",
-    )
-    assert sensor.parse(b":010002\n").value == 2
-    (report,) = iter_reports(CheckTarget([sensor]), sensor.id, examples=4)
+    assert SENSOR.parse(b":010002\n").value == 2
+    (report,) = iter_reports(CheckTarget([SENSOR]), SENSOR.id, examples=4)
     assert not report.findings
 
 
@@ -85,3 +91,46 @@ def test_a_missing_method_is_named_at_declaration() -> None:
     for form, names in ((Unencodable, "encode"), (Underived, "is_text, begins, largest")):
         with pytest.raises(SpecError, match=f"wire: {form.__name__} does not define {names}"):
             Frame(Struct("id" / Int8ub), max_length=20, wire=form())  # type: ignore[abstract]
+
+
+BROKEN = {
+    "begins": lambda self, texts: None,
+    "find_end": lambda self, data: data.index(b"?"),
+    "decode": lambda self, data, next_runs: None,
+    "encode": lambda self, struct, runs: None,
+}
+
+
+def make_broken_sensor(method: str) -> Sensor:
+    """Return a sensor with a wire form with one method that raises or returns None."""
+    form = type("Broken", (HexLines,), {method: BROKEN[method]})()
+    frame = Frame(Struct("id" / Int8ub, "value" / Int16ub), max_length=20, wire=form)
+    return replace(SENSOR, frames={"state": frame})
+
+
+@pytest.mark.parametrize("method", BROKEN)
+def test_a_failing_method_is_named_with_its_file(method: str) -> None:
+    sensor = make_broken_sensor(method)
+    with pytest.raises(PluginError, match=r"wire form, .*test_own_wire_form.py:"):
+        sensor.build("state", id=1, value=2)
+
+
+@pytest.mark.parametrize("method", ["begins", "find_end", "decode"])
+def test_a_broken_wire_form_does_not_stop_other_sensors(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = {
+        "acme-hex": make_broken_sensor(method),
+        "ldrobot-ld06": ls.sensor("ldrobot-ld06"),
+    }
+    monkeypatch.setattr(identification, "sensors", lambda: installed)
+    frames = simulate(installed["ldrobot-ld06"], 20)
+    sample = SampleBytes("test", (b":010002\n", *frames), datagrams=False)
+    with pytest.warns(UserWarning, match=r"acme-hex.*wire form, .*test_own_wire_form.py:"):
+        verdict = identification.identify_sample(sample)
+    assert verdict.sensor is installed["ldrobot-ld06"]
+    (fitting,) = identification.find_fitting_sensors(frames[:1], datagrams=False)
+    assert fitting is installed["ldrobot-ld06"]
+    fault = identification.find_nearest_fault(frames[0][:-1] + b"?")
+    assert fault is not None
+    assert fault.sensor == "ldrobot-ld06"
