@@ -37,7 +37,7 @@ MAX_LAYOUT_FIELDS = 4
 #: The maximum number of changes that are described separately.
 MAX_DESCRIBED_CHANGES = 3
 #: For each kind of damage, the likeliest first: the number of bytes that the damage adds to the
-#: frame, and the number of candidates for each offset.
+#: frame, and the number of possible repairs at each offset.
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
@@ -72,8 +72,9 @@ def find_changes(
 ) -> list[FrameChange]:
     """Return the changes of a frame that each explain its damage alone.
 
-    A change explains the damage if undoing it gives one valid and plausible frame of the type. The
-    kinds are tried one after another, until changes of one kind explain the damage.
+    A change explains the damage if undoing it gives one valid frame of the type, which
+    `Frame.plausible` accepts. The kinds are tried one after another, until changes of one kind
+    explain the damage.
 
     Args:
         frame: the frame type.
@@ -81,29 +82,31 @@ def find_changes(
         kinds: the kinds of change to try.
         offsets: the offsets at which changes are tried; None for all.
     """
+    if not data:
+        return []
     engine = get_codec(frame)
-    for kind in kinds if data else ():
-        longer, values = KINDS[kind]
-        size = len(data) - longer
-        fits = engine.size in (None, size) and max(engine.prefix, default=-1) < size
-        if (
-            fits
-            and 0 < size <= _find_max_size(engine, values)
-            and (matching := list(_iter_changes(kind, values, data, size, engine, offsets)))
-        ):
+    for kind in kinds:
+        added_bytes, choices = KINDS[kind]
+        size = len(data) - added_bytes
+        if size == 0 or engine.size not in (None, size):
+            continue
+        if size <= max(engine.prefix, default=-1) or size > _find_max_size(engine, kind):
+            continue
+        matching = list(_iter_changes(kind, choices, data, size, engine, offsets))
+        if matching:
             return matching
     return []
 
 
-def _find_max_size(engine: Codec, values: int) -> int:
+def _find_max_size(engine: Codec, kind: str) -> int:
     """Return the maximum length of a frame that is searched for changes, in bytes.
 
     Args:
         engine: parses the frame type.
-        values: number of changes to try at each offset.
+        kind: the kind of change to search.
     """
     is_compiled = isinstance(engine, CompiledCodec)
-    if values > 8:
+    if kind == "lost byte":
         if is_compiled and _count_layout_fields(engine.frame) <= MAX_LAYOUT_FIELDS:
             return MAX_LOST_BYTE_FRAME_BYTES
         return 0
@@ -120,74 +123,86 @@ def _count_layout_fields(frame: Frame) -> int:
 
 
 def _iter_changes(
-    kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
+    kind: str, choices: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
 ) -> Iterator[FrameChange]:
     """Yield the changes of one kind that explain the damage.
 
     Args:
         kind: the kind of change.
-        values: number of changes of this kind to try at each offset.
+        choices: number of changes of this kind to try at each offset.
         data: the damaged frame.
         size: length of the undamaged frame.
         engine: parses the frame type.
         chosen: the offsets at which changes are tried; None for all.
     """
+    # A byte may be lost at the end too, which is one more offset than the damaged frame has.
     tried_offsets = np.arange(max(len(data), size))
     damaged = np.frombuffer(data, np.uint8)
     if kind == "inserted byte":
         # Removing any byte of a run of equal bytes gives the same result: try only the first.
-        tried_offsets = tried_offsets[np.diff(damaged, prepend=~damaged[:1]) != 0]
+        is_first = np.ones(len(damaged), np.bool_)
+        is_first[1:] = damaged[1:] != damaged[:-1]
+        tried_offsets = tried_offsets[is_first]
     if chosen is not None:
         tried_offsets = tried_offsets[np.isin(tried_offsets, chosen)]
-    offsets = np.repeat(tried_offsets, values)
-    if values == 1:
-        changes = damaged[tried_offsets]
+    offsets = np.repeat(tried_offsets, choices)
+    if kind == "inserted byte":
+        values = damaged[tried_offsets]
     else:
-        changes = np.tile(np.arange(values, dtype=np.uint8), len(tried_offsets))
+        values = np.tile(np.arange(choices, dtype=np.uint8), len(tried_offsets))
     if kind == "lost byte":
-        # Inserting a byte before or after an equal byte gives the same result.
-        is_new = changes != damaged[offsets - 1]
-        is_new[offsets == 0] = True
+        # Inserting a byte before or after an equal byte gives the same result: try only before.
+        is_new = values != damaged[offsets - 1]
+        is_new[offsets == 0] = True  # no byte precedes
         offsets = offsets[is_new]
-        changes = changes[is_new]
+        values = values[is_new]
     step = max(1, BATCH_BYTES // size)
     for first in range(0, len(offsets), step):
         part = slice(first, first + step)
-        rows = _undo_changes(kind, damaged, offsets[part], changes[part], size)
+        rows = _undo_changes(kind, damaged, offsets[part], values[part], size)
         fits = np.ones(len(rows), np.bool_)
-        for offset, (mask, value) in engine.prefix.items():
-            fits &= rows[:, offset] & mask == value
+        for offset, (mask, constant) in engine.prefix.items():
+            fits &= rows[:, offset] & mask == constant
         which = np.flatnonzero(fits)
         if len(which):
             survey = engine.survey(rows.reshape(-1), which * size)
             which = which[(survey.status == VALID) & (survey.sizes == size)]
         for index in which.tolist():
-            yield FrameChange(kind, int(offsets[first + index]), int(changes[first + index]))
+            yield FrameChange(kind, int(offsets[first + index]), int(values[first + index]))
 
 
 def _undo_changes(
     kind: str,
     damaged: NDArray[np.uint8],
     offsets: NDArray[np.intp],
-    changes: NDArray[np.uint8],
+    values: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """Return the damaged frame with each change undone, (number of changes, size)."""
+    """Return the damaged frame with each change undone, (number of changes, size).
+
+    Args:
+        offsets: `FrameChange.offset` of each change.
+        values: `FrameChange.value` of each change.
+    """
     columns = count_up(size)
     change_columns = offsets[:, None]
+    indices = np.arange(len(offsets))
     if kind == "inserted byte":
+        # Bytes from the change on are one place later in the damaged frame.
         return damaged[columns + (columns >= change_columns)]
     if kind == "lost byte":
+        # Bytes after the change are one place earlier in the damaged frame. The limit of the
+        # index matters only for a byte lost at the end, which is replaced below.
         rows = damaged[np.minimum(columns - (columns > change_columns), len(damaged) - 1)]
-        rows[np.arange(len(rows)), offsets] = changes
+        rows[indices, offsets] = values
         return rows
     rows = np.tile(damaged, (len(offsets), 1))
-    rows[np.arange(len(rows)), offsets] ^= np.uint8(1) << changes
+    rows[indices, offsets] ^= np.uint8(1) << values
     return rows
 
 
 def describe_damage(
-    frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, FieldValue]]
+    frame: Frame, data: bytes, read_values: Callable[[bytes], Mapping[str, FieldValue]]
 ) -> Iterator[str]:
     """Yield a sentence for each single change that explains the damage.
 
@@ -197,7 +212,7 @@ def describe_damage(
     Args:
         frame: the frame type.
         data: the damaged frame.
-        values: a function that returns the values of the fields of a frame, by path.
+        read_values: a function that returns the values of the fields of a frame, by path.
     """
     matching = find_changes(frame, data)
     if len(matching) > MAX_DESCRIBED_CHANGES:
@@ -205,37 +220,41 @@ def describe_damage(
         possible = "1 offset is possible" if count == 1 else f"{count} offsets are possible"
         yield f"one {matching[0].kind} explains the damage; {possible}"
         return
-    before = values(data) if matching else {}
+    before = read_values(data) if matching else {}
     for change in matching:
-        explains = (
-            f"{'one' if len(matching) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
-            f" {change.kind} explains the damage"
-        )
-        yield f"{explains}: {_describe_change(change, before, values(change.repair(data)))}"
+        if len(matching) == 1:
+            article = "one"
+        elif change.kind == "inserted byte":
+            article = "an"
+        else:
+            article = "a"
+        description = _describe_change(change, before, read_values(change.repair(data)))
+        yield f"{article} {change.kind} explains the damage: {description}"
 
 
 def _describe_change(
     change: FrameChange, before: Mapping[str, FieldValue], after: Mapping[str, FieldValue]
 ) -> str:
+    """Describe where a change is, and the field that it affects.
+
+    Args:
+        before: the values of the fields of the damaged frame, by path.
+        after: the values after the change is undone.
+    """
     kind, offset, value = change
     if kind == "inserted byte":
         return f"byte {offset}, 0x{value:02x}"
-    path = next(
-        (
-            path
-            for path, field in after.items()
-            if field.contains_bit(offset, value)
-            or (kind == "lost byte" and field.covers_byte(offset))
-        ),
-        "",
-    )
     if kind == "lost byte":
-        return f"0x{value:02x} before byte {offset}" + (f", in {path}" if path else "")
-    values = [str(part[path]) for part in (before, after) if path in part]
-    return f"byte {offset} bit {value}" + (
-        f", {path} {', sent as '.join(values)}"
-        if path and all(values)
-        else f", {path}"
-        if path
-        else ""
-    )
+        text = f"0x{value:02x} before byte {offset}"
+        for path, field in after.items():
+            if field.covers_byte(offset):
+                return f"{text}, in {path}"
+        return text
+    text = f"byte {offset} bit {value}"
+    for path, field in after.items():
+        if field.contains_bit(offset, value):
+            texts = [str(values[path]) for values in (before, after) if path in values]
+            if all(texts):
+                return f"{text}, {path} {', sent as '.join(texts)}"
+            return f"{text}, {path}"
+    return text
