@@ -50,32 +50,38 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
     """
     first = FirstFrames()
     missing = set(sensor.state)
-    clock = sensor.clock
-    needs_reference = clock is not None and clock.reference is not None
-    reference_frame = ""
-    if clock is not None and clock.reference is not None:
-        reference_frame = clock.reference[0]
+    reference_frame: str | None = None
+    if sensor.clock is not None and sensor.clock.reference is not None:
+        reference_frame, _ = sensor.clock.reference
+    needs_reference = reference_frame is not None
     has_reference_frame = False
     seen_bytes = 0
     for batch in batches:
         for frames in batch:
             seen_bytes += int(frames.sizes.sum())
-            for name in missing & set(frames.names):
-                rows = np.flatnonzero(frames.kinds == frames.names.index(name))
+            for name in missing:
+                rows = _find_rows(frames, name)
                 if len(rows):
                     first.state[name] = frames.data(int(rows[0]))
             missing -= set(first.state)
-            if needs_reference and reference_frame in frames.names:
-                rows = np.flatnonzero(frames.kinds == frames.names.index(reference_frame))
-                has_reference_frame = has_reference_frame or len(rows) > 0
-                if first.reference is None and len(rows):
+            if reference_frame is not None and needs_reference and first.reference is None:
+                rows = _find_rows(frames, reference_frame)
+                if len(rows):
+                    has_reference_frame = True
                     first.reference = _find_reference(sensor, reference_frame, frames, rows)
-        is_hopeless = not has_reference_frame and seen_bytes > REFERENCE_SEARCH_BYTES
-        if first.reference is not None or is_hopeless:
+        never_arrives = not has_reference_frame and seen_bytes > REFERENCE_SEARCH_BYTES
+        if first.reference is not None or never_arrives:
             needs_reference = False
         if not missing and not needs_reference:
             break
     return first
+
+
+def _find_rows(frames: Frames, name: str) -> NDArray[np.intp]:
+    """Return the indices of the frames of a type, (n,)."""
+    if name not in frames.names:
+        return np.zeros(0, np.intp)
+    return np.flatnonzero(frames.kinds == frames.names.index(name))
 
 
 def _find_reference(
@@ -85,13 +91,15 @@ def _find_reference(
     assert sensor.clock is not None
     table = get_codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:
-        seconds = reported_seconds(sensor.clock, table)
-        readings = reference_readings(sensor, table)
+        reported_s = reported_seconds(sensor.clock, table)
+        readings_ns = reference_readings(sensor, table)
     except Exception:
         return None  # reported when the packets are decoded
-    finite = np.flatnonzero(np.isfinite(seconds))
+    finite = np.flatnonzero(np.isfinite(reported_s))
     if not len(finite):
         return None
     first = finite.item(0)
-    host_ns = max(frames.at.item(rows.item(first)), 0)
-    return ClockReference(readings.item(first), seconds.item(first), host_ns)
+    host_ns = max(frames.at.item(rows.item(first)), 0)  # -1 in `frames.at` if unknown
+    return ClockReference(
+        reading_ns=readings_ns.item(first), reported_s=reported_s.item(first), host_ns=host_ns
+    )

@@ -21,8 +21,9 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream, iter_released
 from lidarspec.sensor_operations import Sensor
 
-#: Maximum number of batches that are kept until the type of the data frames is known.
-_MAX_UNDECIDED_BATCHES = 256
+#: Maximum number of `Frames`, each from a piece of input, that are kept until the type of the data
+#: frames is known.
+_MAX_UNDECIDED_PIECES = 256
 #: Maximum number of IMU samples that are kept until a scan ends.
 _MAX_WAITING_IMU_SAMPLES = 1 << 16
 
@@ -38,7 +39,7 @@ class PacketReader:
         first: frames to use before the first packet.
 
     Attributes:
-        last: the packets of the last batch.
+        last: the packets of the last batch whose frame type was known; None if there was none.
         imu_samples: the IMU samples of the last batch.
     """
 
@@ -49,11 +50,8 @@ class PacketReader:
         self._decoder = decoder
         self._first = first
         self._frame = frame
-        self._undecided: deque[Frames] = deque(maxlen=_MAX_UNDECIDED_BATCHES)
-        if frame is None:
-            self._stream = None
-        else:
-            self._stream = self._make_stream(frame)
+        self._undecided: deque[Frames] = deque(maxlen=_MAX_UNDECIDED_PIECES)
+        self._stream = self._make_first_stream()
         self._imu = self._make_imu_stream()
         self.last: Packets | None = None
         self.imu_samples = join_samples([])
@@ -70,22 +68,20 @@ class PacketReader:
 
         Frames that arrive before their type is known are stored for a later call.
         """
-        if batch.replaced:
+        if batch.replaced:  # another sensor is read from now on
             self._undecided.clear()
-            if self._frame is None:
-                self._stream = None
-            else:
-                self._stream = self._make_stream(self._frame)
-        self._undecided += batch.frames
-        frames = list(self._undecided)
+            self._stream = self._make_first_stream()
+        frames = batch.frames
         if self._stream is None:
+            self._undecided += batch.frames
+            frames = list(self._undecided)
             name = choose_data_frame(self._sensor, frames)
             if name is None:
                 if not self._sensor.has_points:
-                    self._undecided.clear()
+                    self._undecided.clear()  # the sensor has no data frames
                 return None
             self._stream = self._make_stream(name)
-        self._undecided.clear()
+            self._undecided.clear()
         self.last = self._stream.add(frames)
         if batch.interrupted:
             self._stream.interrupt()
@@ -100,6 +96,8 @@ class PacketReader:
         if self._imu is None:
             return
         if batch.replaced:
+            # The `ScanStream` has this buffer. The last scan of the replaced sensor takes the
+            # samples.
             waiting = self._imu.waiting
             self._imu = self._make_imu_stream()
             assert self._imu is not None
@@ -135,8 +133,17 @@ class PacketReader:
         return stream.add([])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to pickle, without packets and samples that were already returned."""
+        """Return the state for a bookmark (see `FileScans`), which is pickled.
+
+        Packets and samples that were already returned are left out.
+        """
         return {**vars(self), "last": None, "imu_samples": join_samples([])}
+
+    def _make_first_stream(self) -> PacketStream | None:
+        """Return the stream of the chosen frame type; None if the type is not known yet."""
+        if self._frame is None:
+            return None
+        return self._make_stream(self._frame)
 
     def _make_stream(self, frame: str) -> PacketStream:
         return PacketStream(
