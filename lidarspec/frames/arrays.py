@@ -72,7 +72,7 @@ def broadcast_value(values: NDArray[np.int64]) -> int | None:
 
 
 def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
-    """Return each distinct value with the indices of its occurrences, (k,), ascending.
+    """Return the distinct values, ascending, each with the indices at which it occurs.
 
     Args:
         values: the values.

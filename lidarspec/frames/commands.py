@@ -40,8 +40,8 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
 
     Args:
         arguments: the arguments by name, in the units of their fields. The mapping may also contain
-            values that are known only when the command is sent, by the path of their field, and
-            values of a template by name.
+            values of a template, by name, and values that are known only when the command is sent,
+            by the path of the field.
 
     Raises:
         UnknownCommand: if the sensor has no such command.

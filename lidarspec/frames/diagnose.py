@@ -1,8 +1,8 @@
 """Find the first fault in the bytes of one frame.
 
-Faults are ordered by their offset in the frame. A wrong constant or value has its own offset. A
-wrong length or checksum has the offset of the end of its struct. Missing or additional bytes come
-last.
+Faults are ordered by the offset up to which the frame has to be read. For a wrong constant or
+value, this is the end of the field. For a wrong length or checksum, this is the end of the struct.
+Missing or additional bytes come last.
 """
 
 from __future__ import annotations

@@ -490,8 +490,8 @@ class _Encoder:
 def to_raw(info: FieldInfo, value: Any) -> Any:
     """Return the raw value of a field.
 
-    The name of an Enum is converted to its number, and a single byte for an integer field to its
-    value.
+    The name of an Enum is converted to its number. If the field is an integer, a single byte is
+    converted to an integer.
     """
     if info.adapter is not None and info.kind == "int" and value is not None:
         return info.adapter.encode(value, 0)
@@ -505,7 +505,7 @@ def to_raw(info: FieldInfo, value: Any) -> Any:
 def fill_counts(given: Container, table: Schema) -> None:
     """Set the header fields that contain the lengths of arrays.
 
-    A given value is kept, unless the field is always computed from the array.
+    Given values are kept, except for fields that are always computed from the array.
     """
     counted = set[str]()
     for axis, count in table.arrays.items():

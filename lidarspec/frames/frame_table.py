@@ -39,9 +39,9 @@ class Table(Protocol):
 
     def __len__(self) -> int: ...
     def raw(self, path: str) -> NDArray[Any]:
-        """Return the raw values of a field, (n, *lengths of its axes), in native byte order.
+        """Return the raw values of a field in native byte order.
 
-        The value of a missing field or element is 0.
+        The shape is (n, *lengths of the arrays). The value of a missing field or element is 0.
         """
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
@@ -67,7 +67,7 @@ class Table(Protocol):
         """Return a table of the frames at these indices, in this order."""
 
     def parts(self, axis: str, kind: str = "") -> tuple[Table, NDArray[np.intp]]:
-        """Return the parts of one kind, in stream order, and the row of each part's frame, (k,)."""
+        """Return the parts of one kind in stream order, and the row of each part's frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -652,7 +652,7 @@ def _take_element(
 
 
 def _has_element(table: Table, path: str, indices: Mapping[str, int]) -> NDArray[np.bool_]:
-    """Return whether each frame has one element of a field's arrays, (n,)."""
+    """Return whether the element of a field at `indices` exists in each frame, (n,)."""
     base_present = table.present(path)
     is_of_frames = base_present is None or base_present.ndim == 1
     column = table.raw(path) if is_of_frames else base_present

@@ -199,7 +199,8 @@ class Leaf:
         """Return the offset of each element, row by row.
 
         Args:
-            depth: the number of arrays to iterate over; by default all arrays outside a bit block.
+            depth: how many of the outer arrays to iterate over; by default all arrays outside a bit
+                block.
         """
         offsets = [self.offset]
         for length, stride in list(zip(self.shape, self.strides, strict=False))[:depth]:

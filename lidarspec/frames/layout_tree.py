@@ -322,7 +322,7 @@ class HeaderWalk:
     def _add_peeked_fields(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add fields at the cursor without moving it.
+        """Add fields at the cursor, and leave the cursor at this place.
 
         The bytes of these fields belong to the following nodes.
         """
@@ -814,7 +814,10 @@ class _CandidateSet:
         return there, values
 
     def add_refuted(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
-        """Add a candidate to `refuted` if a constant of the node is wrong in it."""
+        """Add the candidates with a wrong constant to `refuted`.
+
+        The constants are those of the node.
+        """
         if node.constants:
             self.refuted.append(which[self.have_wrong_constants(node.constants, which)])
 
@@ -1101,9 +1104,9 @@ class HeaderTree:
         return node
 
     def _select_new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
-        """Return the constants of a walk, without those that all frames begin with.
+        """Return the constants of a walk that the search has not checked.
 
-        The search has already checked the constants that all frames begin with.
+        The search has checked the constants that all frames begin with.
         """
         return {
             offset: bits

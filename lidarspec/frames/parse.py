@@ -539,7 +539,7 @@ def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[A
 def _find_bit_runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """Return the runs of consecutive bits of a bit block from which a value is joined.
+    """Return the runs of consecutive bits that make up a value in a bit block.
 
     The block is read as one number. A run is (lowest bit in the block, mask, lowest bit in the
     value).

@@ -416,7 +416,10 @@ class _PartWalk:
     def _evaluate_all(
         self, layout: Layout, formula: tree.Formula, offsets: Offsets
     ) -> NDArray[np.int64]:
-        """Return the value of a formula for the part at each offset; -1 if it fails."""
+        """Return the value of a formula for the part at each offset, (n,).
+
+        The value is -1 if the formula raises an error.
+        """
         asked = tree.refs(formula)
         is_simple = isinstance(formula, tree.Ref) or (
             isinstance(formula, tree.Op) and all(map(_fits_columns, tree.iter_subformulas(formula)))
@@ -455,7 +458,7 @@ class _PartWalk:
 
 
 def _fits_columns(formula: tree.Formula) -> bool:
-    """Return whether 64-bit columns represent a part of a formula exactly.
+    """Return whether the value of an operand is exact in 64-bit columns.
 
     This is true for fields, for comparisons, and for numbers that are not too large.
     """

@@ -27,7 +27,7 @@ MAX_BUILDS = 4
 
 
 def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any, int]:
-    """Parse the frame at the start of `data`; return the values and the size of the frame.
+    """Parse the frame at the start of `data`; return its values and its size.
 
     Raises:
         construct.ConstructError: if the bytes do not begin with a frame.

@@ -336,7 +336,7 @@ def sum_bytes(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def compute_registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """Return the register after the spans of each row, (n,).
+    """Return the CRC register after the spans of each row, (n,).
 
     The dtype is the smallest integer type for the register.
     """
@@ -379,8 +379,8 @@ def _compute_by_position(
 ) -> NDArray[Any]:
     """Return the result of `compute_registers` for a few short rows.
 
-    It is the XOR of the contributions of all bytes. A table for each position contains these
-    contributions.
+    The register is the XOR of the contributions of all bytes. A table for each position contains
+    these contributions.
     """
     table, firsts, begun = make_place_tables(length, start, width, poly, refin)
     found: NDArray[Any] = np.bitwise_xor.reduce(

@@ -249,7 +249,7 @@ class Schema:
         return found[0]
 
     def find_sequence(self, path: str) -> str | None:
-        """Return the path of the array of parts that contains a field; None without one.
+        """Return the path of the array of parts that contains a field; None if none does.
 
         Args:
             path: the path of the array itself, or of a field in its elements.

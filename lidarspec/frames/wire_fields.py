@@ -83,7 +83,7 @@ class PlacedSeal:
 
     @property
     def is_right(self) -> bool:
-        """Whether the stored checksum is correct, or means that none was computed."""
+        """Whether the stored checksum is correct, or states that there is no checksum."""
         return self.stored == self.computed or self.stored in self.seal.absent
 
 
