@@ -178,7 +178,7 @@ class Framing:
         *,
         gathered: bool = True,
     ) -> Frames:
-        """Check the candidates of a type at some offsets.
+        """Check the candidates of a type at these offsets.
 
         Args:
             kind: the index of the type.
@@ -445,7 +445,7 @@ class Candidates:
 
 
 def select_live(candidates: Frames, *, final: bool) -> Frames:
-    """Return the valid candidates and, unless `final`, the incomplete candidates."""
+    """Return the valid candidates, and the incomplete candidates if not `final`."""
     if candidates.is_all_valid:
         return candidates
     is_live = candidates.status <= (VALID if final else SHORT)

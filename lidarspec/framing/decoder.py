@@ -428,7 +428,7 @@ class Decoder:
             stops: the offset after each skipped range.
 
         Returns:
-            The number of bytes in each skipped range that are not fillers, (n,).
+            The number of bytes without fillers in each skipped range, (n,).
         """
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():

@@ -84,8 +84,8 @@ def random_frame(
     """Return a valid frame with a random header and random content.
 
     Args:
-        drawn: functions that draw the raw values of certain fields, by path, for values that are
-            hardly ever valid if they are random.
+        drawn: functions that draw the raw values of certain fields, by path. They are needed for
+            fields whose random values are hardly ever valid.
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.has_measured_sizes:
@@ -209,7 +209,11 @@ LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 def _make_random_rows(
     engine: Codec, layout: Layout, number: int, source: random.Random
 ) -> NDArray[np.uint8]:
-    """Return random structs that have allowed values and can be encoded, (number, size)."""
+    """Return random structs with values that are allowed and can be encoded.
+
+    Returns:
+        (number, size) bytes.
+    """
     rows = (
         np.frombuffer(source.randbytes(number * layout.size), np.uint8)
         .reshape(number, layout.size)
@@ -391,7 +395,7 @@ def _draw_from_sweep(
 
 
 def _store_swept(leaf: Leaf, rows: NDArray[np.uint8], value: Any) -> None:
-    """Write a value of a sweep into a struct, if it has as many elements as the field.
+    """Write a value of a sweep into a struct, if value and field have the same length.
 
     Otherwise the struct keeps its random values.
     """

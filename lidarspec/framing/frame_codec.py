@@ -55,7 +55,7 @@ class Codec:
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        """Check the candidates at some offsets, and return them with their layout and status.
+        """Check the candidates at these offsets; return them with layout and status.
 
         Args:
             buffer: the bytes.

@@ -317,8 +317,8 @@ def _check_incomplete(
         sizes: the size of each candidate when it is complete, in bytes.
 
     Returns:
-        The status of each candidate, and the number of its bytes that are required to decide about
-        it.
+        The status of each candidate, and the number of bytes required to decide about the
+        candidate.
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()

@@ -265,7 +265,7 @@ class StructConditions:
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def make_struct_conditions(self, layout: Layout) -> list[Check]:
-        """Return the conditions of the struct as checks of frames of a layout."""
+        """Return the conditions of the struct as checks for the frames of a layout."""
         every = (
             (
                 condition,

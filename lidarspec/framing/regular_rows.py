@@ -29,7 +29,7 @@ DISTINCTIVE_CONSTANTS = 4
 def find_regular_frames(
     framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
 ) -> PieceResult | None:
-    """Return the frames that follow one another from the start of a piece.
+    """Return the frames that follow one another at the start of a piece.
 
     Returns None if the piece must be searched.
 

@@ -204,7 +204,7 @@ class _FrameWalk:
         return position
 
     def _is_earlier(self, kind: int, position: int) -> bool:
-        """Return whether a candidate at an offset is of a type declared before `kind`."""
+        """Return whether the candidate at an offset has a type declared before `kind`."""
         starts = self._frames.starts
         row = int(starts.searchsorted(position))
         if row == len(starts) or starts.item(row) != position:

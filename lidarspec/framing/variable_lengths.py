@@ -57,7 +57,7 @@ BLOCK_BYTES = 1 << 19
 
 @dataclass(frozen=True)
 class LayoutFamily:
-    """The family of a layout; the layouts of a family differ only in the length of an array.
+    """A family of layouts, which differ only in the length of an array.
 
     Attributes:
         number: the number that identifies the family.
@@ -242,7 +242,7 @@ class JointChecker:
 
 
 def _find_length(check: Check) -> int:
-    """Return the length of the outermost array of a test; 0 outside of arrays."""
+    """Return the length of the outermost array that a test covers; 0 without an array."""
     if isinstance(check, LookupCondition) and check.shape:
         return check.shape[0]
     return 0
@@ -251,8 +251,8 @@ def _find_length(check: Check) -> int:
 def _iter_by_size(sizes: Offsets) -> Iterator[Offsets]:
     """Yield the indices of candidates in groups of similar size.
 
-    The indices in a group are sorted by size. The rows of a group have at most `BLOCK_BYTES`
-    together.
+    The indices in a group are sorted by size. All rows of a group together have at most
+    `BLOCK_BYTES`.
     """
     order = np.argsort(sizes, kind="stable")
     ordered = sizes[order]

@@ -87,7 +87,7 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """For each row, the rows that are 1, 2, 4, 8 ... frames later in its run, (n,) each.
+        """For each row, the rows 1, 2, 4, 8 ... frames later in its run, (n,) each.
 
         If the run is too short, the array has the last row of the run. The last array has the last
         row of every run.
