@@ -276,7 +276,8 @@ class Column(NDArrayOperatorsMixin):
     def gather(self, table: NDArray[np.float64]) -> Column:
         """Return a row of a table for each value. The value is the index of the row.
 
-        The k numbers of a row are along an array of the frame with k elements.
+        The k numbers of a row become the elements along an array of the frame, which has k
+        elements.
 
         Args:
             table: (m + 1, k). The last row is nan; values outside of 0 to m - 1 select this row.
@@ -306,8 +307,8 @@ class Column(NDArrayOperatorsMixin):
     def shift(self, step: int) -> Column:
         """Return for each element the value `step` elements later in stream order.
 
-        A negative step returns earlier values. The result has the same axes. It is nan if packets
-        were lost between both elements, and beyond the end of the stream.
+        A negative step returns earlier values. The result has the same axes. A value is nan if
+        packets were lost between both elements, or if the other element does not exist.
         """
         row = FlatColumn(self)
         size = abs(step)
@@ -412,7 +413,7 @@ def padding_mask(
 ) -> NDArray[np.bool_] | None:
     """Return a mask of the elements that are not padding; None without padding.
 
-    The mask has the shape (n, product of the other lengths).
+    The mask has the shape (n, number of elements in a packet).
     """
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):

@@ -482,7 +482,7 @@ def compute(
 
 
 def get_only_field(node: Node) -> Node | None:
-    """Return the field of an expression of a single field; None for other expressions."""
+    """Return the only field of an expression; None if it has several fields or none."""
     if node.fields is not None and len(node.fields) == 1:
         return node.fields[0]
     return None
@@ -655,7 +655,7 @@ class _ResultPart:
 def header_function(
     function: Callable[[Any], Any], schema: Schema, to_integers: IntegerConverter
 ) -> HeaderFunction:
-    """Return the `HeaderFunction` for a function and a schema; repeated calls share it."""
+    """Return the `HeaderFunction` of a function and a schema. The result is cached."""
     return HeaderFunction(function, to_integers)
 
 
