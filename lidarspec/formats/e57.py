@@ -104,7 +104,7 @@ def _add_scan(
 
 
 def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the columns with the names of the standard, converted to supported types."""
+    """Return the columns by their names in E57, converted to supported types."""
     invalid = ~own["valid"]
     columns = {FIELD_NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
     columns["cartesianInvalidState"] = invalid * np.uint8(INVALID_COORDINATES)

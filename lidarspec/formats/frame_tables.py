@@ -186,8 +186,8 @@ def _write_table(
 def _with_float_integers(columns: Columns) -> Columns:
     """Return columns with integers converted to float64, except `time_ns`.
 
-    Batches in which a frame lacks a field have a float64 column for it. The conversion makes the
-    types of all batches equal.
+    If a frame of a batch lacks a field, the column of this batch is float64. The conversion makes
+    the types of all batches equal.
     """
     return {
         name: values.astype(np.float64)
