@@ -246,7 +246,10 @@ class BatchColumns(ColumnSource):
     def _compute_times(
         self, share: GroupPoints, first: int, last: int | None
     ) -> NDArray[np.float64]:
-        """Return the times of the points of some packets, (packets, *shape), s since `base`."""
+        """Return the times of the points of packets, in seconds since `base`.
+
+        The shape is (packets, *shape of the points).
+        """
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(

@@ -77,7 +77,7 @@ def to_hex(rgb: Rgb) -> str:
 
 
 def _interpolate(ends: tuple[float, float], share: float) -> float:
-    """Return a value between two values, by its `share` of the way, 0 to 1."""
+    """Return a value between two ends: the first for a `share` of 0, the last for 1."""
     return ends[0] + (ends[1] - ends[0]) * share
 
 

@@ -325,7 +325,7 @@ class Plan:
 
     @cached_property
     def _may_have_finite_directions(self) -> bool:
-        """Whether azimuth and elevation are finite, as far as this is known without a batch.
+        """Whether azimuth and elevation are finite, as far as is known without a batch.
 
         `has_finite_directions` checks the values of a batch.
         """

@@ -201,7 +201,7 @@ def put(context, array, index, value):
 
 @intrinsic
 def flip_sign(context, value, whole):
-    """Return a float32 with its sign changed if the lowest bit of a float64 is set."""
+    """Return the float32 `value`, negated if the lowest bit of `whole` is set."""
 
     def make(target, builder, signature, args):
         word = ir.IntType(32)

@@ -481,7 +481,7 @@ class KernelWriter:
         return leaf.offset <= first or inside
 
     def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """Add a lookup that replaces an expression, and return its text.
+        """Add a lookup that replaces an expression; return the text of the lookup.
 
         Returns None if `find_window` has no result for the field.
 

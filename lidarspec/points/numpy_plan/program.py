@@ -127,7 +127,7 @@ class Program(ColumnMaker):
         run: Callable[[ProgramRun, NDArray[Any]], Any],
         *reads: Callable[[ProgramRun], Any],
     ) -> int:
-        """Add a step, and return the register that it fills."""
+        """Add a step, and return the register for its result."""
         output = self.add_register(kind)
         registers = tuple(read.register for read in reads if isinstance(read, RegisterRead))
         self.steps.append(ProgramStep(text, run, output, registers))
@@ -136,7 +136,7 @@ class Program(ColumnMaker):
     def add_call(
         self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]
     ) -> int:
-        """Add a call of a function that accepts `out`, and return the register that it fills."""
+        """Add a call of a function that accepts `out`; return the register for the result."""
         return self.add_step(
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
         )
