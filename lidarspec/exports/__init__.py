@@ -187,7 +187,7 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
 
 
 def find_required_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """Return {path: formula} of the fields that must have the value of a formula."""
+    """Return the formulas whose value a field must have, as {path: formula}."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)

@@ -324,8 +324,8 @@ def _assemble_part(part: tree.Part, raw: str) -> str:
 def ksy(sensor: Sensor) -> str:
     """Return the sensor's frame types as a .ksy document.
 
-    The document parses a sequence of data frames. If the sensor has none, it parses a sequence of
-    frames of the first type.
+    The document parses a sequence of data frames. For a sensor without data frames, the document
+    parses a sequence of frames of the first type.
 
     Raises:
         ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names
@@ -633,7 +633,7 @@ class _KaitaiWriter:
 
 
 def _make_enum(labels: Mapping[int, str]) -> Attribute:
-    """Return a Kaitai enum: the name of each number, documented by its original name."""
+    """Return a Kaitai enum of named numbers, with the original names as documentation."""
     members: dict[Any, Any] = {}
     taken = set[str]()
     for code, label in labels.items():

@@ -513,7 +513,7 @@ def _make_algorithm_table(algorithm: Checksum) -> Table:
 
 
 def _list_numbers(node: tree.Node) -> list[tree.Node | tree.Part]:
-    """Return the numbers in a node, or [] if it contains arrays or conditional parts."""
+    """Return the numbers in a node, or [] if the node has arrays or conditional parts."""
     below = list(tree.nodes(node))
     if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):
         return []
