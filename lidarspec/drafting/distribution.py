@@ -96,7 +96,7 @@ class DistributionNames:
 
 
 def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
-    """Return {path: text} of the files of a distribution with an example sensor."""
+    """Return the files of a distribution with an example sensor, as {path: text}."""
     values = {**names.values(), "speed_remark": ", if code is 3" if link == "serial" else ""}
     return _make_files(
         names,
@@ -110,7 +110,7 @@ def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
 def make_draft_files(
     names: DistributionNames, link: Link, draft: Draft, *, origin: str, port: int | None
 ) -> dict[str, str]:
-    """Return {path: text} of the files of a distribution with a drafted sensor.
+    """Return the files of a distribution with a drafted sensor, as {path: text}.
 
     Args:
         names: the names in the distribution.
@@ -154,7 +154,7 @@ def _make_files(
     vectors: str,
     templates: tuple[str, str, str],
 ) -> dict[str, str]:
-    """Return {path: text} of the files of a distribution.
+    """Return the files of a distribution, as {path: text}.
 
     Args:
         vectors: the content of vectors.json.

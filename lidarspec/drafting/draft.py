@@ -476,10 +476,10 @@ def _are_similar(first: RisingField, second: RisingField) -> bool:
 
 
 def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
-    """Return blocks at equal distances, each of which begins with a similar rising field.
+    """Return blocks at equal distances that each begin with a similar rising field.
 
-    If there are several such groups of blocks, the one with the most bytes is returned. Returns
-    None if there is none.
+    If there are several groups of such blocks, the group with the most bytes is returned. Returns
+    None if no blocks are found.
     """
     found_blocks = []
     for field in fields:

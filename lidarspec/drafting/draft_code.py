@@ -80,7 +80,7 @@ class DraftField:
 
 
 def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
-    """Return {name: text} of the values for the template of a module.
+    """Return the values for the template of a module, as {name: text}.
 
     Args:
         draft: the analysed frames.
@@ -487,8 +487,8 @@ def _format_alternatives(begin: str, names: Sequence[str]) -> str:
 def _format_max_length(draft: Draft) -> str:
     """Return the value of `max_length`, in bytes.
 
-    If the length field has one byte, it limits the length. Otherwise the limit is twice the length
-    of the longest frame in the capture, because longer frames may occur.
+    A length field of one byte limits the length. Otherwise the limit is twice the length of the
+    longest frame in the capture, because longer frames may occur.
     """
     if draft.size is not None or draft.length is None:
         return str(draft.size)

@@ -539,7 +539,8 @@ def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period:
     """Return whether the number of constant bytes is probably a coincidence.
 
     Chernoff's bound gives the probability that random bytes with the same distribution of values
-    have as many constant bytes. It is multiplied by the number of periods that are tried.
+    have as many constant bytes. This probability is multiplied by the number of periods that are
+    tried.
 
     Args:
         data: the data.
