@@ -72,8 +72,8 @@ def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]
 def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     """Return the raw value of a field for a text.
 
-    For a field of bytes, the text is hexadecimal. For a number, it is a label of the field, or a
-    number with or without a unit.
+    For a field of bytes, the text is hexadecimal. For a number, the text is a label of the field,
+    or a number with or without a unit.
     """
     if info.kind == "bytes":
         return _parse_bytes(text, f"{place}: {path}")

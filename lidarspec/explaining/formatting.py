@@ -463,7 +463,7 @@ def _count_marked_bytes(error: WireError) -> int:
 
 
 def describe_losses(sensor: Sensor) -> str:
-    """Return a text about how lost packets are counted, or why they are not."""
+    """Return a text about how lost packets are counted, or why none are counted."""
     if sensor.sequence is not None:
         return f"counted by `{sensor.sequence.field}`"
     if sensor.counts_losses:

@@ -258,8 +258,8 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    The frame ends at an offset in `ends` that gives it the length of its type, or one byte more or
-    less. If there is no such offset, the end is estimated.
+    An offset in `ends` is preferred at which the frame has the length of its type, or one byte more
+    or less. If there is none, the end is estimated.
 
     Args:
         data: the bytes.
