@@ -29,8 +29,8 @@ def make_arguments(subject: SensorUnderTest, name: str, share: float) -> dict[st
     """Return a valid value for each argument of a command, by name.
 
     Args:
-        share: position of a number between its lowest and its highest value, or length of a text
-            as a share of its maximum, from 0 to 1.
+        share: from 0 to 1: the position of a number between its limits, and the length of a text
+            relative to its maximum length.
     """
     return {
         key: _make_argument(subject.sensor, name, key, share)

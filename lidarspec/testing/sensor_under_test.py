@@ -244,7 +244,7 @@ class SensorUnderTest:
 
         Args:
             name: the frame type.
-            share: the part of the usual number of examples that the property needs.
+            share: the number of examples relative to the usual number.
         """
         few = 8 if self.sensor.frames[name].max_length > MAX_SHORT_BYTES else 1
         few *= 2 if len(self.sensor.frames) > MANY_FRAME_TYPES else 1

@@ -211,11 +211,11 @@ def streams(
 ) -> SearchStrategy[Any]:
     """Return a strategy for input that `Sensor.decode`, `split` and `scans` accept.
 
-    The input consists of valid frames of all incoming types. It is bytes, or a list of datagrams if
-    the sensor sends datagrams. If a frame type is only valid after another type (`after`), that
-    type comes first. If a frame type is only valid after several such frames in a row (`confirm`),
-    the input has at least this number of frames in a row. Without noise, every byte belongs to a
-    frame.
+    The input consists of valid frames of all incoming types. The input is bytes, or a list of
+    datagrams if the sensor sends datagrams. If a frame type is only valid after another type
+    (`after`), that type comes first. If a frame type is only valid after several such frames in a
+    row (`confirm`), the input has at least this number of frames in a row. Without noise, every
+    byte belongs to a frame.
 
     Args:
         sensor: an id or a Sensor.
@@ -397,7 +397,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
 
 @functools.lru_cache(maxsize=4096)
 def _header_values(sensor: Sensor, frame: str, info: FieldInfo) -> SearchStrategy[int]:
-    """Return a strategy for a field that the layout depends on."""
+    """Return a strategy for the raw value of a field that determines the layout."""
     if info.const is not None:
         return st.just(int(info.const))
     if info.allowed:

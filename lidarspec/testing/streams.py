@@ -116,5 +116,5 @@ def _scans_in_batches(sensor: Sensor, frames: list[Found], size: int) -> list[Sc
 
 
 def _summarize_scan(scan: Scan) -> tuple[int, bool, bool]:
-    """Return the number of points of a scan, and whether it is whole and complete."""
+    """Return the number of points of a scan, and its `whole` and `complete`."""
     return len(scan), scan.whole, scan.complete

@@ -253,8 +253,8 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     """Check that each checksum is verified by a `Checksummed`.
 
-    A checksum is recognized by its name, or by a search in the vectors. A field is accepted if its
-    docs say that it is not checked, unless the search finds its algorithm.
+    A checksum is recognized by its name, or by a search in the vectors. A checksum may stay
+    unverified if the docs of its field say so and the search finds no algorithm.
     """
     sealing = _find_verified_fields(subject, name)
     free = [
@@ -293,7 +293,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
 def _find_verified_fields(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields of a frame type that store a verified checksum.
 
-    They are found in several examples, because some headers omit the part with the checksum.
+    Several examples are searched, because some headers omit the part with the checksum.
     """
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
@@ -591,7 +591,7 @@ def _compare_points(
     wanted: Mapping[str, Mapping[str, float]],
     entry_key: str,
 ) -> None:
-    """Compare single points of a vector's frame with their expected columns."""
+    """Check that points of a vector's frame have the columns that the vector states."""
     cloud = decode_frames(subject, name, [data] * subject.sensor.frames[name].confirm).points()
     columns_of_points = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
