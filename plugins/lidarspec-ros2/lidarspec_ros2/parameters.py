@@ -270,7 +270,7 @@ class Settings:
         )
 
     def limit_ranges(self, planar: LaserScan) -> LaserScan:
-        """Return a planar scan with the parameters' range limits, if they are narrower."""
+        """Return a planar scan with range limits narrowed by the parameters."""
         far = min(planar.range_max, self["range_max"] or math.inf)
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 
@@ -295,7 +295,7 @@ class Settings:
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configure_sensor(self) -> Sensor | None:
-        """Return the sensor that the parameters name, with its options; None if none."""
+        """Return the sensor in the parameters, with its options; None if it is not set."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)
