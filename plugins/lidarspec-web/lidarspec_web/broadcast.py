@@ -151,7 +151,7 @@ class Broadcast:
     def can_seek(self) -> bool:
         """Whether the source is a file that supports seeking.
 
-        It does not support seeking if its scans are selected by number.
+        Seeking is not supported if the scans are selected by number.
         """
         return not self.is_live and not self._select.is_counted and self.source != "-"
 
@@ -206,7 +206,7 @@ class Broadcast:
         self.paused = True
 
     def play(self) -> None:
-        """Continue a file; at its end, play it from the beginning.
+        """Continue to play a file; at the end of the file, begin again.
 
         Raises:
             UsageError: if the source is live.
@@ -308,7 +308,7 @@ class Broadcast:
                 raise
 
     def _reopen_at(self, target: float) -> None:
-        """Open a file again, and show the first scan at or after a time."""
+        """Open a file again, and show the first scan at or after `target`, in seconds."""
         device = self._reopen()
         self.device.close()
         self.device = device
