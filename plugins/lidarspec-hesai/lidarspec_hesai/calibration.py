@@ -119,7 +119,7 @@ def configure(
     """Return the sensor with a unit's tables instead of the model's.
 
     A file given to an earlier `configure` remains in use. If the angles are read from a file,
-    opening the sensor does not request them.
+    opening the sensor does not request the angles.
 
     Args:
         points: a function that returns points, given `Fields` and the unit's `Calibration`.

@@ -105,8 +105,8 @@ def make_packet(
         blocks: the type of the number of blocks.
         imu: whether the packet can have an IMU part.
         safety: whether the packet can have a functional safety part.
-        verify_crc: whether CRCs are verified. Otherwise they are plain fields, for models for which
-            the covered bytes are not known.
+        verify_crc: whether CRCs are verified. For models whose covered bytes are not known, CRCs
+            are plain fields.
     """
     crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
     fine_azimuth = [] if block is None else ["fine_azimuth" / block]

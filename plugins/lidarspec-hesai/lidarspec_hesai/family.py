@@ -21,7 +21,7 @@ def make_spinning_sensor(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a rotating sensor that requests the angles of the unit when it is opened.
+    """Return a rotating sensor; opening it requests the angles of the unit.
 
     Args:
         id: the id of the sensor.

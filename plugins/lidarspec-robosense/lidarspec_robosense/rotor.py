@@ -327,8 +327,8 @@ def make_points(
     """Return the points of lasers with an optical centre away from the axis.
 
     The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step from one
-    shot to the next is the difference of their azimuths. Until the first valid difference, it is
-    computed from the speed in DIFOP.
+    shot to the next is the difference of their azimuths. Until the first valid difference, the step
+    is computed from the speed in DIFOP.
 
     Args:
         lasers: the elevation of each laser, and its angle clockwise from the rotor's direction, in

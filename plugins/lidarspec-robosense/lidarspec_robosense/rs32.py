@@ -158,7 +158,7 @@ def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
     """Return whether a packet can be from a Bpearl.
 
     Azimuths have to be below 360 degrees. If `v4` is true, the bytes of version 4 are required.
-    Otherwise they are not allowed, and the type must not be that of an RS-LiDAR-16 or -32.
+    Otherwise these bytes are not allowed, and the type must not be that of an RS-LiDAR-16 or -32.
     """
     is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (

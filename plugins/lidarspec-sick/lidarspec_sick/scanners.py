@@ -143,8 +143,9 @@ def sweep(i: int, family: ScannerFamily, echoes: int = 1) -> dict[str, Any]:
 def make_frames(family: ScannerFamily, cola: str) -> dict[str, Frame]:
     """Return the frames of scans, of commands and of replies.
 
-    Scans can be received in CoLa A and in CoLa B; those in `cola` come first. Commands and replies
-    are only in `cola`. There are frames for scans with one echo, and with `family.echoes` echoes.
+    Scans can be received in CoLa A and in CoLa B; the frames in `cola` come first. Commands and
+    replies are only in `cola`. There are frames for scans with one echo, and with `family.echoes`
+    echoes.
     """
     forms = sorted("AB", key=lambda form: form != cola)
     frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}

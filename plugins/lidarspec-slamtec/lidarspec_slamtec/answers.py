@@ -145,7 +145,7 @@ def is_config_plausible(f: Fields) -> Any:
 def make_config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
     """Return frame name and values of a simulated reply with a configuration value.
 
-    `value` is in its unit, or bytes if the key has no fixed width.
+    `value` is a number in the unit of the key, or bytes if the key has no fixed width.
     """
     field = VALUES.get(key)
     name, size = (field.name, field.sizeof()) if field else ("data", len(value))

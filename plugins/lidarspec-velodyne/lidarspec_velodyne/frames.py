@@ -170,7 +170,7 @@ def is_plausible_dual(f: Fields) -> Any:
 def is_plausible_position(f: Fields) -> Any:
     """Return whether the PPS state is known and the NMEA sentence is text.
 
-    In a data packet, the bytes in place of the sentence are not text, because they contain flags.
+    A data packet has flags in place of the sentence, which are not text.
     """
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 

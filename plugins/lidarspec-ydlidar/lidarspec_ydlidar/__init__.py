@@ -199,7 +199,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
 def relatives(name: str) -> dict[str, str | Relative]:
     """Return, by id, how to recognize the other models with the same sample size.
 
-    They include models of CSPC, which send the same packet.
+    The other models include models of CSPC, which send the same packet.
     """
     own_model = MODELS[name]
     models = {
