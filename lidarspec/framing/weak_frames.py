@@ -87,10 +87,10 @@ class WeakRuns:
 
     @cached_property
     def _jumps(self) -> list[Indices]:
-        """For each row, the rows 1, 2, 4, 8 ... frames later in its run, (n,) each.
+        """Arrays with the row that is 1, 2, 4, 8 ... frames later in the run of each row.
 
-        If the run is too short, the array has the last row of the run. The last array has the last
-        row of every run.
+        The shape of an array is (n,). If a run is too short, the array has the last row of the run.
+        The last array has the last row of every run.
         """
         count = len(self.frames)
         rows = np.arange(count)
