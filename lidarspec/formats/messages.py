@@ -194,7 +194,7 @@ def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, 
 
 
 def make_records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
-    """Return the points to write in PCL's layout, in types that messages support."""
+    """Return the points to write, with PCL's layout and types that messages support."""
     points = cloud.to_structured()
     if not every_point:
         points = np.compress(cloud.valid, points)  # ten times as fast as indexing
