@@ -1,7 +1,7 @@
 """The packets of one layout in a batch, with their plan and their values.
 
-A batch has a `GroupPoints` for each layout. Its `PlainValues` evaluates nodes of the plan by the
-reference evaluator, each node once.
+A batch has a `GroupPoints` for each layout. The `PlainValues` of a group evaluates the nodes of the
+plan by the reference evaluator, each node once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rotate and move the points of a cloud by the mounting of the sensor on its carrier."""
+"""Convert points from the axes of the sensor to the axes of its carrier."""
 
 from __future__ import annotations
 

@@ -499,7 +499,7 @@ class Expressions(KernelWriter):
 
 
 def _split_halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return numbers as two float32 arrays, whose sum is more precise than float32."""
+    """Split numbers into two float32 arrays with a more precise sum than one float32."""
     high = values.astype(np.float32)
     return high, (values - high).astype(np.float32)
 
