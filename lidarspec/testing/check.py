@@ -713,6 +713,7 @@ def _make_report(
         return report
     watch(f"{sensor.id}: declaration", 0)
     report.findings += check_declaration(subject)
+    is_whole = not subject.tested  # whether all rules were checked
     for done, tested_property in enumerate(PROPERTIES):
         violated = sorted(
             {finding.code for finding in list_unacknowledged(report.findings, sensor, whole=False)}
@@ -721,6 +722,7 @@ def _make_report(
         reason = tested_property.lacks(subject) or (
             f"not tested because of {', '.join(violated)}" if violated else ""
         )
+        is_whole = is_whole and not violated
         if reason:
             report.skipped[tested_property.name] = reason
             continue
@@ -731,13 +733,12 @@ def _make_report(
         report.findings += findings
         if any(finding.code in FATAL_RULES for finding in report.findings):
             report.skipped[REMAINING_PROPERTIES] = "not tested until these findings are fixed"
+            is_whole = False
             break
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
     )[::-1]
-    left = list_unacknowledged(
-        distinct, sensor, whole=REMAINING_PROPERTIES not in report.skipped and not subject.tested
-    )
+    left = list_unacknowledged(distinct, sensor, whole=is_whole)
     report.findings = [source_texts.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {

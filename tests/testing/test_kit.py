@@ -67,6 +67,7 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import (
     code_for_range,
+    degrees,
     intensity_of_distance,
     no_example,
     no_wrap_aligned,
@@ -351,6 +352,11 @@ def test_intended_findings_are_acknowledged_with_a_reason() -> None:
         "LS209",
         "LS210",
     }
+
+
+def test_an_acknowledged_rule_that_was_not_checked_may_occur() -> None:
+    (sensor,) = degrees.lidarspec_sensors()
+    assert codes(replace(sensor, acknowledged={"LS506": "a mirror"})) == {"LS502"}
 
 
 @pytest.mark.slow
