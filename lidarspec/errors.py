@@ -44,7 +44,7 @@ class SpecError(LidarSpecError):
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 
-#: Packages that a plugin calls. They never contain the line at fault.
+#: Packages that plugins and their tests call. The line at fault is never there.
 _CALLED_PACKAGES = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
@@ -100,12 +100,13 @@ class PluginError(SpecError):
 
         if isinstance(error, PluginError):
             return error
-        file, line = raised_at(error)
-        code = getattr(getattr(function, "func", function), "__code__", None)
+        file, line = find_plugin_line(error)
+        plain_function = getattr(function, "func", function)  # of a functools.partial
+        code = getattr(plain_function, "__code__", None)
         if not file and code is not None:
             file = code.co_filename
             line = code.co_firstlineno
-        location = f" ({shown_path(file)}:{line})" if file else ""
+        location = f" ({format_path(file)}:{line})" if file else ""
         if type(error) is SpecError:
             kind = ""
         else:
@@ -123,7 +124,7 @@ class PluginError(SpecError):
         )
 
 
-def printable(text: str) -> str:
+def escape_controls(text: str) -> str:
     """Return text with escaped control characters such as `\\x1b`.
 
     Line ends and tabs are kept. Control characters are all characters that control a terminal or
@@ -134,25 +135,25 @@ def printable(text: str) -> str:
     from unicodedata import category
 
     # control, format and surrogate characters; separators of lines and paragraphs
-    steering = {
+    controls = {
         character for character in text if category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
     } - {"\n", "\t"}
     return text.translate(
         {
             ord(character): character.encode("unicode_escape").decode("ascii")
-            for character in steering
+            for character in controls
         }
     )
 
 
-def shown_path(file: str) -> str:
+def format_path(file: str) -> str:
     """Return a path as text; it is relative if it is below the working directory."""
     if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
         return os.path.relpath(file)
     return file
 
 
-def raised_at(error: BaseException) -> tuple[str, int]:
+def find_plugin_line(error: BaseException) -> tuple[str, int]:
     """Return file and line of the plugin's code that raised an exception.
 
     This is the innermost frame of the traceback outside lidarspec and libraries. Returns "" and 0
@@ -217,13 +218,8 @@ class WireError(LidarSpecError):
         self.expected = expected
         self.got = got
         self.data = data
-        super().__init__(
-            ": ".join(
-                part
-                for part in (" ".join(part for part in (sensor, frame) if part), reason)
-                if part
-            )
-        )
+        subject = " ".join(name for name in (sensor, frame) if name)
+        super().__init__(": ".join(part for part in (subject, reason) if part))
 
 
 class UsageError(LidarSpecError):
@@ -238,6 +234,9 @@ class LibraryError(UsageError):
         extra: the extra of lidarspec that installs it.
         least_version: the oldest version that can be used; "" if any version can be used.
         installed_version: the installed version; "" if the library is missing.
+
+    Args:
+        cause: why the import failed; "" if it did not.
     """
 
     def __init__(
@@ -273,34 +272,37 @@ def did_you_mean(
     name: str,
     known: Iterable[str],
     *,
-    alike: float = 0.5,
+    min_similarity: float = 0.5,
     aliases: Mapping[str, str] = MappingProxyType({}),
-    max_parts: int = MAX_SUGGESTED_NAMES,
+    max_containing: int = MAX_SUGGESTED_NAMES,
 ) -> str:
     """Return a clause such as ``; did you mean 'speed'?``; "" if no name is similar.
 
-    Names that contain the unknown name have priority over similar names.
+    All names that contain the unknown name are suggested. If there are none or too many of them,
+    the most similar name is suggested.
 
     Args:
         name: the unknown name.
         known: the valid names.
-        alike: minimum similarity of a suggested name to the unknown name, from 0 to 1.
+        min_similarity: minimum similarity of a suggested name to the unknown name, from 0 to 1.
         aliases: alias -> the name to suggest instead of it.
-        max_parts: the maximum number of suggested names that contain `name`.
+        max_containing: the maximum number of suggested names that contain `name`.
     """
     import difflib  # imported here because suggestions are rare
 
-    by_letters = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
-    parts = dict.fromkeys(
-        meant for other, meant in by_letters.items() if len(name) > 1 and name.lower() in other
-    )
-    close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=alike)
-    if 0 < len(parts) <= max_parts:
-        named = list(parts)
+    by_lower_case = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
+    containing = dict[str, None]()  # an ordered set, because several aliases may mean one name
+    if len(name) > 1:
+        containing = dict.fromkeys(
+            meant for other, meant in by_lower_case.items() if name.lower() in other
+        )
+    if 0 < len(containing) <= max_containing:
+        suggested = list(containing)
     else:
-        named = [by_letters[other] for other in close]
-    if named:
-        return f"; did you mean {format_names(named)}?"
+        close = difflib.get_close_matches(name.lower(), by_lower_case, n=1, cutoff=min_similarity)
+        suggested = [by_lower_case[other] for other in close]
+    if suggested:
+        return f"; did you mean {format_names(suggested)}?"
     return ""
 
 
@@ -341,15 +343,23 @@ def refuse_text(data: object) -> None:
 class UnknownName(UsageError):
     """An unknown name; the message suggests similar names, or lists all names.
 
+    Args:
+        name: the unknown name.
+        known: the valid names.
+        place: the subject of the message, such as the id of the sensor; "" for none.
+        hint: the end of the message, which begins with its separator, such as "; ...".
+        aliases: alias -> the name to suggest instead of it.
+
     Attributes:
-        alike: minimum similarity of a suggested name to the unknown name, from 0 to 1.
-        max_parts: maximum number of suggested names that contain the unknown name.
+        what: the kind of name, for the message.
+        min_similarity: minimum similarity of a suggested name to the unknown name, from 0 to 1.
+        max_containing: maximum number of suggested names that contain the unknown name.
         max_listed: maximum number of names that are listed if none is suggested.
     """
 
     what = "name"
-    alike = 0.5
-    max_parts = MAX_SUGGESTED_NAMES
+    min_similarity = 0.5
+    max_containing = MAX_SUGGESTED_NAMES
     max_listed: float = 12
 
     def __init__(
@@ -364,16 +374,20 @@ class UnknownName(UsageError):
         self.name = name
         self.known = tuple(sorted(known))
         self.place = place
-        suggestion = did_you_mean(
-            name, self.known, alike=self.alike, aliases=aliases, max_parts=self.max_parts
+        similar = did_you_mean(
+            name,
+            self.known,
+            min_similarity=self.min_similarity,
+            aliases=aliases,
+            max_containing=self.max_containing,
         )
-        is_listed = 0 < len(self.known) <= self.max_listed and not suggestion
+        is_listed = 0 < len(self.known) <= self.max_listed and not similar
         if is_listed:
             names = f" (known: {', '.join(self.known)})"
         else:
             names = ""
         where = f"{place}: " if place else ""
-        super().__init__(f"{where}unknown {self.what} {name!r}{suggestion}{names}{hint}")
+        super().__init__(f"{where}unknown {self.what} {name!r}{similar}{names}{hint}")
 
 
 class UnknownSensor(UnknownName):
@@ -383,10 +397,12 @@ class UnknownSensor(UnknownName):
         distribution: the distribution that has the sensor, if it is known that this distribution is
             not installed or failed to load; otherwise "".
         failure: the reason why the installed distribution failed to load; otherwise "".
+
+    If `distribution` is not "", the message ends with it instead of `hint`.
     """
 
     what = "sensor"
-    max_parts = 30  # a vendor's name suggests all of its sensors
+    max_containing = 30  # a vendor's name suggests all of its sensors
 
     def __init__(
         self,
@@ -412,7 +428,7 @@ class UnknownFrame(UnknownName, KeyError):
     """The sensor has no frame type with this name."""
 
     what = "frame"
-    alike = 0.7
+    min_similarity = 0.7
     max_listed = math.inf
     __str__ = Exception.__str__  # KeyError shows the repr of the message
 
@@ -427,7 +443,7 @@ class UnknownCommand(UnknownName):
     """The sensor has no command with this name."""
 
     what = "command"
-    alike = 0.8  # a wrong guess can stop a motor
+    min_similarity = 0.8  # a wrong guess can stop a motor
     max_listed = math.inf
 
 
@@ -441,7 +457,7 @@ class UnknownFormat(UnknownName):
     """There is no file format with this suffix."""
 
     what = "format"
-    alike = 0.6  # suffixes are short, so half of their letters are often equal by chance
+    min_similarity = 0.6  # suffixes are short, so half of their letters are often equal by chance
 
 
 class MissingField(UsageError):
@@ -488,6 +504,9 @@ class WriteError(SourceError):
 
     Attributes:
         reason: the reason, without the path.
+
+    Args:
+        state: the state in which the file is left, for the message.
     """
 
     def __init__(self, path: str, reason: str, state: str) -> None:

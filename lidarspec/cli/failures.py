@@ -113,7 +113,7 @@ def _find_next_command(error: Exception, command: str, verb: str) -> str:
         return f"lidarspec check {shlex.quote(error.path)}"
     # The user named the file of the plugin.
     if isinstance(error, errors.PluginError) and error.file and sensor not in registry():
-        return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
+        return f"lidarspec check {shlex.quote(errors.format_path(error.file))}"
     if "{sensor}" in command and not sensor:
         if isinstance(error, errors.SpecError):
             return "lidarspec plugins"

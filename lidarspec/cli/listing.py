@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 
 from lidarspec.cli.output import emit_parts, render
-from lidarspec.errors import printable
+from lidarspec.errors import escape_controls
 from lidarspec.explaining.listing import Line, fold, join_text as plain_text
 
 #: Role of a part of a line -> its style on a terminal.
@@ -50,5 +50,5 @@ def _format_line(line: Line, width: int | None) -> str:
 
     drawing = Text()
     for span in line if width is None else fold(line, width):
-        drawing.append(printable(span.text), STYLES.get(span.role))
+        drawing.append(escape_controls(span.text), STYLES.get(span.role))
     return render(drawing)

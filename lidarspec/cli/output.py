@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lidarspec.cli.terminal import note, say, verbosity
-from lidarspec.errors import printable, system_errors
+from lidarspec.errors import escape_controls, system_errors
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -101,7 +101,11 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         rate = f"{self._unit(task.speed)}/s" if task.speed else ""
         completed, total = done or (0, 0)
         self._make_bar.update(
-            task.id, description=printable(text()), completed=completed, total=total, rate=rate
+            task.id,
+            description=escape_controls(text()),
+            completed=completed,
+            total=total,
+            rate=rate,
         )
         self._make_bar.start()
         self._make_bar.refresh()

@@ -32,7 +32,7 @@ from lidarspec.cli.options import (
 )
 from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.errors import UnknownFrame, UsageError, printable
+from lidarspec.errors import UnknownFrame, UsageError, escape_controls
 from lidarspec.explaining.clock_text import describe_clock
 from lidarspec.packets.clock_monitor import ClockReport
 from lidarspec.points.conventions import UNITS
@@ -225,7 +225,7 @@ def _format_value(name: str, value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, str):
-        return printable(value)
+        return escape_controls(value)
     if isinstance(value, int | np.bool_):
         return str(int(value))
     if not math.isfinite(value):
@@ -335,7 +335,7 @@ class StatsPrinter:
         if self.device.sensor.clock is not None:
             say(f"  clock    {describe_clock(clock)}")
         for fact, value in self.device.info.items():
-            say(f"  {fact}: {printable(value)}")
+            say(f"  {fact}: {escape_controls(value)}")
 
     def _collect_figures(self, reading: MeterReading) -> dict[str, Any]:
         facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}

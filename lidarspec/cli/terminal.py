@@ -18,7 +18,7 @@ from typing import Any
 
 import click
 
-from lidarspec.errors import SourceError, printable
+from lidarspec.errors import SourceError, escape_controls
 
 
 class Verbosity:
@@ -52,7 +52,7 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
     """
     if isinstance(content, str):
         if colour is None:
-            content = printable(content)
+            content = escape_controls(content)
         else:
             content = "".join(map(_escape_part, _COLOURS.split(content)))
     with _translate_write_errors():
@@ -67,7 +67,7 @@ def note(text: str) -> None:
     if verbosity.loudness < 0:
         return
     try:
-        click.echo(printable(text), err=True)
+        click.echo(escape_controls(text), err=True)
     except (OSError, ValueError):
         _discard_stream(sys.stderr)
 
@@ -119,7 +119,7 @@ def discard_output() -> None:
 def _escape_part(part: str) -> str:
     if _COLOURS.fullmatch(part):
         return part
-    return printable(part)
+    return escape_controls(part)
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ from lidarspec.detect.listen import (
     list_udp_ports,
     read_sensor_sample,
 )
-from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
+from lidarspec.errors import LidarSpecError, UsageError, escape_controls, suggestion
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
@@ -419,7 +419,7 @@ def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diag
     return Diagnosis(
         True,
         f"{name} sends{rate}: {score.data_frames} data frames, {score.share:.0%} of the bytes are"
-        f" in frames{printable(device)}",
+        f" in frames{escape_controls(device)}",
     )
 
 

@@ -24,7 +24,7 @@ from lidarspec.detect.identification import (
     verb_to_show,
 )
 from lidarspec.device.device import Device
-from lidarspec.errors import LidarSpecError, UsageError, printable, suggest
+from lidarspec.errors import LidarSpecError, UsageError, escape_controls, suggest
 from lidarspec.explaining.clock_text import describe_clock
 from lidarspec.packets.returns import describe_incomplete_groups
 from lidarspec.recording.format import Header
@@ -458,7 +458,7 @@ def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
     if content.incomplete_returns:
         yield "returns", describe_incomplete_groups(content.incomplete_returns)
     if content.clock:
-        yield "clock", printable(content.clock)
+        yield "clock", escape_controls(content.clock)
     for name, text in content.info.items():
-        yield name.replace("_", " "), printable(text)
+        yield name.replace("_", " "), escape_controls(text)
     yield COMMAND_LABEL, content.command

@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError, printable
+from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError, escape_controls
 from lidarspec.spec import tree
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import with_frames
@@ -102,7 +102,7 @@ def _make_line(text: str) -> str:
 
     Each export escapes its own special characters.
     """
-    return printable(" ".join(text.split()))
+    return escape_controls(" ".join(text.split()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.color import Color, ColorSystem
 from rich.text import Text
 
-from lidarspec.errors import printable
+from lidarspec.errors import escape_controls
 from lidarspec.points.appearance import RAMP_STEPS
 from lidarspec.points.colours import Rgb, make_ramp
 
@@ -150,7 +150,7 @@ class CellGrid:
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
-        text = printable(text).replace("\n", " ")
+        text = escape_controls(text).replace("\n", " ")
         text = text[max(-column, 0) :][: width - max(column, 0)]
         column = max(column, 0)
         self.codes[row, column : column + len(text)] = [ord(character) for character in text]

@@ -15,7 +15,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import UsageError, printable
+from lidarspec.errors import UsageError, escape_controls
 from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.listing import list_parents
 from lidarspec.exports import select_frame
@@ -100,7 +100,7 @@ def explanation(value: Explanation) -> str:
     for number, row in enumerate(value.rows[:MAX_ROWS]):
         indent = "&nbsp;" * 2 * len(list_parents(row.path))
         name = escape(row.path.rpartition(".")[2])
-        meaning = escape(printable(row.meaning))
+        meaning = escape(escape_controls(row.meaning))
         if row.matches_spec:
             tint = f"hsl({number * HUE_STEP_DEG % 360} 70% 50% / .25)"
         else:
@@ -136,10 +136,10 @@ def sensor(value: Sensor) -> str:
     Each diagram can be opened and closed. At first, only the diagrams of data frames are open.
     """
     head = (
-        f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
+        f"<b>{escape(escape_controls(f'{value.vendor} {value.model}'))}</b>"
         f" <code>{escape(value.id)}</code>, verified by {escape(value.status)}"
     )
-    source = f'<div style="opacity:.75">{escape(printable(value.source))}</div>'
+    source = f'<div style="opacity:.75">{escape(escape_controls(value.source))}</div>'
     return "\n".join(
         [f"<div>{head}{source}</div>", *(_make_diagram(value, name) for name in value.frames)]
     )
@@ -218,14 +218,14 @@ def _make_table(
 ) -> str:
     """Return an HTML table. Cells are HTML; the caption and the heads are plain text."""
     cell = _CELL.format(align=align)
-    head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
+    head = "".join(f'<th style="{cell}">{escape(escape_controls(name))}</th>' for name in heads)
     body = "\n".join(
         f"<tr>{''.join(f'<td style={chr(34)}{cell}{chr(34)}>{text}</td>' for text in row)}</tr>"
         for row in rows
     )
     return (
         f'<div style="overflow:auto;max-height:{MAX_TABLE_PX}px;font-size:90%">'
-        f'<div style="padding:0 8px 4px">{escape(printable(caption))}</div>'
+        f'<div style="padding:0 8px 4px">{escape(escape_controls(caption))}</div>'
         "<table"
         f' style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n'
         f"<tbody>{body}</tbody></table></div>"

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import lidarspec as ls
-from lidarspec.errors import printable
+from lidarspec.errors import escape_controls
 from lidarspec.exports import EXPORTS
 from lidarspec.spec import Sensor
 
@@ -34,7 +34,7 @@ def evil() -> Sensor:
 @pytest.mark.parametrize("kind", EXPORTS)
 def test_control_characters_and_line_breaks_are_escaped(evil: Sensor, kind: str) -> None:
     text = ls.export(evil, kind)
-    assert text == printable(text)
+    assert text == escape_controls(text)
     assert not any(line.startswith("]]") for line in text.splitlines())
 
 
