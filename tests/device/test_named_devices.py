@@ -263,8 +263,8 @@ def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr
     assert (
-        f"{folder} is accessible to other users: run chmod 775; other users could run programs"
-        " as you"
+        f"other users could run programs as you, because {folder} is accessible to other users:"
+        " run chmod 775"
     ) in said
     assert "is not a folder" in ran("trust", folder / "front.bin", code=2).stderr
 
