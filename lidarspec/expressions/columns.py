@@ -156,7 +156,7 @@ class Column(NDArrayOperatorsMixin):
         """Return one element of an array field for each packet; nan if it is missing."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
-                "only a field can be indexed, with one index for each array, as in"
+                "only a field can be indexed, and each index is one integer, as in"
                 " f.columns[0].timestamp"
             )
         return _read_column(self.batch, self.frame, f"{self.source}[{index}]")
@@ -215,8 +215,8 @@ class Column(NDArrayOperatorsMixin):
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
             raise SpecError(
-                f"cannot move a column from {len(own)} nested arrays to {', '.join(axes)}: name at"
-                f" least {len(own)} arrays"
+                f"the column varies along {len(own)} nested arrays: .on(...) requires at least"
+                f" {len(own)} arrays, got {', '.join(axes)}"
             )
         names = {schema.array_depths[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
@@ -633,17 +633,17 @@ def _find_axis(
         if found:
             names = [" x ".join(names) for names in found.values()]
             reason = (
-                f"fits several arrays of the frame, {' and '.join(names)}: choose the array, for"
+                f"match several arrays of the frame, {' and '.join(names)}: choose the array, for"
                 f" example with along({found[max(found)][-1]!r}, ...)"
             )
             break
     else:
         arrays = ", ".join(f"{axis} {length}" for (_, length), axis in whole.items())
         if arrays:
-            reason = f"fits no array of the frame; the arrays have the lengths {arrays}"
+            reason = f"match no array of the frame; the arrays have the lengths {arrays}"
         else:
-            reason = "fits no array, because the frame has no arrays"
-    raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
+            reason = "match no array, because the frame has no arrays"
+    raise SpecError(f"{' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
 def align_points(
@@ -672,11 +672,11 @@ def align_points(
     stray = next((name.strip("?") for name in axes if name is not None and "?" in name), None)
     if stray is not None or len(shape) > 1 + len(axes):
         if stray is not None:
-            where = f"along {stray!r}"
+            array = f"the array {stray!r}"
         else:
-            where = "along another array"
+            array = "an array"
         raise SpecError(
-            f"the points vary {where}, but they use no field of that array"
+            f"the values of the points vary along {array}, but no value uses a field of this array"
             f" ({_describe_lengths(named, axes)}): use along(...) to assign plain numbers to an"
             " array",
             rule="LS214",
@@ -859,7 +859,7 @@ def load_physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     array = table.raw(info.path)
     if array.dtype == object:
         raise SpecError(
-            "the values of this field are not numbers: declare text as bytes",
+            "the values of this field are not numbers; for text, declare the field as Bytes(...)",
             path=info.path,
         )
     with np.errstate(invalid="ignore"):  # a signalling nan is a nan
@@ -919,7 +919,8 @@ class Fields:
         """Return one element of an array of structs; a negative index counts from the end."""
         if not self._prefix or not isinstance(index, int):
             raise SpecError(
-                "expected one index for each array, as in f.columns[0].timestamp or f.distances[-1]"
+                "only an array can be indexed, and each index is one integer, as in"
+                " f.columns[0].timestamp or f.distances[-1]"
             )
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 

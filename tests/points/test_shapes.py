@@ -492,15 +492,15 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
     [
         (
             lambda f: Polar(range=f.near, azimuth=f.first * ANGLES),
-            r"3 values fits several .*, near and other\[\]: .*along\('other\[\]', ",
+            r"3 values match several .*, near and other\[\]: .*along\('other\[\]', ",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=np.zeros(7)),
-            r"7 values fits no array .* have the lengths near 3, other 4, other\[\] 3",
+            r"7 values match no array .* have the lengths near 3, other 4, other\[\] 3",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
-            r"along 'other\[\]', but they use no field of that array \(.*other\[\] 3",
+            r"along the array 'other\[\]', but no value uses a field of this array \(.*other\[\] 3",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))),
@@ -512,7 +512,7 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
         ),
         (
             lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),
-            r"along 'other(\[\])?', but they use no field of that array",
+            r"along the array 'other(\[\])?', but no value uses a field of this array",
         ),
         (lambda f: Polar(range=f.first, azimuth=f.first.index), r"a field inside an array"),
     ],
@@ -559,7 +559,7 @@ def test_simulation_reports_the_same_axis_errors() -> None:
         points=lambda f: Polar(range=f.near * along("other[]", np.ones(3)), azimuth=0),
         simulation=Simulation(lambda i: {}, rate=10),
     )
-    with pytest.raises(SpecError, match=r"along 'other\[\]'"):
+    with pytest.raises(SpecError, match=r"along the array 'other\[\]'"):
         simulate(sensor, 2)
 
 
