@@ -113,8 +113,8 @@ def _merge_values(
             put_value(merged, split_path(name), new)
         except (AttributeError, TypeError, ValueError):
             raise UsageError(
-                f"{place}: {name} cannot be set in the given values:"
-                " they have no such field, or its array needs an index, as in points[0].distance"
+                f"{place}: {name} cannot be set: the given values have no field of this name, or"
+                " an array in the name has no index, as in points[0].distance"
             ) from None
     return merged
 

@@ -148,7 +148,7 @@ def find_argument_slot(sensor: SensorDescription, name: str, argument: str) -> A
         if not is_integer or not low <= declared.kind.low <= declared.kind.high <= high:
             raise SpecError(
                 f"Choice cannot set {declared.path!r}: the field must be an integer without a"
-                " scale, with room for all numbers of the Choice",
+                " scale that can contain all numbers of the Choice",
                 path=place,
                 sensor=sensor.id,
             )
@@ -200,8 +200,8 @@ def _make_slot(sensor: SensorDescription, name: str, path: str, place: str) -> A
     left = counts[len(indices) :]
     if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
         reason = (
-            f"{path!r} has {len(indices)} indices, but the number of arrays around the field is"
-            f" {len(counts) - (info.kind == 'bytes')}"
+            f"{path!r} has {len(indices)} indices, but the field is inside"
+            f" {len(counts) - (info.kind == 'bytes')} arrays"
         )
         raise SpecError(reason, path=place, sensor=sensor.id)
     for index, count in zip(indices, counts, strict=False):

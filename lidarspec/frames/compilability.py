@@ -43,14 +43,16 @@ def _check(node: tree.Node, path: str, *, is_in_array: bool) -> None:
         case tree.Blob() if is_in_array and node.ending is not None:
             raise NotCompilableError(
                 node.info.path,
-                "the content of each element determines its end: use an array of structs",
+                "the size of each element depends on its content: use an array of structs",
             )
         case tree.PartSequence() if is_in_array:
             raise NotCompilableError(path, "the sequence of parts is inside an array")
         case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
-                    raise NotCompilableError(part.info.path, "the bits are in an array of arrays")
+                    raise NotCompilableError(
+                        part.info.path, "the bit field is inside an array of arrays"
+                    )
         case tree.When() | tree.Select():
             _check_alternatives(node)
     for formula in tree.formulas(node):
@@ -90,8 +92,8 @@ def _check_alternatives(node: tree.When | tree.Select) -> None:
             if path and (path in names or (part is alternative and not is_only_one)):
                 raise NotCompilableError(
                     path,
-                    "the content of the part determines its size, but another case of the same If"
-                    " or Switch has a different field with this name",
+                    "several cases of an If or Switch have a field with this name, and the size of"
+                    " one of these fields depends on its content: use different names",
                 )
 
 

@@ -179,7 +179,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    expected = "parts that end where the bytes for parts end"
+    expected = "parts that fill the bytes of the array exactly"
     return Fault(LENGTH, part.prefix, part.start, expected, None, end)
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 #: The reason why an array inside the elements of an array has no single length per frame.
-VARYING_LENGTH = "the length of the array varies within one frame, so it cannot be a column"
+VARYING_LENGTH = "the inner arrays of one frame have different lengths, so they cannot be a column"
 
 
 class Table(Protocol):
@@ -534,7 +534,8 @@ class ParsedTable:
             if info.dtype is None:
                 return _make_object_column(values)
             raise SpecError(
-                "the branches have values of different shapes, so the field cannot be a column",
+                "the shape of the values differs between the cases of an If or Switch, so the field"
+                " cannot be a column",
                 path=path,
             ) from None
         return column

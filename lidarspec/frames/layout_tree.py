@@ -1143,7 +1143,7 @@ def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
         if frame.wire is not None and endings:
             raise NotCompilableError(
                 next(iter(endings)),
-                "a frame with a wire form cannot contain bytes up to a terminator",
+                "a frame with `wire` cannot contain bytes up to a terminator",
             )
         return HeaderTree(frame.tree, frame.max_struct_bytes)
     except NotCompilableError as reason:

@@ -156,7 +156,7 @@ def _parse_invalid(
         return frame, _parse_unverified(sensor, frame, data)
     if not sensor.frames:
         raise UnknownFrame(
-            "data", (), place=sensor.id, hint="; first configure the sensor with its file"
+            "data", (), place=sensor.id, hint="; configure the sensor with its file first"
         )
     faults = [_find_fault(sensor, name, data) for name in sensor.frames]
     if not verify:
@@ -205,7 +205,7 @@ def _find_field_fault(
     """
     fault = _run_search(sensor, name, diagnose.find_fault, examined)
     if fault is None:  # a checksum of a plugin returned a different value this time
-        return WireError("the frame is not valid", sensor=sensor.id, frame=name, data=data)
+        return WireError("the frame is invalid", sensor=sensor.id, frame=name, data=data)
     return _to_wire_error(sensor, name, data, fault, to_wire_offset)
 
 

@@ -150,7 +150,7 @@ class FormCoder(Coder):
         tree = frame_layouts(frame)
         if isinstance(tree, NotCompilableError):
             raise SpecError(
-                f"a wire form requires fields with computable offsets: {tree.reason}",
+                f"`wire` requires a struct in which all offsets can be calculated: {tree.reason}",
                 path=tree.path,
             )
         self.form = form
@@ -278,7 +278,7 @@ class FormCoder(Coder):
         else:
             offset = decoded.problem.offset
         if not leaves:
-            reason = f"the header does not allow the frame to have {size} bytes"
+            reason = f"the frame has {size} bytes, which does not match its header"
             return Problem(offset, reason, got=size)
         got = data[offset : offset + MAX_SHOWN_BYTES]
         reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"

@@ -317,8 +317,8 @@ def describe_end(node: tree.PartSequence) -> str:
         )
     )
     return (
-        f"the first part has {format_formula(node.size)} bytes, and {following} of each part is"
-        " the size of the next part, or 0 in the last part"
+        f"the first part has {format_formula(node.size)} bytes; {following} in each part is the"
+        " size of the next part (0: last part)"
     )
 
 

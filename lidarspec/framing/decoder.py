@@ -91,7 +91,7 @@ class Decoder:
     ) -> None:
         if not sensor.incoming:
             raise UsageError(
-                f"{sensor.id} has no frames until it is configured: first configure it with a file"
+                f"{sensor.id} has no frames yet: configure the sensor with its file first"
             )
         self.sensor = sensor
         self.stream = stream

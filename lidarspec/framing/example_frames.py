@@ -163,7 +163,7 @@ def _draw_header(
         except UnknownSelectorError as unknown:
             if isinstance(unknown.leaf, MeasuredSize):
                 raise SpecError(
-                    "a header is not enough for an example: the layout depends on the content",
+                    "no example can be made, because the size of this field depends on its content",
                     path=unknown.leaf.info.path,
                 ) from None
             own = drawn.get(unknown.leaf.info.path)

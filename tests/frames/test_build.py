@@ -41,7 +41,7 @@ def make_command_sensor(**args: Any) -> Sensor:
         (("nothing", 0, 9), "'nothing'"),
         (("t", 0, 9), "'t'"),
         (("v[2]", 0, 9), "2 elements"),
-        (("t.u[0]", 0, 9), "arrays around the field is 0"),
+        (("t.u[0]", 0, 9), "the field is inside 0 arrays"),
         (("t.u", Text(3)), "'t.u'"),
     ],
 )

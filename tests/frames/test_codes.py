@@ -193,7 +193,7 @@ def test_a_command_has_names_of_its_own_for_a_shared_field() -> None:
             Choice(**wrong)
     wide = Command("set", args={"fan": ("number", Choice(off=-1, on=300))})
     beyond = dataclasses.replace(sensor, commands={"set_fan": wide})
-    with pytest.raises(SpecError, match="room for all numbers of the Choice"):
+    with pytest.raises(SpecError, match="can contain all numbers of the Choice"):
         beyond.command("set_fan", fan="on")
 
 

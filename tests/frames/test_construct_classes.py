@@ -492,12 +492,12 @@ PLAIN: dict[str, Case] = {
         "a" / Array(2, VarInt),
         "b" / Int8ub,
         frames="8101020c 01020c",
-        reason="content of each element",
+        reason="size of each element depends on its content",
     ),
     "CString in an array": case(
         "a" / Array(2, CString("utf8")),
         frames="61620000 00c3a900",
-        reason="content of each element",
+        reason="size of each element depends on its content",
     ),
     "NullTerminated that keeps its end": case(
         "a" / NullTerminated(GreedyBytes, require=False),
