@@ -149,7 +149,7 @@ class ChecksumWithConstant(Checksum):
         if isinstance(self.base, Xor | WordXor):
             operation = "xor"
         elif self.negative:
-            operation = "taken from"
+            operation = "subtracted from"
         else:
             operation = "plus"
         return f"{self.base.describe()}, {operation} 0x{self.constant:0{digits}x}"

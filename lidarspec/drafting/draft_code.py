@@ -464,7 +464,7 @@ def _iter_sensor_arguments(angles: Sequence[str], counters: Sequence[RisingField
     if angles:
         yield f'scan=OnWrap("{angles[0]}"),{_format_alternatives("  #", angles[1:])}'
     else:
-        yield "scan=Every(0.1),  # seconds, because no angle was found that marks a revolution"
+        yield "scan=Every(0.1),  # seconds; no angle was found, so revolutions are unknown"
     if counters:
         counter = counters[0]
         limits = ""

@@ -103,9 +103,10 @@ class CoveredSpan:
                 + [f"the last {self.tail}"] * (self.tail > 0)
             )
             return "all bytes after the checksum" + (f", except {omitted}" if omitted else "")
-        return f"all other bytes except the first {self.head}" + (
-            f" and the last {self.tail}" if self.tail else ""
-        )
+        omitted = ["the checksum"]
+        omitted += [f"the first {self.head}"] * (self.head > 0)
+        omitted += [f"the last {self.tail}"] * (self.tail > 0)
+        return f"all bytes except {', '.join(omitted[:-1])} and {omitted[-1]}"
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,8 @@ class ChecksumMatch:
         """All remarks for the user."""
         if self.has_constant:
             constant = (
-                "the checksum includes a constant, which may be a start value or the contribution"
-                " of other bytes"
+                "the checksum contains a constant, which is a start value or comes from constant"
+                " bytes"
             )
             return (constant, *self.notes)
         return self.notes

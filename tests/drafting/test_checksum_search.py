@@ -152,7 +152,7 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
     assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
         2,
-        "all other bytes except the first 2",
+        "all bytes except the checksum and the first 2",
     )
 
 
