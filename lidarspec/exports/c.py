@@ -117,7 +117,7 @@ def write_checksum(algorithm: Checksum, name: str) -> str:
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
-            raise ExportError("C does not support a folded sum that is padded with zeros")
+            raise ExportError("the export to C does not support Fold15 inside ZeroPadded")
         pad = (
             f"    for (; i % {algorithm.to}; ++i) {{\n"
             f"        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
@@ -331,7 +331,7 @@ def _format_checksum(
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
             raise ExportError(
-                f"{path}: C does not support a checksum that is stored in several places"
+                f"{path}: the export to C does not support a checksum that is stored in several places"
             )
     return _CHECKSUM.format(
         name=name.removesuffix("_ok"),

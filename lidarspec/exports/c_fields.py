@@ -288,7 +288,8 @@ class CLayout:
                 return SizeFormula(size)
             case tree.Blob() if entry.node.ending is not None:
                 raise ExportError(
-                    f"{entry.path}: C does not support bytes whose end is found by their content"
+                    f"{entry.path}: the export to C does not support bytes whose size depends on"
+                    " their content"
                 )
             case tree.Blob():
                 return SizeFormula(
@@ -314,8 +315,8 @@ class CLayout:
                 )
             case tree.PartSequence():
                 raise ExportError(
-                    f"{entry.path}: C does not support parts with an offset that depends on the"
-                    " sizes of earlier parts"
+                    f"{entry.path}: the export to C does not support parts with an offset"
+                    " that depends on the sizes of earlier parts"
                 )
             case tree.Empty() | tree.Derived():
                 return SizeFormula()
@@ -390,8 +391,8 @@ class CLayout:
         size = self.compute_size(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
-                f"{node.axis}: C does not support elements with an offset that depends on the sizes"
-                " of earlier elements"
+                f"{node.axis}: the export to C does not support elements with an offset that"
+                " depends on the sizes of earlier elements"
             )
         return size
 

@@ -336,8 +336,8 @@ def ksy(sensor: Sensor) -> str:
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
         raise ExportError(
-            f"{sensor.id}: two frame types have the same name in the lower case that Kaitai"
-            " requires"
+            f"{sensor.id}: two frame types have names that differ only in case, but Kaitai requires"
+            " lower case"
         )
     name = identifier(make_prefix(sensor))
     remarks = [
@@ -393,7 +393,7 @@ def _find_terminator(path: str, ending: tree.Ending) -> int:
         ExportError: if the end is not a single byte after the content.
     """
     if ending.is_content:
-        raise ExportError(f"{path}: the export to Kaitai has no numbers of variable size")
+        raise ExportError(f"{path}: Kaitai does not support numbers of variable size")
     if len(ending.terminator) != 1:
         raise ExportError(f"{path}: Kaitai supports only one byte as the terminator of bytes")
     return ending.terminator[0]

@@ -166,11 +166,11 @@ def describe_effect(sensor: Sensor, name: str) -> str:
         "starts the data": command.starts,
         "stops the data": command.stops,
         "accepted only while the sensor sends no data": command.only_stopped,
-        f"{command.settle:g} s before the next command": command.settle > 0,
-        f"again every {command.every:g} s": command.every > 0,
-        "sent on opening": name in sensor.on_open,
-        "sent on closing": name in sensor.on_close,
-        f"over the link `{command.link}`": command.link != "data",
+        f"followed by a pause of {command.settle:g} s": command.settle > 0,
+        f"sent again every {command.every:g} s": command.every > 0,
+        "sent when the device is opened": name in sensor.on_open,
+        "sent when the device is closed": name in sensor.on_close,
+        f"sent over the link `{command.link}`": command.link != "data",
     }
     return "; ".join(text for text, holds in effects.items() if holds)
 
@@ -195,7 +195,7 @@ def _iter_frame_section(name: str, frame: Frame) -> Iterator[str]:
     remarks = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
     remarks += [f"expected after a `{frame.after}` frame"] * (frame.after is not None)
     if frame.confirm > 1:
-        remarks.append(f"accepted only in sequences of at least {frame.confirm} frames")
+        remarks.append(f"accepted after {frame.confirm} consecutive valid frames of this type")
     remarks += ["checked for plausible values"] * (frame.plausible is not None)
     yield "; ".join(remarks) + "."
     rows = [

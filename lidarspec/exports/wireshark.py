@@ -234,7 +234,10 @@ class _TableWriter:
 
     def _make_blob_table(self, node: tree.Blob) -> Table:
         if node.ending is not None:
-            raise ExportError(f"{node.info.path}: the end of the bytes is found by their content")
+            raise ExportError(
+                f"{node.info.path}: the export to Wireshark does not support bytes whose"
+                " size depends on their content"
+            )
         name = node.name or "constant"
         if node.name:
             path = node.info.path
@@ -353,8 +356,8 @@ class _TableWriter:
         for kind in node.kinds:
             if kind.until is not None:
                 raise ExportError(
-                    f"{node.axis}: Wireshark does not support an array of parts that ends at a"
-                    " certain value"
+                    f"{node.axis}: the export to Wireshark does not support an array of parts that"
+                    " ends at a certain value"
                 )
             magic = [
                 [offset, mask, value]
@@ -503,7 +506,7 @@ def _make_algorithm_table(algorithm: Checksum) -> Table:
         case ZeroPadded():
             if isinstance(algorithm.algorithm, ZeroPadded):
                 raise ExportError(
-                    "Wireshark does not support a checksum over data that is padded twice"
+                    "the export to Wireshark does not support ZeroPadded inside ZeroPadded"
                 )
             return {**_make_algorithm_table(algorithm.algorithm), "pad": algorithm.to}
     raise ExportError(
@@ -625,7 +628,8 @@ def dissector(sensor: Sensor) -> str:
     link = sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
         raise ExportError(
-            f"{sensor.id}: Wireshark does not support messages that consist of several datagrams"
+            f"{sensor.id}: the export to Wireshark does not support messages that consist of"
+            " several datagrams"
         )
     # The dissector shows the first type that matches. Incoming types come first, so bytes that
     # match both directions are shown as incoming. Types with more constants come before others,

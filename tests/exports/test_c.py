@@ -40,11 +40,11 @@ SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 #: fields of these names get an underscore, since functions of the whole frame have them.
 OWN = ("frame_length", "is_frame")
 #: the reason of the refusal of parts that C cannot say.
-_PARTS = "C does not support parts with an offset that depends"
+_PARTS = "the export to C does not support parts with an offset that depends"
 #: the shapes that C cannot say, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
-    "shape-names": "bytes whose end is found by their content",
+    "shape-names": "bytes whose size depends on their content",
     "shape-segments": f"segments: {_PARTS}",
     "shape-tags": f"tags: {_PARTS}",
     "shape-channels": f"channels: {_PARTS}",

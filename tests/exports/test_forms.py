@@ -215,7 +215,10 @@ def assert_page_is_complete(sensor: Sensor) -> None:
 def test_a_reference_page_has_all_facts() -> None:
     text = export(ls.sensor("cspc-m1c1-mini"), "md")
     assert "| link `data` | serial, 150 000 or 115 200 baud, 8N1" in text
-    assert "| `start` | `aa 55 f0 0f` | `ack` | starts the data; sent on opening |" in text
+    assert (
+        "| `start` | `aa 55 f0 0f` | `ack` | starts the data; sent when the device is opened |"
+        in text
+    )
     assert "| 15 | 15.000 deg |" in export(ls.sensor("velodyne-vlp16"), "md")
 
 

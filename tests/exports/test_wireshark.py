@@ -34,7 +34,7 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 #: the shapes that Wireshark cannot be told, with the reason.
 REFUSED = {
     "shape-text": "Decimal is Python code",
-    "shape-names": "the end of the bytes is found by their content",
+    "shape-names": "does not support bytes whose size depends on their content",
     "shape-fragments": "messages that consist of several datagrams",
     **find_recoded(SHAPED.values()),
 }
