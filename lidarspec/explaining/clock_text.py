@@ -38,7 +38,7 @@ def describe_time_source(report: ClockReport) -> str:
 
 def _describe_epoch(report: ClockReport) -> str:
     if not report.epoch:
-        return "the manual does not say from when the clock counts"
+        return "the epoch of the clock is not documented"
     return EPOCHS[report.epoch]
 
 

@@ -422,7 +422,7 @@ def _make_rows(contents: FileContents) -> Sequence[tuple[str, str]]:
         lines.append(
             (
                 "part",
-                "the counts are those of the beginning of this long file"
+                "only the beginning of this long file was counted"
                 + "; the time of its end is unknown" * (contents.last_ns is None),
             )
         )

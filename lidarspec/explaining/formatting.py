@@ -467,8 +467,11 @@ def describe_losses(sensor: Sensor) -> str:
     if sensor.sequence is not None:
         return f"counted by `{sensor.sequence.field}`"
     if sensor.counts_losses:
-        return "counted by the clock"
-    return "not counted, because the packets have no counter and no clock with a declared pace"
+        return "computed from the clock, because the packets have no counter"
+    return (
+        "not counted, because the packets have no counter, and the time between packets is not"
+        " declared"
+    )
 
 
 def describe_declared_clock(clock: Clock) -> str:

@@ -214,7 +214,7 @@ def test_text_is_as_the_conventions_say() -> None:
     assert (
         lines[4] == "0009  00 00 e2  points[1]    0.000 m, intensity 226, at -0.20 deg -> no return"
     )
-    assert lines[-2] == "002c  3a 1a     timestamp    6.714 s; restarts at 30 s"
+    assert lines[-2] == "002c  3a 1a     timestamp    6.714 s; restarts from 0 after 30 s"
     assert re.fullmatch(
         r"002e  (..)        crc          0x\1 ok \(CRC-8 poly 0x4d over 46 bytes\)", lines[-1]
     )
