@@ -168,7 +168,7 @@ def _check_permission(port: str) -> Iterator[Diagnosis]:
     if group:
         yield Diagnosis(
             False,
-            f"{text}; members of the group {group} may open it, after they log in again",
+            f"{text}; add yourself to the group {group}, and log in again",
             f"sudo usermod -aG {group} $USER",
         )
     else:

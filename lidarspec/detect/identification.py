@@ -521,9 +521,9 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     return (
-        f"{text}. Another checksum, {match.algorithm.describe()}, matches {match.place} in"
-        f" {match.right} of {match.total} frames. It covers {covered} of the"
-        f" {length - match.place.size} other bytes ({match.span.describe(match.place, length)})"
+        f"{text}. The checksum {match.algorithm.describe()} matches {match.place} in"
+        f" {match.right} of {match.total} frames, over {covered} of {length} bytes"
+        f" ({match.span.describe(match.place, length)})"
     )
 
 

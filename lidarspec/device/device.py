@@ -353,8 +353,7 @@ class Device(ClosingContext):
         while not (self._unseen_scans and self._input.has_decoded_until(arrived)):
             if self._input.ended:
                 raise SourceError(
-                    f"{self.source}: no further scan arrives, because the input is"
-                    f" {self._input.state}"
+                    f"{self.source}: no more scans, because the input is {self._input.state}"
                 )
             batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
             if batch is not None:
@@ -620,7 +619,7 @@ class Device(ClosingContext):
         warnings = [f"{self.source}: {text}" for text in self._unknown_codes]
         if self._contradiction:
             warnings.append(
-                f"{self.source}: read as {self.sensor.id}, but {self._contradiction}; next:"
+                f"{self.source}: decoded as {self.sensor.id}, but {self._contradiction}; next:"
                 f" lidarspec detect {quote(str(self.source))}"
             )
         return warnings

@@ -192,8 +192,7 @@ class LiveInput(DeviceInput):
                     and not self.sensor.commands[name].starts
                 ):
                     self._reported_warnings.append(
-                        f"{error}; the sensor is read without the values that the reply would have"
-                        " contained"
+                        f"{error}; reading continues without the values of the reply"
                     )
                 elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
                     self._reported_warnings.append(

@@ -155,7 +155,7 @@ class Replay:
 
         Raises:
             UsageError: if the file has no times, but they are required.
-            WireError: if the file contains no received data.
+            WireError: if the file contains no data.
             SourceError: if the file cannot be read, or nothing can be sent.
         """
         while True:
@@ -165,7 +165,7 @@ class Replay:
                 self._start = time.monotonic()
             yield from self._run_once()
             if not self.chunks:
-                raise WireError(f"{self._file} contains no received data")
+                raise WireError(f"{self._file} contains no data")
             if not self._loop:
                 return
 

@@ -559,15 +559,15 @@ def test_frames_of_another_sensor_are_a_warning(tmp_path: Path, number: int) -> 
     path.write_bytes(b"".join(ls.simulate(ls.sensor("velodyne-vlp16"), number)))
     with ls.open(path, "velodyne-hdl32e") as device:
         assert list(device.scans())
-        (warning,) = (warning for warning in device.warnings if "read as" in warning)
+        (warning,) = (warning for warning in device.warnings if "decoded as" in warning)
         assert (
-            f"{path}: read as velodyne-hdl32e, but the frames are those of velodyne-vlp16 ("
+            f"{path}: decoded as velodyne-hdl32e, but the frames are those of velodyne-vlp16 ("
             in warning
         )
         assert f"next: lidarspec detect {path}" in warning
     with ls.open(path, "velodyne-vlp16") as device:
         assert list(device.scans())
-        assert not any("read as" in warning for warning in device.warnings)
+        assert not any("decoded as" in warning for warning in device.warnings)
 
 
 def test_live_frames_of_another_sensor_are_a_warning() -> None:
@@ -614,9 +614,7 @@ def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
         whole = [scan for scan in device.scans() if scan.complete]
     with ls.open(path, TURNING) as device:
         assert [device.latest().stamp_ns for _ in whole] == [scan.stamp_ns for scan in whole]
-        with pytest.raises(
-            SourceError, match="no further scan arrives, because the input is ended"
-        ):
+        with pytest.raises(SourceError, match="no more scans, because the input is ended"):
             device.latest()
 
 

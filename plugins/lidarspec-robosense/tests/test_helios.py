@@ -378,7 +378,7 @@ def test_a_packet_of_another_model_is_a_warning(tmp_path: Path) -> None:
     path.write_bytes(b"".join(frames))
     with ls.open(path, SENSOR) as device:
         assert list(device.scans())
-        assert not any("read as" in warning for warning in device.warnings)
+        assert not any("decoded as" in warning for warning in device.warnings)
 
 
 @pytest.mark.parametrize("hertz", [4.95, 10, 20])  # 300 rpm less a tolerance, 600, 1200
