@@ -149,7 +149,7 @@ MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
 def describe_difference(own: int, other: int) -> str | Relative:
     """Return how to distinguish two models by their packets per revolution."""
     if own == other:
-        return "the packets are identical, but the label and possibly the baud rate differ"
+        return "both models send the same packets; the label and possibly the baud rate differ"
     return Relative(
         f"packets start every {360 / other:g} degrees", partial(starts_on_grid, packets=other)
     )

@@ -250,7 +250,7 @@ def make_rangefinder(name: str) -> Sensor:
         on_open=("output_on",),
         range_limits=limits,
         relatives={
-            other: "the frames are identical; the label on the housing names the model"
+            other: "both models send the same frames; the label on the housing names the model"
             for other in MODELS
             if other != name
         },

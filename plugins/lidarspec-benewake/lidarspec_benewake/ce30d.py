@@ -134,5 +134,5 @@ CE30D = Sensor(
     simulation=Simulation(sweep, rate=SCAN_RATE_HZ * PACKETS_PER_SCAN),
     range_limits=(0.1, 30.0),
     status="manual",
-    source="ce30_driver 1.3, packet.h, packet.cpp and udp_socket.h; the least range is assumed",
+    source="ce30_driver 1.3, packet.h, packet.cpp and udp_socket.h; the shortest range is assumed",
 )

@@ -66,7 +66,7 @@ DATA = Struct(
         this.count,
         Struct(
             "x" / Scaled(Int16sl, 0.005, "m") * "positive to the right",
-            "y" / Scaled(Int16ul, 0.005, "m") * "distance ahead",
+            "y" / Scaled(Int16ul, 0.005, "m") * "positive forwards",
             "z" / Scaled(Int16sl, 0.005, "m") * "positive upwards",
             "reflectivity" / Int8ul,
             "after" / Scaled(Int8ul, 1e-6, "s") * "time since the previous point",
@@ -155,8 +155,8 @@ VISTA = Sensor(
     vendor_axes=("right", "forward", "up"),
     status="manual",
     source=(
-        "Sensor Communication Specifications (opening), and a public reader; the maximum"
-        " range is assumed"
+        "first pages of the Sensor Communication Specifications, and a public reader; the"
+        " maximum range is assumed"
     ),
 )
 

@@ -107,9 +107,11 @@ def make_ack(header: bytes) -> Checksummed:
             "header" / Const(header),
             "mode"
             / Enum(Int8ul, **{name: mode ^ 0xA0 for name, mode in MODES.items()})
-            * "mode of the command, XOR A0",
-            "length" / Const(7, Int8ul) * "number of data bytes: firmware and reserved",
-            "firmware" / Int8ul * "set in the reply to the command start; 3 means V3.0",
+            * "mode of the command, XORed with A0",
+            "length" / Const(7, Int8ul) * "number of bytes in `firmware` and `reserved`",
+            "firmware"
+            / Int8ul
+            * "firmware version in the reply to the command start; 3 means V3.0",
             "reserved" / Bytes(6),
             "checksum" / Int8ul,
         ),
@@ -140,7 +142,7 @@ INFO = Checksummed(
 SCAN_START = Checksummed(
     Struct(
         "header" / Const(b"\xa5\x5a"),
-        "length" / Const(0, Int16ul) * "0: point packets follow until stop",
+        "length" / Const(0, Int16ul) * "0: point packets follow until the command stop",
         "sum" / Int16ul,
         "type" / Const(0x81, Int8ul) * "start of scan data",
     ),
@@ -208,7 +210,7 @@ M_AND_T: tuple[Construct, ...] = (
     / BitStruct(
         "m"
         / BitsInteger(7)
-        * "start packet: scans per second in 0.1 Hz; next packet: customer firmware; else 0",
+        * "in a start packet: scan rate in 0.1 Hz; in the next packet: customer firmware; else 0",
         START,
     ),
     "frequency" / Computed(this.mt.m * this.mt.start / 10) * "scans per second; 0 if unknown",
@@ -463,11 +465,13 @@ def reports_firmware(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits 1 to 7 of the third byte are set, but do not contain a constant firmware number",
+    "bits 1 to 7 of the third byte contain other values than the firmware number",
     has_bits_beside_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
-    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the replies to requests differ"),
+    **dict.fromkeys(
+        ("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the models reply differently to requests"
+    ),
     **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI_RELATIVE),
 }
 
@@ -638,8 +642,8 @@ COIN_D6 = make_coin(
     simulation=make_coin_simulation("COIN-D6", steps=400, hertz=10.0),
     status="manual",
     source=(
-        "vendor's SDK (baud rate); published observations of a COIN-D6: speed, points, the"
-        " auxiliary frame"
+        "vendor's SDK (baud rate); published observations of a COIN-D6 (speed, points,"
+        " auxiliary frame)"
     ),
 )
 

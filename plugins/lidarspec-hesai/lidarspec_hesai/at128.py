@@ -191,7 +191,7 @@ TAIL = (
     ),
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
     "return_mode" / RETURN_MODE,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

@@ -75,8 +75,8 @@ FLAGS = BitStruct(
 )
 IMU = Struct(
     "temperature" / Scaled(Int16sl, 0.01, "degC"),
-    "acceleration_unit" / Int16ul * "size of one step of the accelerations, millionths of g",
-    "rate_unit" / Int16ul * "size of one step of the angular rates, hundredths of mdeg/s",
+    "acceleration_unit" / Int16ul * "step of `acceleration`, in millionths of g",
+    "rate_unit" / Int16ul * "step of the angular rates, in hundredths of mdeg/s",
     "time" / Int32ul * "time of the sample, in steps of 25 ns",
     "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU; its axes are not documented",
     "rate" / Array(3, Int16sl),
@@ -136,9 +136,9 @@ def make_packet(
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
-        "first_return" / Int8ul * "the return that the first block of each shot contains",
+        "first_return" / Int8ul * "number of the return in the first block of each firing",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
-        "return_count" / Int8ul * "number of returns per shot; some models send the maximum number",
+        "return_count" / Int8ul * "returns per firing; some models send the maximum number",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if verify_crc else body),
         *safety_part,
@@ -176,8 +176,8 @@ UNSEEN = (
 )
 ACKNOWLEDGED = {
     "LS205": (
-        "according to a captured stream, the CRCs do not cover the header, the version of the"
-        " safety part or the signature"
+        "in a captured stream, the CRCs do not cover the header, the version of the safety part"
+        " and the signature"
     )
 }
 

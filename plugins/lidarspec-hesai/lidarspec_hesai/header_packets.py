@@ -41,9 +41,9 @@ def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) 
         "header_reserved" / Bytes(2),
         "lasers" / Const(lasers, Int8ul),
         "block_count" / Int8ul,
-        "first_return" / Int8ul * "the return that the first block of each shot contains",
+        "first_return" / Int8ul * "number of the return in the first block of each firing",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
-        "return_count" / Int8ul * "number of returns per shot; some models send the maximum number",
+        "return_count" / Int8ul * "returns per firing; some models send the maximum number",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
     ]
     channel = Struct(

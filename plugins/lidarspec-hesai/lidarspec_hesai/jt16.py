@@ -66,7 +66,7 @@ def make_packet(data_type: int, *body: Any) -> Struct:
         "time_version" / Int8ul,
         "data_type" / Const(data_type, Int8ul),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
         *body,
         "crc" / Int32ul,
     )
@@ -85,11 +85,12 @@ DATA = Checksummed(
         ),
         "dirt"
         / Int32ul
-        * "soiling of the window, two bits per channel; the first channel has the lowest bits",
+        * "soiling of the window, two bits per channel; the first channel is in the lowest bits",
         "unit_state" / Int8ul,
         "reserved_id"
         / Int8ul
-        * "meaning of reserved_info: 12 to 15: software version; 16 to 19: hardware version",
+        * "selects the content of `reserved_info`; 12 to 15: software version; 16 to 19: hardware"
+        " version",
         "reserved_info" / Int16ul,
         "sequence" / Int16ul,
     ),

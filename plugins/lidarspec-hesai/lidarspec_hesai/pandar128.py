@@ -160,14 +160,16 @@ def make_tail(speed: float) -> Any:
     """Return the fields of the tail; the motor speed has steps of `speed` rpm."""
     return (
         "tail_reserved" / Bytes(9),
-        "azimuth_state" / Int16ul * "two bits per block; the first block has the highest bits",
+        "azimuth_state"
+        / Int16ul
+        * "two bits per block; the highest bits are those of the first block",
         "operational_state"
         / Int8ul
         * "0: high performance; other values: standard or energy saving",
         "return_mode" / RETURN_MODE,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full second in `utc`",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since `utc`",
         "factory" / Int8ul * FACTORY,
     )
 

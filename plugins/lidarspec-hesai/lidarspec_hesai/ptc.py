@@ -54,7 +54,7 @@ SETTINGS = {
     "speed": Struct("rate" / Scaled(Int16ub, 1, "rpm")),
     "standby": Struct("standby" / Enum(Int8ub, run=0, stop=1) * "stop: the motor stands still"),
     "return_mode": Struct(
-        "mode" / Enum(Int8ub, **RETURN_SETTINGS) * "a mode that the model supports"
+        "mode" / Enum(Int8ub, **RETURN_SETTINGS) * "must be a return mode that the model supports"
     ),
     "send_to": Struct(
         "host" / Bytes(4), "port" / Int16ub * "destination port of data", "gps_port" / Int16ub

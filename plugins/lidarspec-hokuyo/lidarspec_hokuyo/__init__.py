@@ -65,12 +65,12 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
     """Return how to recognize a scanner with the geometry `other`."""
     if own.last == other.last:
-        return "the scans are identical; the reply to get_parameters names the model"
+        return "both models send the same scans; the reply to get_parameters names the model"
     if other.last > own.last:
         return Relative(
             f"scans with steps beyond {own.last}", lambda f: decimal_value(f.last) > own.last
         )
-    return "the packet rate differs; the reply to get_parameters names the model"
+    return "the models send packets at different rates; the reply to get_parameters names the model"
 
 
 @cache

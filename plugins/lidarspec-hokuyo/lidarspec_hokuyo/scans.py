@@ -179,7 +179,7 @@ def make_scan_frame(command: str, geometry: Geometry) -> Frame:
         max_length=MAX_SCAN_CHARACTERS[echoes],
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry, echoes=echoes),
-        acknowledged={"LS711": "this model has no step with four digits"}
+        acknowledged={"LS711": "the step numbers of this model have at most three digits"}
         if geometry.end < 1000
         else {},
         wire=Lines(LINE_CHARACTERS, head=(15 if is_continuous else 12, 2, 4), bare=1, check=Scip())

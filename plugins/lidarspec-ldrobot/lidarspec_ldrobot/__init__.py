@@ -80,7 +80,7 @@ DATA = add_crc(
         ),
     ),
     "end_angle" / Scaled(Int16ul, 0.01, "deg"),
-    "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts at 30 s",
+    "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts from 0 after 30 s",
 )
 HEALTH = add_crc(
     "header" / Const(b"\x54\xe0"),
@@ -202,7 +202,7 @@ def relatives(own: str) -> dict[str, str | Relative]:
     others["oradar-ms200"] = MS200_POINT_RATE_HZ
     return {
         name: (
-            "identical packets at the same point rate"
+            "both models send the same packets at the same rate"
             if rate == POINT_RATES_HZ[own]
             else Relative(
                 f"{rate} points per second, calculated from speed and angles",

@@ -585,7 +585,7 @@ def make_lidar(name: str) -> Sensor:
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         relatives={
-            other: "the broadcast contains another device type"
+            other: "its broadcast contains another device type"
             for other in MODELS
             if other != name and MODELS[other][2] == rate
         },

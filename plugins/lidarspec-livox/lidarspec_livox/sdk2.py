@@ -85,7 +85,7 @@ SET_GPS_TIME = 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
 MAX_DATAGRAM_BYTES = 1472  # without fragmentation
-VARIABLE_COUNT = {"LS203": "a datagram contains any number of parameters"}
+VARIABLE_COUNT = {"LS203": "a datagram can contain any number of parameters"}
 SHOTS = np.arange(96)  # shot numbers of a simulated packet
 IMU_RATE_HZ = 200
 DEVICE_TYPES = {"MID-360": 9, "HAP, industrial": 10, "HAP": 15, "MID-360S": 35}

@@ -68,7 +68,9 @@ DATA = Struct(
         BLOCKS,
         Struct(
             "flag" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise, at the first laser of the block",
+            "azimuth"
+            / Scaled(Int16ul, 0.01, "deg")
+            * "clockwise, when the first laser of the block fires",
             "groups"
             / Array(
                 GROUPS,

@@ -164,11 +164,11 @@ def describe_differences(own: str) -> dict[str, str]:
         if other == own:
             continue
         if direction == XV11_DIRECTIONS[own]:
-            texts[other] = "the packets are identical; the label names the model"
+            texts[other] = "both models send the same packets; the label names the model"
         elif direction == 1:
-            texts[other] = "the packets are identical, but this model rotates counter-clockwise"
+            texts[other] = "sends the same packets, but rotates counter-clockwise"
         else:
-            texts[other] = "the packets are identical, but this model rotates clockwise"
+            texts[other] = "sends the same packets, but rotates clockwise"
     return texts
 
 

@@ -41,9 +41,9 @@ def test_the_xv11_counts_counter_clockwise_and_the_lds02rr_clockwise() -> None:
 
 
 def test_only_a_model_that_rotates_the_other_way_differs_in_direction() -> None:
-    label = "the packets are identical; the label names the model"
-    clockwise = "the packets are identical, but this model rotates clockwise"
-    counter_clockwise = "the packets are identical, but this model rotates counter-clockwise"
+    label = "both models send the same packets; the label names the model"
+    clockwise = "sends the same packets, but rotates clockwise"
+    counter_clockwise = "sends the same packets, but rotates counter-clockwise"
     assert XV11.relatives == {"xiaomi-lds01rr": label, "xiaomi-lds02rr": clockwise}
     assert LDS01RR.relatives == {"neato-xv11": label, "xiaomi-lds02rr": clockwise}
     assert LDS02RR.relatives == dict.fromkeys(["neato-xv11", "xiaomi-lds01rr"], counter_clockwise)

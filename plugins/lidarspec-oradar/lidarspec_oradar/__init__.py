@@ -145,7 +145,7 @@ MS200 = Sensor(
     turn=(5, 15),
     relatives={
         "ldrobot-stl27l": IDENTICAL,
-        "ldrobot-ld06": "the frames are identical, but this model accepts no commands",
+        "ldrobot-ld06": "sends the same frames, but accepts no commands",
         "ldrobot-ld20": IDENTICAL,
         "ldrobot-stl06p": IDENTICAL,
         "ldrobot-ld14": IDENTICAL,

@@ -64,7 +64,7 @@ MODELS = {
 }
 #: The pixel fields that become columns in `extra`.
 EXTRA_FIELDS = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
-METADATA_ONLY = "the packets are identical; the metadata name the model"
+METADATA_ONLY = "both models send the same packets; the metadata name the model"
 
 
 def points(f: Fields, unit: Unit) -> Polar:

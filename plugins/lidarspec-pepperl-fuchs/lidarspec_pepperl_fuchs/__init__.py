@@ -138,7 +138,7 @@ def make_packet(letter: str) -> Construct:
         "header_size" / OneOf(Int16ul, HEADER_SIZES) * "a multiple of 4",
         "scan_number" / Int16ul * "scan counter",
         "packet_number" / Int16ul * "number of the packet in its scan, from 1",
-        "timestamp_raw" / make_time() * "time of the first sample since power-on",
+        "timestamp_raw" / make_time() * "time of the first sample, counted from power-on",
         "timestamp_sync"
         / make_time()
         * "synchronized time of the first sample; 0 if the clock is not synchronized",

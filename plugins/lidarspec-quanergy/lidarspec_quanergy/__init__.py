@@ -215,7 +215,8 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
         turn=(5.0, 20.0),
         relatives={
             f"quanergy-{other}": (
-                "the packets are identical; the label, or the sensor's web page, names the model"
+                "both models send the same packets; the label and the web page of the sensor name"
+                " the model"
             )
         },
         status="manual",

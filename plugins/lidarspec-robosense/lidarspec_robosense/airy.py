@@ -143,7 +143,7 @@ DATA = Struct(
             "flag" / BLOCK_FLAG,
             "azimuth"
             / Scaled(Int16ub, 0.01, "deg")
-            * "angle of the rotor, clockwise, at the first laser of a pair of blocks",
+            * "angle of the rotor, clockwise, when the first laser of a pair of blocks fires",
             "channels" / Array(HALF_LASERS, Struct("echo" / ECHO, "intensity" / Int8ub)),
         ),
     ),

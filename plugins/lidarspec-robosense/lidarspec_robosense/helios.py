@@ -113,7 +113,9 @@ def make_packet(rows: Construct) -> Struct:
         "header" / Const(b"\x55\xaa\x05\x5a"),
         "protocol_version" / Enum(Int16ub, old=0, latest=1),
         "reserved_6" / Bytes(2),
-        "top_packet_count" / Bytes(4) * "four counts, each 3 above the previous one",
+        "top_packet_count"
+        / Bytes(4)
+        * "four counters in one byte each; each is 3 above the one before",
         "bottom_packet_count" / Int32ub * "packet counter",
         "reserved_16" / Bytes(1),
         "range_resolution" / Enum(Int8ub, **{"5 mm": 0, "2.5 mm": 1}),

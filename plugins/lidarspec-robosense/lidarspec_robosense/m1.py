@@ -92,7 +92,7 @@ HEADER_START: tuple[Construct, ...] = (
 #: Firmware -> temperature of the mirror. "current": as in the M1P user guide and rs_driver; "2021":
 #: as in rs_driver of April 2021; "": unknown.
 TEMPERATURES: dict[str, Construct] = {
-    "": "mems_tmp" / Int8ub * "degC + 80 or signed degC; the firmware decides which",
+    "": "mems_tmp" / Int8ub * "degC + 80 or signed degC, which depends on the firmware",
     "current": "mems_tmp" / Scaled(Int8ub, 1, "degC", offset=-80),
     "2021": "mems_tmp" / Scaled(Int8sb, 1, "degC"),
 }

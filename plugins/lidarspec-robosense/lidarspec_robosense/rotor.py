@@ -99,7 +99,7 @@ def make_blocks(
         channels = "groups" / Array(firings, groups)
     azimuth: Construct = (
         Scaled(Int16ub, 0.01, "deg")
-        * "angle of the rotor, clockwise, at the first laser of the block"
+        * "angle of the rotor, clockwise, when the first laser of the block fires"
     )
     return Array(count, Struct("flag" / flag, "azimuth" / azimuth, channels))
 
@@ -178,7 +178,9 @@ DIFOP_VERSIONS: tuple[Construct, ...] = (
     "motor_firmware" / Bytes(5),
     "hardware" / Bytes(3),
     "web_version" / Bytes(4),
-    "backup_checksums" / Bytes(16) * "checksums of top board, bottom board, software, web page",
+    "backup_checksums"
+    / Bytes(16)
+    * "checksums of the top board, the bottom board, the software and the web page",
     "gateway" / Bytes(4),
     "subnet_mask" / Bytes(4),
     "reserved_91" / Bytes(201),

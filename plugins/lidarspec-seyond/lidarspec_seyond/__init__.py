@@ -110,7 +110,7 @@ PIXEL = ByteSwapped(
         "elongation" / BitsInteger(4),
         "type" / Enum(BitsInteger(2), normal=0, ground=1, fog=2),
         "second" / BitsInteger(1) * "1: second return",
-        "strength" / BitsInteger(8) * "reflectance or intensity, as `flags` says; 255: a reflector",
+        "strength" / BitsInteger(8) * "reflectance or intensity, see `flags`; 255: a reflector",
         "radius"
         / Scaled(BitsInteger(17), 0.005, "m")
         * "0: no return; if `long` is 1, the radius is twice this value",

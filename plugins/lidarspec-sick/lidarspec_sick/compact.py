@@ -263,7 +263,9 @@ def make_scanner(name: str) -> Sensor:
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
         relatives={
-            other: "the modules have another number of layers" for other in MODELS if other != name
+            other: "its modules have a different number of layers"
+            for other in MODELS
+            if other != name
         },
         status=status,
         source=(

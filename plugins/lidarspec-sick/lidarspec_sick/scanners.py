@@ -187,8 +187,8 @@ def describe_difference(own: ScannerFamily, other: ScannerFamily) -> str | Relat
     """Return how to recognize a scanner of another family."""
     if own == other:
         return (
-            "the scans are identical; the reply to get_identity and the label on the housing"
-            " name the model"
+            "both models send the same scans; to tell them apart, use get_identity or the label on"
+            " the housing"
         )
     return Relative(
         "the scan rate, the angular step or the first angle differs",

@@ -122,7 +122,7 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "serial" / Int32ub,
         "status"
         / Array(2, Enum(Int8ub, ok=0, error=1, pollution_warning=2, pollution_error=4))
-        * "only the second value is the status of the device",
+        * "the second value is the status of the device",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
         "time" / Scaled(Int32ub, 1, "us") * "time of the start of the scan, since power-up",

@@ -104,7 +104,7 @@ VALUES: dict[int, Construct] = {
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
     ANSWER_TYPE: "answer_type"
     / Enum(Int8ul, **STREAMS)
-    * "type of the data frames of this mode; a descriptor before them states it",
+    * "type of the data frames of this mode, as in the descriptor before the data frames",
 }
 _VALUE_BYTES = np.full(MODE_NAME + 1, np.nan)
 _VALUE_BYTES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]

@@ -115,7 +115,7 @@ ULTRA = make_capsule(
                 "predict2"
                 / Scaled(BitsInteger(10, signed=True), 1, "")
                 * (
-                    "difference to `major` of the next cabin, in steps that depend on its range;"
+                    "difference to `major` of the next cabin, in steps that depend on that `major`;"
                     " 511 and -512: no return"
                 ),
                 "predict1"

@@ -193,9 +193,7 @@ SET_MESSAGE = make_ubx(  # UBX-CFG-MSG, p. 54
     3,
     "message_class" / Int8ul,
     "message_id" / Int8ul,
-    "rate"
-    / Int8ul
-    * "number of solutions after which the message is sent once; 0: it is never sent",
+    "rate" / Int8ul * "the message is sent once per this number of solutions; 0: never",
 )
 SET_RATE = make_ubx(  # UBX-CFG-RATE, p. 75
     b"\x06\x08",

@@ -237,8 +237,8 @@ HI_RES_RELATIVE = {
 
 
 UNPUBLISHED = {
-    "LS710": "the license of the captured packet allows no copy here; the project's tests read the"
-    " original file"
+    "LS710": "the license of the captured packet does not allow a copy in this distribution; the"
+    " project's tests read the original file"
 }
 
 VLP16 = Sensor(
@@ -268,8 +268,8 @@ VLP16 = Sensor(
     # 12 shots, or 6 with dual return, with periods of 110.592 and 46.080 us
     relatives={
         "velodyne-hdl32e": (
-            "it sends one packet every 553 us (276 us with dual return), a VLP-16 every 1327 us"
-            " (664 us)"
+            "an HDL-32E sends one packet every 553 us (276 us with dual return), a VLP-16 every"
+            " 1327 us (664 us)"
         ),
         **HI_RES_RELATIVE,
         **VLP32A_RELATIVE,

@@ -258,8 +258,8 @@ def configure(unit: UnitCalibration, sensor: Sensor, /, *, calibration: str | Pa
         ) from None
     if len(lasers) != 2 * SLOTS or set(table) != set(range(2 * SLOTS)):
         raise UsageError(
-            f"{calibration!s}: contains {len(table)} lasers of {len(lasers)}, expected each of"
-            f" 0 to {2 * SLOTS - 1} once"
+            f"{calibration!s}: contains {len(lasers)} entries with {len(table)} different lasers,"
+            f" expected one entry for each laser from 0 to {2 * SLOTS - 1}"
         )
     offset, vertical, *metres = (
         tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
@@ -334,8 +334,8 @@ def make_sensor(series: str, unit: UnitCalibration, other: str) -> Sensor:
         turn=SPEED_LIMITS_HZ,
         relatives={
             f"velodyne-hdl64e-{other}": (
-                "it sends one packet every 288 us (S2) or 346 us (S3), and with dual return"
-                " twice as often"
+                "the S2 sends one packet every 288 us, the S3 every 346 us; with dual return, both"
+                " send twice as often"
             )
         },
         status="manual",

@@ -586,9 +586,7 @@ def test_an_invalid_hdl64e_file_is_refused(tmp_path: Path) -> None:
         match=r"text\.xml: not the calibration of an HDL-64E \(db\.xml\): syntax error",
     ):
         sensor.configure(calibration=text)
-    with pytest.raises(
-        ls.UsageError, match="contains 32 lasers of 32, expected each of 0 to 63 once"
-    ):
+    with pytest.raises(ls.UsageError, match="contains 32 entries with 32 different lasers"):
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "vlp32.xml", 32))
     with pytest.raises(ls.UsageError, match="rotCorrection_ of a laser must be finite"):
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "nan.xml", rotCorrection_="nan"))

@@ -193,7 +193,7 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
         )
     if own.number and other.number:
         return "info.model"
-    return "the packets are identical, but the label and possibly the baud rate differ"
+    return "both models send the same packets; the label and possibly the baud rate differ"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:
@@ -209,7 +209,7 @@ def relatives(name: str) -> dict[str, str | Relative]:
     }
     return models | dict.fromkeys(
         CSPC_MODELS.get(own_model.sample_format.size, ()),
-        "a CSPC sends the frame info when it is started",
+        "a sensor of CSPC sends an `info` frame when it is started",
     )
 
 

@@ -27,7 +27,11 @@ def make_reply(kind: int, *fields: Construct, size: int) -> Frame:
 
 
 SCAN_START = Frame(
-    Struct("descriptor" / Const(b"\xa5\x5a\x05\x00\x00\x40\x81") * "packets follow until stop")
+    Struct(
+        "descriptor"
+        / Const(b"\xa5\x5a\x05\x00\x00\x40\x81")
+        * "packets follow until the command stop"
+    )
 )
 ANSWERS = {
     "scan_start": SCAN_START,
@@ -48,7 +52,7 @@ ANSWERS = {
     ),
     "setting": make_reply(
         0x04,
-        "value" / Int8ul * "number of the sampling rate, or the direction of rotation",
+        "value" / Int8ul * "code of the sampling rate, or of the direction of rotation",
         size=1,
     ),
     "stamp": Frame(
