@@ -554,8 +554,8 @@ def convert(
             if manifest.is_new and not force and manifest.has(piece.target)
         ]:
             error = UsageError(
-                f"{taken[0]} exists already and was not overwritten: the folder has no {MANIFEST}"
-                " that names its source"
+                f"{taken[0]} exists already, and was not overwritten, because the folder has no"
+                f" {MANIFEST} with the source of this file"
             )
             raise suggest(error, "repeat with --force, or with another folder")
         if not force:
@@ -603,7 +603,9 @@ def _iter_results(
                 "a worker process was killed, possibly because memory ran out, so the piece that it"
                 " was converting was not written"
             )
-            raise suggest(error, "repeat the command: it resumes where this one ended") from None
+            raise suggest(
+                error, "repeat the command: it converts only the missing pieces"
+            ) from None
         except Exception as failure:  # an error of a survey, or a Dask worker that died repeatedly
             result = piece.describe_failure(failure)
         if isinstance(result, dict):

@@ -223,7 +223,7 @@ def _format_report(report: Report, *, verbose: bool) -> list[str]:
     else:
         verdict = "clean"
     if report.held:
-        more = f", {report.held} properties hold"
+        more = f", {report.held} checks passed"
     else:
         more = ""
     more += f", {len(report.skipped)} skipped" if report.skipped else ""

@@ -90,7 +90,7 @@ class SourceClock:
     default=DRIFT_LIMIT_PPM,
     show_default=True,
     metavar="PPM",
-    help="Maximum drift of a clock without fault, in ppm.",
+    help="Largest drift, in ppm, that is not reported as a fault.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each source.")
 def clock(
@@ -102,9 +102,9 @@ def clock(
 ) -> None:
     """Diagnose the clocks of sensors: source of time, lock, offset, drift, jumps.
 
-    The times in the packets are compared with their arrival times. The arrival times are by the
-    clock of this computer, or, for a file, of the computer that recorded it. Several sources are
-    read at the same time, and compared with each other. The exit code is 1 if a clock is at fault.
+    The times in the packets are compared with their arrival times. Arrival times are measured by
+    the clock of this computer, or of the computer that recorded the file. Several sources are read
+    at the same time, and compared with each other. The exit code is 1 if a clock is at fault.
     """
     with contextlib.ExitStack() as stack:
         clocks = [

@@ -177,11 +177,11 @@ def convert(
 ) -> None:
     """Write the points of a recording or capture to a file of another format.
 
-    The suffix of OUT selects the format. .csv and .npz contain the columns x, y, z, range, azimuth,
-    elevation, intensity, time, ring, return_index and column, as far as the sensor has them, its
-    further columns, and the number of the scan. Units are metres, radians, and seconds since the
-    scan's stamp. .npy, .ply, .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring,
-    time and the further columns; if several scans share a file, also the number of the scan. .bin
+    The suffix of OUT selects the format. .csv and .npz contain all columns of the sensor, such as
+    x, y, z, range, azimuth, elevation, intensity, time, ring, return_index and column, and the
+    number of the scan. Units are metres, radians, and seconds since the scan's stamp. .npy, .ply,
+    .pcd and the compressed .lzf.pcd contain x, y, z, intensity, ring, time and further columns of
+    the sensor. If several scans share a file, they also contain the number of the scan. .bin
     contains x, y, z and intensity, as in KITTI. .xyz contains x, y and z.
 
     If OUT contains a number format, as in scans/%05d.pcd, each scan is written to a file of its
@@ -337,8 +337,8 @@ def _require_same_time(packets: Packets, frames_by_clock: dict[bool, str]) -> No
     frames_by_clock.setdefault(has_clock, packets.frame)
     if len(frames_by_clock) > 1:
         reason = (
-            f"the IMU samples of {frames_by_clock[True]} have the sensor's time, those of"
-            f" {frames_by_clock[False]} have none, so one file cannot contain both"
+            f"the IMU samples of {frames_by_clock[True]} frames have the sensor's time, but those"
+            f" of {frames_by_clock[False]} frames do not, so one file cannot contain both"
         )
         raise suggest(UsageError(reason), "repeat with --time host")
 

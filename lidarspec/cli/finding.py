@@ -165,8 +165,8 @@ def crc(
         emit("\n\n".join(_describe_match(match, len(frames[0])) for match in shown), output)
     if not matches:
         note(
-            f"no checksum found in {len(frames)} frame{'s' * (len(frames) != 1)}: check that each"
-            " is complete and begins at its first byte"
+            f"no checksum found in {len(frames)} frame{'s' * (len(frames) != 1)}: check that the"
+            " frames are complete"
         )
         raise click.exceptions.Exit(FINDINGS)
     if matches[0].evidence_bits < WEAK_BITS:

@@ -368,7 +368,9 @@ def _parse_stretch(text: str | None) -> tuple[float, float]:
         start = 0
         end = 0
     if not colon or not 0 <= start < end:
-        raise UsageError(f"{text!r} is not a byte range FROM:TO, such as 940:1034, 0x3ac: or :47")
+        raise UsageError(
+            f"{text!r} is not a byte range FROM:TO, such as '940:1034', '0x3ac:' or ':47'"
+        )
     return start, end
 
 

@@ -354,7 +354,7 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
         if sample is not None and (fault := _make_wrong_checksums_error(sample)) is not None:
             return fault
         if sample is not None and sample.is_text:
-            error = WireError(f"{source} is text and has no data frame: {stats}", sensor=sensor.id)
+            error = WireError(f"{source} is text without a data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
             reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])

@@ -270,13 +270,15 @@ SPEED = NumberType("speed", _parse_speed, "a speed, such as 1, 0.5, 10 or max")
 SLICE = NumberType(
     "slice",
     lambda text: _parse_pair(text, _parse_moment),
-    "a slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
+    "a slice of time, such as '10s:20s', '10s:', ':1min' or '2026-11-23T05:02:00Z:'",
 )
 #: A first and a last index, from "5:10".
-INDICES = NumberType("indices", _parse_indices, "a slice of whole numbers, such as 5:10, 5: or :10")
+INDICES = NumberType(
+    "indices", _parse_indices, "a slice of whole numbers, such as '5:10', '5:' or ':10'"
+)
 #: A minimum and a maximum range in metres, from "0.5m:30m".
 DISTANCES = NumberType(
-    "distances", _parse_distances, "a span of distances, such as 0.5m:30m, 50cm: or :30"
+    "distances", _parse_distances, "a span of distances, such as '0.5m:30m', '50cm:' or ':30'"
 )
 
 #: Argument of `Selection` -> the option that sets it.

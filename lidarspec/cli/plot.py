@@ -97,7 +97,9 @@ def plot(
     else:
         suffix = Path(output).suffix.lower()
     if suffix not in matplotlib_figures.SUFFIXES:
-        raise UsageError(f"{output}: expected a suffix of {', '.join(matplotlib_figures.SUFFIXES)}")
+        raise UsageError(
+            f"{output}: expected a file name that ends in {', '.join(matplotlib_figures.SUFFIXES)}"
+        )
     refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
         require_points(device, source)

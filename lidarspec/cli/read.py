@@ -368,7 +368,7 @@ class StatsPrinter:
 @click.option(
     "--max-errors",
     type=SHARE,
-    help="Exit with code 1 if a larger share of frames is invalid or lost, such as 1%.",
+    help="Exit with code 1 if more than this share of the frames is invalid or lost, such as 1%.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(
@@ -404,7 +404,10 @@ def stats(
             )
             worst = max(reading.error_rate, reading.loss_rate or 0.0)
             if max_errors is not None and worst > max_errors:
-                note(f"{worst:.3%} of the frames are invalid or lost, more than {max_errors:.3%}")
+                note(
+                    f"{worst:.3%} of the frames are invalid or lost;"
+                    f" --max-errors allows {max_errors:.3%}"
+                )
                 has_findings = True
             try:
                 conclude(device)

@@ -114,12 +114,12 @@ PLACES = (
     metavar="N",
     default=0,
     show_default=True,
-    help="Send some datagrams late, after up to N later datagrams.",
+    help="Delay some datagrams, each by up to N datagrams.",
 )
 @click.option(
     "--unplug",
     type=DURATION,
-    help="Disconnect the sensor each time it was connected for this long.",
+    help="Disconnect the sensor repeatedly, each time after it was connected for this time.",
 )
 @click.option(
     "--shake",
@@ -138,7 +138,7 @@ PLACES = (
 @click.option(
     "--clock",
     metavar="FAULT,...",
-    help="Simulate faults of the clock, separated by commas: utc, tai, gps, drift=50ppm,"
+    help="Faults of the clock to simulate, separated by commas: utc, tai, gps, drift=50ppm,"
     " step=0.2s@10s, pps@10s, leap@10s, unlock=5s@10s, restart@10s.",
 )
 @click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
@@ -236,7 +236,7 @@ def _serve(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; no program has read {format_size(opened.unsent_bytes)} of the data"
+            lost = f"; {format_size(opened.unsent_bytes)} were not read by a program"
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")

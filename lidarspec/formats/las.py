@@ -175,8 +175,8 @@ def _fill_records(
         steps = steps if valid.all() else np.where(valid, steps, 0)
         if np.abs(steps).max() > MAX_STEPS:
             reason = (
-                f"along {axis}, a point is {np.abs(steps).max() * STEP_M / 1000:.0f} km from the"
-                f" origin of the file ({offset:.0f} m): LAS cannot store this distance in steps of"
+                f"a point is {np.abs(steps).max() * STEP_M / 1000:.0f} km from the origin of the"
+                f" file ({axis} = {offset:.0f} m): LAS cannot store this distance in steps of"
                 " 0.1 mm"
             )
             raise suggest(UsageError(reason), "lidarspec convert IN OUT.parquet")

@@ -516,7 +516,7 @@ def lidarspec_sensors():
             recorder.write(Chunk(data, 1_785_283_200 * 10**9 + number))
     words = ("convert", recording, tmp_path / "imu.csv", "-s", plugin, "--imu")
     refused = ran(*words, code=2).stderr
-    assert "fast have the sensor's time, those of slow have none" in refused
+    assert "fast frames have the sensor's time, but those of slow frames do not" in refused
     assert "next: repeat with --time host" in refused
     assert "13 IMU samples" in ran(*words, "--time", "host").stderr
 

@@ -332,7 +332,7 @@ def test_unrecordable_sources_give_a_reason(stream: Path, datagrams: Path, tmp_p
     assert not (tmp_path / "it.lsr").exists()
     (tmp_path / "empty.bin").touch()
     assert (
-        "no received data"
+        "contains no data"
         in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
     )
     assert not (tmp_path / "it.lsr").exists()

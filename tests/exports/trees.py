@@ -21,7 +21,7 @@ RECODED = "this export does not support frames of text or of escaped bytes"
 #: The installed sensors that other languages cannot read because of a struct, with the reason.
 NULL_TERMINATED = dict.fromkeys(
     ("hokuyo-urg04lx", "hokuyo-utm30lx", "hokuyo-utm30lxew"),
-    "bytes whose end is found by their content",
+    "bytes whose size depends on their content",
 )
 
 

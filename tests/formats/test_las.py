@@ -104,7 +104,7 @@ def test_places_far_away_count_from_nearby(tmp_path: Path) -> None:
         las.x, (one.points.x + np.float32(500_000))[one.points.valid], atol=5.1e-5, rtol=0
     )
     assert abs(las.header.offsets[0] - 500_000) < 5
-    with pytest.raises(UsageError, match=r"along x, a point is 500 km from the origin of the file"):
+    with pytest.raises(UsageError, match=r"a point is 500 km from the origin of the file \(x = "):
         write(tmp_path / "b.las", [one, with_points(one, x=one.points.x + np.float32(500_000))])
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
 
