@@ -155,11 +155,14 @@ class ExpectedReply:
         values: the values that the reply must have: path -> value. Paths that a frame type does
             not have are ignored.
         refusal: the frame type of a refusal; None if the sensor sends no refusals.
+        echoes: the values that a refusal must repeat if its frame type has these fields: path ->
+            value.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
     values: Mapping[str, Any]
     refusal: str | None = None
+    echoes: Mapping[str, Any] = field(default_factory=dict)
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
         """Return a list of the differences between a frame and the expected reply.
@@ -184,6 +187,12 @@ class ExpectedReply:
             f"{path} {value} instead of {name_value(table[path], expected[path])}"
             for path, value in wrong
         ]
+
+    def is_refusal(self, frame: str, values: Any) -> bool:
+        """Return whether a frame can be the refusal of the request."""
+        return frame == self.refusal and all(
+            get_nested(values, path) in (value, _MISSING) for path, value in self.echoes.items()
+        )
 
     def overlaps(self, other: ExpectedReply) -> bool:
         """Return whether a frame could match both this and another expected reply."""
@@ -380,14 +389,15 @@ class Session:
             sent = self.sensor.parse(data, command.frame)
         else:
             sent = None
-        values = {**command.matches, **{path: get_nested(sent, path) for path in command.echoes}}
+        echoes = {path: get_nested(sent, path) for path in command.echoes}
         if timeout is None:
             wait = _to_ns(command.timeout) * (1 + command.retries)
         else:
             wait = _to_ns(timeout)
         pending = PendingReply(f"{self.sensor.id} {name}")
         if tables:
-            expected = ExpectedReply(tables, values, command.refusal)
+            values = {**command.matches, **echoes}
+            expected = ExpectedReply(tables, values, command.refusal, echoes)
         else:
             expected = None
         self._lines.setdefault(command.link, _LinkQueue()).queue.append(
@@ -601,13 +611,15 @@ class Session:
     def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
         """Fail the oldest unanswered request if a frame is a refusal.
 
-        A refusal does not name the refused request, so the oldest request is assumed.
+        A refusal may contain nothing that identifies the refused request. Therefore, the oldest
+        request whose `echoes` it does not contradict is assumed.
 
         Returns:
             Whether the frame is a refusal.
         """
         refused = next(
-            (late for late in line.late_replies if late.expected.refusal == item.frame), None
+            (late for late in line.late_replies if late.expected.is_refusal(item.frame, values)),
+            None,
         )
         current = line.current
         if refused is not None:
@@ -616,7 +628,7 @@ class Session:
         elif (
             current is not None
             and current.expected is not None
-            and current.expected.refusal == item.frame
+            and current.expected.is_refusal(item.frame, values)
             and now >= current.sent[0]
         ):
             self._free_link(line, current, reply_count=1, since=now)

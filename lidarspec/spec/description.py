@@ -267,7 +267,8 @@ class Command:
             is documented.
         matches: the values, by path, that fields of the reply must have. If there are several frame
             types, only the fields that a reply has are compared.
-        echoes: the paths of fields that have the same value in the request and in the reply.
+        echoes: the paths of fields that have the same value in the request and in the reply. A
+            refusal must also have these values, if its frame type has the fields.
         refusal: the frame type that the sensor sends instead of the reply if it refuses the
             command. The error message contains the labels of this frame's `Enum` fields.
         timeout: the seconds to wait for the reply, each time the command is sent.

@@ -514,3 +514,27 @@ def test_a_late_refusal_does_not_fail_the_next_command() -> None:
     assert (third.done, session.late) == (False, 1)
     session.receive([ack(1)], 6 + SECOND)
     assert third.failure is not None
+
+
+def test_a_refusal_of_another_request_is_ignored() -> None:
+    asked = Command(
+        "order",
+        {"code": 3, "motor.speed": 0, "motor.trim": 0},
+        reply="data",
+        refusal="ack",
+        echoes=("code", "motor.trim"),
+        timeout=1.0,
+    )
+    session = Session(with_commands(ask=asked))
+    first = session.request("ask", 0)
+    session.receive([ack(9)], 1)
+    assert not first.done
+    session.tick(SECOND)
+    second = session.request("ask", SECOND)
+    session.receive([ack(9)], SECOND + 1)
+    assert (session.late, second.done) == (0, False)
+    session.receive([ack(3)], SECOND + 2)  # of the first request
+    assert (session.late, second.done) == (1, False)
+    session.receive([ack(3)], SECOND + 3)  # a refusal has no field motor.trim
+    assert second.failure is not None
+    assert "refused" in str(second.failure)
