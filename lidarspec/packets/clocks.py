@@ -385,7 +385,7 @@ def clock_terms(
         if info is None or scaling is None or info.axes:
             reason = "a clock must be a field with a unit of time, outside of arrays"
             raise SpecError(
-                reason if info else "the clock uses this field, but no data frame has it",
+                reason if info else "the clock uses this field, but no data frame has this field",
                 path=path,
                 sensor=sensor,
             )

@@ -59,7 +59,9 @@ class Choice(Range):
     def __init__(self, **names: int) -> None:
         is_valid = all(type(value) is int for value in names.values())
         if not names or not is_valid or len(set(names.values())) < len(names):
-            raise SpecError("Choice(name=number) requires names, and a different integer for each")
+            raise SpecError(
+                "Choice requires names with different integers, as in Choice(off=0, on=1)"
+            )
         object.__setattr__(self, "low", min(names.values()))
         object.__setattr__(self, "high", max(names.values()))
         object.__setattr__(self, "names", names)

@@ -188,8 +188,8 @@ class Frame:
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
                 raise SpecError(
-                    f"{name} must map exactly one path (of a field with Parts) to a function, got"
-                    f" {', '.join(own) or 'none'}",
+                    f"a mapping for `{name}` must have one key, the path of a field with Parts; got"
+                    f" {', '.join(own) or 'no key'}",
                     path=name,
                 )
         if self.data and self.clock is not None:

@@ -279,7 +279,11 @@ def check_wire_form(form: object) -> None:
         name for name in _OWN_METHODS if getattr(kind, name, None) is getattr(WireForm, name)
     ]
     if missing:
-        advice = "" if WireForm in kind.__mro__ else "; derive it from WireForm for defaults"
+        advice = (
+            ""
+            if WireForm in kind.__mro__
+            else "; derive the class from WireForm, which defines defaults"
+        )
         raise SpecError(
             f"{kind.__name__} does not define {', '.join(missing)}{advice}", path="wire"
         )

@@ -147,7 +147,10 @@ def an_exchange_holds(
         if answer is None:
             return
         require(
-            command.replies, "LS605", "the vector has a reply, but the command declares none", path
+            command.replies,
+            "LS605",
+            "the vector has a reply, but the command declares no reply",
+            path,
         )
         session = Session(sensor)
         pending = session.request(name, 0, **given)

@@ -80,7 +80,7 @@ def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
                 low, high = sorted(info.physical(limit) for limit in info.limits)
                 raise ViolationError(
                     "LS514",
-                    f"sweep({number}) returns {beyond:g} {info.unit}, but the field represents"
+                    f"sweep({number}) returns {beyond:g} {info.unit}, but the field can represent"
                     f" {low:g} to {high:g} {info.unit}",
                     f"{name}.{path}",
                 )

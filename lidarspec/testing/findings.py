@@ -75,7 +75,7 @@ LS213 a column is used with `if`, `and`, `or` or `not` | a column has one truth 
 LS214 columns have different shapes | a point needs one value of each
       | give one value for each point or packet; name the axis of an array with along(...)
 LS215 `spread` gives all samples one value | all points of a packet get the same angle or time
-      | set full= to the circle in the angle's unit, or use steps(count)
+      | set full= to a full circle in the unit of the angle, or use steps(count)
 LS216 no data frame has this field | the scans, the clock or the counter need it | use a path that `lidarspec show` prints
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
 LS218 the intensity is calculated from another field | users expect the intensity that the sensor measured
@@ -103,7 +103,7 @@ LS502 angles are in degrees | radians are expected, so directions are wrong | us
 LS503 a single point has no direction | a count of 1 divides by count - 1 | use spread(start, end, count, full=360.0)
 LS504 angles run backwards across the full circle | once per turn, a packet is spread over the whole circle
       | use spread(..., full=360.0)
-LS505 an angle of exactly the full circle is not folded | sensors send 360.00 degrees for 0
+LS505 an angle of one full circle is not treated as 0 | sensors send 360.00 degrees for 0
       | use wrap(angle, 360.0), or reject it in `plausible`
 LS506 angles are not in the order of the rotation | scans are cut at wrong angles | use the manual's direction, and spread or wrap
 LS507 decoding does not return the simulated scene | `sweep` and `points` contradict each other | make `sweep` the inverse of `points`
@@ -111,7 +111,7 @@ LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail
       | return the physical values of packet i, by field path
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
 LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare PacketCounter(field, first=, last=)
-LS511 points turn the other way | left and right are exchanged, or vendor_axes differ from the manual
+LS511 points turn in the wrong direction | left and right are exchanged, or vendor_axes differ from the manual
       | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds

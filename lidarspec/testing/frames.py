@@ -245,7 +245,7 @@ def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     require(
         any(are_equal(subject.sensor.parse(data), values) for values in read),
         "LS306",
-        "if no type is given, the example is parsed as another type",
+        "parsing an example without frame= returns a frame of another type",
         name,
     )
 

@@ -29,7 +29,7 @@ def test_a_cloud_is_an_array_of_points_for_numpy(scan: Scan) -> None:
     np.testing.assert_allclose(
         np.linalg.norm(cloud[cloud.valid], axis=1), cloud.range[cloud.valid], rtol=1e-5
     )
-    with pytest.raises(ValueError, match="is a copy"):
+    with pytest.raises(ValueError, match="must be copied"):
         np.asarray(cloud, copy=False)
 
 

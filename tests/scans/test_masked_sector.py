@@ -219,7 +219,7 @@ def test_a_cut_that_cannot_be_is_refused() -> None:
     sensor = rotating(blocks_of(None, whole_packets=True))
     with pytest.raises(UsageError, match="cut must be an angle in degrees, not 'north'"):
         sensor.configure(cut="north")
-    with pytest.raises(UsageError, match="not cut at an angle"):
+    with pytest.raises(UsageError, match="do not end at an angle"):
         EXTRAS.configure(cut=90)
 
 
