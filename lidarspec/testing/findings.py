@@ -36,7 +36,7 @@ LS005 another sensor has this id | lidarspec can select only one of the two | ch
 LS006 the list of sensors cannot be read | all sensors of this hook are missing | return a list of Sensor values
 LS007 the declaration is invalid | the sensor is refused when it is declared | correct it as the message says
 LS008 sizeof is used on an optional part | construct raises KeyError for If and Switch | write the longest length as a number
-LS009 the frame has no longest length | a damaged length would block the decoder | declare max_length= of the Frame, in bytes
+LS009 the longest length of the frame is unknown | a damaged length would block the decoder | declare max_length= of the Frame, in bytes
 LS010 the hook raises an error | its result is missing | return None for unknown arguments
 LS101 construct hides this field name | `parsed.items` is a method of the Container | choose another name
 LS102 the field name is reserved | `f.state` and `column.on` have another meaning in `points` | choose another name
@@ -56,7 +56,7 @@ LS113 the struct contains Select or Optional | damaged bytes would select anothe
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
 LS115 an expression of the struct fails | it raises an undocumented exception | make it valid for every header
 LS116 the frame is not compiled | construct parses it, hundreds of times slower | declare fields whose offsets follow from the header
-LS117 the number of a named value is compared | construct compares the name, so the result is always the same | compare with the name
+LS117 a field with named values is compared with a number | construct compares the name, so the result is always the same | compare with the name
 LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"); "" is a pure number
 LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section"
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame
@@ -79,7 +79,7 @@ LS215 `spread` gives all samples one value | all points of a packet get the same
 LS216 no data frame has this field | the scans, the clock or the counter need it | use a path that `lidarspec show` prints
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
 LS218 the intensity is calculated from another field | users expect the intensity that the sensor measured
-      | use the field with this name
+      | use the intensity field
 LS219 the range is calculated from a code | error codes become points | use the distance field
 LS301 no example can be generated | the frame cannot be tested
       | declare Simulation(sweep=...), or strategies = {"frame.field": ...} in the test class
@@ -91,13 +91,13 @@ LS306 a frame is parsed as another type | its fields get another meaning | decla
 LS307 a truncated frame is accepted | missing values are invented | declare the length of every field
 LS308 an undocumented exception is raised | callers catch LidarSpecError only | make lambdas valid for all values
 LS310 the checksum misses a flipped bit | damaged frames are accepted | use a checksum that depends on every byte
-LS311 examples are not repeatable or too long | a failure cannot be reproduced | use no random values and no clock
+LS311 two examples with the same seed differ | a failure cannot be reproduced | use no random values and no clock
 LS312 a field that `Rebuild` fills in is not checked | a frame with another value is accepted, and built differently
       | compare it in `plausible`: f.length == f.size + 5
 LS401 a clean stream loses bytes | valid frames are lost without any damage | declare all parts of the frames
 LS404 scans depend on the size of batches | the same revolution is cut at another place | keep no state in `points`
 LS414 a function of the plugin raises an error | its packets are counted, but lost | make it valid for every valid frame
-LS415 the same bytes give different results | results cannot be reproduced | use the fields only
+LS415 the same bytes give different results | results cannot be reproduced | calculate results from fields only
 LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians; 0 is no return
 LS502 angles are in degrees | radians are expected, so directions are wrong | use np.deg2rad(...)
 LS503 a single point has no direction | a count of 1 divides by count - 1 | use spread(start, end, count, full=360.0)
@@ -117,7 +117,7 @@ LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare C
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds
 LS514 a field cannot represent a value of `sweep` | the simulated sensor sends another value
       | return physical values in the unit of the field, within its limits
-LS601 parsing a command returns other values | the sensor receives another command | use paths of its frame in values and args
+LS601 parsing a built command returns other values | the sensor receives another command | use paths of its frame in values and args
 LS602 an argument is not limited to its range | the sensor receives invalid requests
       | declare args={name: (path, lowest, highest)}
 LS603 a reply cannot match | the command waits until its timeout | use fields of the reply in matches= and echoes=
