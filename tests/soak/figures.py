@@ -428,8 +428,8 @@ def nothing_runs(share: float) -> Figure:
             )
         ran = Path(place, "ran").exists()
     words = (
-        f"5 files from others: {'Python ran' if ran else 'no Python ran'}, {opened} read a"
-        " descriptor or failed"
+        f"5 files from others: {'Python ran' if ran else 'no Python ran'}, {opened}"
+        " files read a descriptor or caused a crash"
     )
     return Figure(words, not ran and not opened)
 

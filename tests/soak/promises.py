@@ -93,8 +93,8 @@ EVERY = (
         "P10",
         "devices survive unplugging",
         (f"{DEVICE}",),
-        "unplugged 100 times: no frame joins bytes from before and after; no descriptor or thread"
-        " left",
+        "unplugged 100 times: no frame joins bytes from before and after unplugging; no descriptor"
+        " or thread is left",
     ),
     Promise(
         "P11",
@@ -112,13 +112,14 @@ EVERY = (
         "P13",
         "a broken plugin is isolated",
         ("tests/plugins/test_plugins.py",),
-        "each kind of broken plugin is named",
+        "for each kind of fault, an error names the plugin",
     ),
     Promise(
         "P14",
         "hostile captures use little memory and raise only SourceError",
         (HOSTILE, "tests/captures/test_memory.py"),
-        "20,000 mutations of each format: 0 findings; a capture of 1 GB below 200 MB",
+        "5,000 mutations of each format: 0 findings; less than 200 MB of memory for a capture of"
+        " 1 GB",
     ),
     Promise(
         "P15",
@@ -130,7 +131,7 @@ EVERY = (
         "P16",
         "clocks are unwrapped",
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
-        "clocks of 30 s, an hour and 16 bits, 100 wraps each, with late packets: exact",
+        "clocks that wrap at 30 s, an hour or 16 bits, 100 wraps each, with late packets: exact",
     ),
     Promise(
         "P17",
@@ -148,7 +149,8 @@ EVERY = (
     Promise("P19", "a scan always ends", (SCANS,), "", figures.measure_blocked_rotors),
     Promise(
         "P20",
-        "decoding is 10 times as fast as the line, and needs less than 64 bytes for each byte",
+        "decoding is 10 times as fast as the line, and needs less than 64 bytes of memory for each"
+        " byte of input",
         (RULE,),
         "",
         figures.slowest,
