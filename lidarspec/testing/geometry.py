@@ -39,6 +39,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.reference_evaluator import evaluate_plainly
+from lidarspec.scans.scan_ends import EndFinder
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, make_room
 from lidarspec.simulation.simulator import frame_simulation
@@ -423,7 +424,8 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     )
     if not frames:
         return
-    evaluated = evaluate_plainly(decode_frames(subject, name, frames).with_points)
+    packets = decode_frames(subject, name, frames).with_points
+    evaluated = evaluate_plainly(packets)
     if evaluated.counts.ndim > 1:
         counts = evaluated.counts.reshape(len(evaluated.counts), -1).sum(axis=1)
     else:
@@ -431,10 +433,15 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     cloud = evaluated.cloud
     packet = np.repeat(np.arange(evaluated.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
+    scan_ends = np.empty(0, np.intp)
+    if not isinstance(subject.sensor.scan, OnWrap):
+        ends = EndFinder(subject.sensor).find(packets, evaluated)
+        scan_ends = np.array([end.point for end in ends], np.intp)
     for ring in np.unique(rings)[:4]:
         selected = (rings == ring) & np.isfinite(cloud.azimuth)
         angle = cloud.azimuth[selected].astype(np.float64)
         number = packet[selected]
+        scan = scan_ends.searchsorted(np.flatnonzero(selected), "right")
         steps = (np.diff(angle) + np.pi) % (2 * np.pi) - np.pi
         moving = np.abs(steps) > 1e-9
         if moving.sum() < 8:
@@ -456,7 +463,11 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
                 " scan ends where the azimuth wraps"
             )
             require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
-        elif back.any():
+            continue
+        back &= np.diff(scan) == 0
+        if not isinstance(subject.sensor.scan, OnWrap) and _have_equal_packets(angle, number):
+            back &= np.diff(number) > 0
+        if back.any():
             index = int(np.flatnonzero(back)[0])
             before, after = np.rad2deg(angle[index : index + 2])
             message = (
@@ -468,6 +479,17 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
                 message,
                 f"{name}.points",
             )
+
+
+def _have_equal_packets(angles: NDArray[np.float64], packets: NDArray[np.intp]) -> bool:
+    """Return whether all packets have the same angles.
+
+    Args:
+        angles: the angle of each point, (n,).
+        packets: the index of the packet of each point, ascending, (n,).
+    """
+    first, *others = np.split(angles, np.flatnonzero(np.diff(packets)) + 1)
+    return all(np.array_equal(first, other) for other in others)
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:

@@ -58,7 +58,6 @@ SENSOR = Sensor(
             data=True,
             max_length=3 + 6 * ROWS,
             plausible=lambda f: f.rows.angle < 360,
-            acknowledged={"LS504": "a packet may be of two faces"},
         )
     },
     points=points,

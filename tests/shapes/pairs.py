@@ -65,14 +65,7 @@ SENSOR = Sensor(
     "shape-pairs",
     vendor="Shapes",
     model="Pairs",
-    frames={
-        "data": Frame(
-            DATA,
-            data=True,
-            plausible=plausible,
-            acknowledged={"LS506": "a scan is a field of view, which begins on the right"},
-        )
-    },
+    frames={"data": Frame(DATA, data=True, plausible=plausible)},
     points=points,
     scan=OnRewind("number"),
     links={"data": Udp(7011)},

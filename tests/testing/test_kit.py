@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,8 +47,10 @@ from lidarspec.spec import (
     Http,
     HttpReply,
     HttpRequest,
+    OnChange,
     Polar,
     Scaled,
+    Serial,
     Simulation,
     Sum,
     take,
@@ -61,7 +64,7 @@ from lidarspec.testing.frames import (
     values_in_units_build_the_same_bytes,
     values_survive_building_and_parsing,
 )
-from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
+from lidarspec.testing.geometry import angles_are_in_order, the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import vectors_hold
@@ -269,6 +272,51 @@ def test_contradictions_are_named(plugin: Any, code: str) -> None:
     (sensor,) = plugin.lidarspec_sensors()
     assert found(sensor) == {code}
     assert found(sound.sensor()) == set()
+
+
+ROWS = Array(6, Struct("distances" / Array(16, Scaled(Int16ul, 0.001, "m"))))
+
+
+def make_solid_state_sensor(packets_per_scan: int = 1) -> Sensor:
+    """Return a sensor with rows of pixels from -56 to 56 degrees, without a ring."""
+    azimuths = np.deg2rad((np.arange(16) - 7.5) * 7.5)
+    elevations = np.deg2rad((2.5 - np.arange(6)) * 10)[:, None]
+    frame = Struct("magic" / Const(b"\x5a\x77\xff\x43"), "number" / Int8ul, "rows" / ROWS)
+    return Sensor(
+        "acme-solid",
+        vendor="Acme",
+        model="Solid",
+        frames={"data": Frame(frame, data=True)},
+        points=lambda f: Polar(f.rows.distances, azimuths, elevations),
+        scan=OnChange("number"),
+        links={"data": Serial(115200)},
+        range_limits=(0.1, 10.0),
+        status="manual",
+        source="invented",
+        simulation=Simulation(lambda i: {"number": i // packets_per_scan % 256}, rate=15),
+    )
+
+
+def make_fan_sensor(packets_per_scan: int = 1) -> Sensor:
+    """Return a sensor with one row of beams from -60 to 60 degrees."""
+    azimuths = np.deg2rad(np.arange(161) * 0.75 - 60)
+    distances = Array(161, Scaled(Int16ul, 0.001, "m"))
+    frame = Struct("magic" / Const(b"\x5a\x77\xff\x43"), "number" / Int8ul, "distances" / distances)
+    return replace(
+        make_solid_state_sensor(packets_per_scan),
+        frames={"data": Frame(frame, data=True)},
+        points=lambda f: Polar(f.distances, azimuths),
+    )
+
+
+@pytest.mark.parametrize("make_sensor", [make_solid_state_sensor, make_fan_sensor])
+def test_the_azimuth_may_step_back_only_where_a_scan_ends(
+    make_sensor: Callable[..., Sensor],
+) -> None:
+    assert codes(make_sensor()) == set()
+    with pytest.raises(ViolationError, match=r"steps back .* in packet 1 of the sweep") as caught:
+        angles_are_in_order(SensorUnderTest(make_sensor(packets_per_scan=2)), "data")
+    assert caught.value.code == "LS506"
 
 
 def rare(f: object) -> object:

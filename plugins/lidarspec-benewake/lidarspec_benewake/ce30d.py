@@ -115,11 +115,7 @@ CE30D = Sensor(
     vendor="Benewake",
     model="CE30-D",
     frames={
-        "data": Frame(
-            PACKET,
-            data=True,
-            acknowledged={"LS506": "a scan covers the field of view, beginning at its right edge"},
-        ),
+        "data": Frame(PACKET, data=True),
         "order": Frame(ORDER, direction="out"),
     },
     points=points,
