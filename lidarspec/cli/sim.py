@@ -119,7 +119,7 @@ PLACES = (
 @click.option(
     "--unplug",
     type=DURATION,
-    help="Disconnect the sensor repeatedly, each time after it was connected for this time.",
+    help="Disconnect the sensor repeatedly, each time after this time.",
 )
 @click.option(
     "--shake",
