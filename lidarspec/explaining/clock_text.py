@@ -48,9 +48,9 @@ def describe_offset(report: ClockReport) -> str:
     The difference between the time scales of sensor and host is subtracted from the offset.
     """
     if math.isnan(report.error_s):
-        reason = "the clock starts at an arbitrary time"
+        reason = "the sensor's clock starts at an arbitrary time"
         if report.epoch in DATED_EPOCHS:
-            reason = "the clock has no valid date"
+            reason = "the sensor's clock has no valid date"
         return f"{report.offset_s:+.3f} s from the host's clock; {reason}"
     text = f"{report.error_s * 1e3:+.2f} ms"
     if abs(report.error_s) >= 1:

@@ -217,7 +217,10 @@ def test_a_clock_without_its_date_is_described_as_such() -> None:
     run = make_run(2, ahead_s=-8.4e8)
     report = watch(run.packets(SYNCED.configure(epoch="utc")), run.began_s).monitor.report()
     rows = dict(iter_clock_rows(report))
-    assert rows["offset"] == "-840000000.000 s from the host's clock; the clock has no valid date"
+    assert (
+        rows["offset"]
+        == "-840000000.000 s from the host's clock; the sensor's clock has no valid date"
+    )
     assert rows["verdict"] == "the clock has no valid date, expected UTC"
 
 
