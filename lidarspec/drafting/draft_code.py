@@ -291,7 +291,7 @@ def _make_rising_field(draft: Draft, rising: RisingField, container: str = "fram
         if start_field is not None:
             evidence.append(
                 f"the value is between {start_field.name} of this frame and {start_field.name} of"
-                " the next frame: the angle of the last sample?"
+                " the next frame; it may be the angle of the last sample"
             )
     return DraftField(rising.offset, rising.size, rising.name, code, tuple(evidence))
 

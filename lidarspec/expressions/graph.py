@@ -242,7 +242,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
-            raise UntraceableError("the array is shorter than the array to which .on() moves it")
+            raise UntraceableError(".on() cannot move values to a longer array")
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
