@@ -465,7 +465,7 @@ def reports_firmware(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits 1 to 7 of the third byte contain other values than the firmware number",
+    "bits 1 to 7 of the third byte contain values other than the firmware number",
     has_bits_beside_firmware,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {

@@ -141,7 +141,7 @@ def make_packet(kind: int, *members: Any) -> Struct:
         "lidar_id" / Int8ul,
         "reserved" / Int8ul,
         "status_code" / STATUS_CODE,
-        "timestamp_type" / Enum(Int8ul, **CLOCKS) * "gps_and_pps: the timestamp is a date",
+        "timestamp_type" / Enum(Int8ul, **CLOCKS) * "with gps_and_pps, the timestamp is a date",
         "data_type" / Const(kind, Int8ul),
         "timestamp" / TIMESTAMP,
         *members,

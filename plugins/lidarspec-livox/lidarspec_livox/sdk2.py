@@ -110,9 +110,7 @@ def make_packet(kind: int, *members: Any) -> Checksummed:
         "frame_cnt" / Int8ul * "frame counter; not used if the scan pattern is non-repetitive",
         "data_type" / Const(kind, Int8ul),
         "time_type" / Enum(Int8ul, power_up=0, ptp_or_gptp=1, gps=2),
-        "pack_info"
-        / Default(Int8ul, 0)
-        * "format of the tags, which only some firmware versions set",
+        "pack_info" / Default(Int8ul, 0) * "format of the tags; only some firmware versions set it",
         "reserved" / Default(Bytes(11), bytes(11)),
         "crc32" / Int32ul * "CRC of all following bytes; 0: not set",
         "timestamp" / Scaled(Int64ul, 1, "ns") * "time of the first point",

@@ -312,7 +312,7 @@ class MetadataKeys:
         number = self.data.get(key, default)
         if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= maximum:
             raise self.make_error(
-                key, "is missing" if number is None else f"must be 1 to {maximum}"
+                key, "is missing" if number is None else f"must be from 1 to {maximum}"
             )
         return number
 

@@ -361,7 +361,7 @@ def test_imu_measurements_come_in_si_units() -> None:
             {"beam_azimuth_angles": [float("nan")] * 16},
             "beam_azimuth_angles must be a list of numbers",
         ),
-        ({"columns_per_frame": 1 << 40}, "columns_per_frame must be 1 to 4096"),
+        ({"columns_per_frame": 1 << 40}, "columns_per_frame must be from 1 to 4096"),
         ({"columns_per_frame": 500}, "500 is not a multiple of columns_per_packet"),
         ({"pixels_per_column": 32}, "has 16 angles, expected 32"),
         ({"udp_profile_lidar": "RNG99"}, "RNG99 is not supported"),

@@ -115,7 +115,7 @@ def make_packet(rows: Construct) -> Struct:
         "reserved_6" / Bytes(2),
         "top_packet_count"
         / Bytes(4)
-        * "four counters in one byte each; each is 3 above the one before",
+        * "four one-byte counters; each counter is 3 higher than the previous counter",
         "bottom_packet_count" / Int32ub * "packet counter",
         "reserved_16" / Bytes(1),
         "range_resolution" / Enum(Int8ub, **{"5 mm": 0, "2.5 mm": 1}),

@@ -131,7 +131,7 @@ def make_scan_fields(echoes: int) -> list[Construct]:
         "outputs" / Array(2, Int8ub),
         "layer"
         / Scaled(Int16sb, 0.01, "deg")
-        * "angle of the layer, positive downwards; only an MRS1000 sends another value than 0",
+        * "angle of the layer, positive downwards; 0 in all models except the MRS1000",
         "scan_rate" / Scaled(Int32ub, 0.01, "Hz"),
         "beam_rate" / Scaled(Int32ub, 100, "Hz"),
         "encoder_count" / Int16ub,

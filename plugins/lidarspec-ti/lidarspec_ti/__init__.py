@@ -136,9 +136,7 @@ DATA = Struct(
     "length" / SizeOf(Int32ul),
     "platform" / Const(PLATFORM, Int32ul),
     "frame_number" / Int32ul,
-    "time"
-    / Scaled(Int32ul, CYCLE_NS, "ns")
-    * "time by a cycle counter, which restarts after 21.5 s",
+    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "cycle counter, which restarts after 21.5 s",
     "detected" / Int32ul * "number of points",
     "tlv_count" / Int32ul,
     "subframe" / Int32ul,

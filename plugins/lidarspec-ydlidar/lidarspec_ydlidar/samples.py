@@ -66,9 +66,7 @@ SAMPLE_8 = make_packed_sample(REFLECTION, "intensity" / BitsInteger(8))
 
 TRIANGLE = SampleFormat(make_plain_distance(0.00025), correction=camera_angle)
 TRIANGLE_FLAGGED = SampleFormat(
-    make_packed_sample(
-        "flags" / BitsInteger(2) * "other values than 0: interference from another lidar"
-    ),
+    make_packed_sample("flags" / BitsInteger(2) * "not 0: interference from another lidar"),
     correction=camera_angle,
 )
 TRIANGLE_8 = SampleFormat(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
