@@ -147,8 +147,8 @@ def find_argument_slot(sensor: SensorDescription, name: str, argument: str) -> A
         is_integer = slot.info.kind == "int" and not slot.info.scaled
         if not is_integer or not low <= declared.kind.low <= declared.kind.high <= high:
             raise SpecError(
-                f"Choice cannot set {declared.path!r}: the field must be an integer without a"
-                " scale that can contain all numbers of the Choice",
+                f"Choice cannot set {declared.path!r}: the field must be an unscaled"
+                " integer that can contain all numbers of the Choice",
                 path=place,
                 sensor=sensor.id,
             )
