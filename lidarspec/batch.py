@@ -554,8 +554,8 @@ def convert(
             if manifest.is_new and not force and manifest.has(piece.target)
         ]:
             error = UsageError(
-                f"{taken[0]} exists already, and was not overwritten, because the folder has no"
-                f" {MANIFEST} with the source of this file"
+                f"{taken[0]} exists already and was not overwritten: the folder has no {MANIFEST},"
+                " so the source of the file is unknown"
             )
             raise suggest(error, "repeat with --force, or with another folder")
         if not force:
