@@ -236,7 +236,7 @@ def _serve(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; {format_size(opened.unsent_bytes)} were not read by a program"
+            lost = f"; {format_size(opened.unsent_bytes)} of the data were not read by a program"
         else:
             lost = ""
         note(f"{_format_sent(device)}{lost}")
