@@ -28,6 +28,8 @@ Link = Literal["serial", "udp"]
 RESERVED_NAMES = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
 #: The maximum number of frames of a capture to write to vectors.json.
 MAX_VECTORS = 3
+#: The header of the section of pyproject.toml that lists the sensors.
+_ENTRY_POINTS = '[project.entry-points."lidarspec.sensors"]\n'
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
 
@@ -83,7 +85,7 @@ class DistributionNames:
         return f"SENSOR_{name}"
 
     @property
-    def module(self) -> str:
+    def package(self) -> str:
         """The import name of the distribution."""
         return self.distribution.replace("-", "_")
 
@@ -91,13 +93,13 @@ class DistributionNames:
         """Return the values for the templates."""
         return {
             name: getattr(self, name)
-            for name in ("id", "constant", "distribution", "module", "vendor", "model")
+            for name in ("id", "constant", "distribution", "package", "vendor", "model")
         }
 
 
 def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
     """Return the files of a distribution with an example sensor, as {path: text}."""
-    values = {**names.values(), "speed_remark": ", if code is 3" if link == "serial" else ""}
+    values = names.values()
     return _make_files(
         names,
         link,
@@ -119,14 +121,19 @@ def make_draft_files(
         origin: a description of the capture.
         port: the UDP port to which the datagrams were sent; None if unknown.
     """
-    serial = "Serial(115_200)},  # replace this baud rate: a capture does not contain it"
-    if port:
-        udp = f"Udp({port})}},  # the port to which the captured datagrams were sent"
+    if link == "serial":
+        link_code = "Serial(115_200)"
+        link_remark = "replace this baud rate: a capture does not contain it"
+    elif port:
+        link_code = f"Udp({port})"
+        link_remark = "the port to which the captured datagrams were sent"
     else:
-        udp = "Udp(2368)},  # replace this port: the capture does not contain it"
+        link_code = "Udp(2368)"
+        link_remark = "replace this port: the capture does not contain it"
     values = {
         **names.values(),
-        **make_template_values(draft, origin=origin, link=serial if link == "serial" else udp),
+        **make_template_values(draft, origin=origin, link_code=link_code),
+        "link_remark": link_remark,
     }
     frames = [
         {
@@ -164,10 +171,11 @@ def _make_files(
     return {
         "pyproject.toml": fill_template("pyproject.toml", values, link),
         "README.md": readme,
+        # empty if lidarspec is installed without its license file
         "LICENSE": distribution("lidarspec").read_text("licenses/LICENSE") or "",
-        f"{names.module}/__init__.py": module,
-        f"{names.module}/py.typed": "",
-        f"{names.module}/vectors.json": vectors,
+        f"{names.package}/__init__.py": module,
+        f"{names.package}/py.typed": "",
+        f"{names.package}/vectors.json": vectors,
         f"tests/test_{names.id.replace('-', '_')}.py": tests,
     }
 
@@ -175,12 +183,8 @@ def _make_files(
 def fill_template(template: str, values: Mapping[str, str], link: Link) -> str:
     """Return the text of a template for a link, with values inserted."""
     text = (files("lidarspec") / "templates" / f"{template}.in").read_text(encoding="utf-8")
-    text_for_link = _CONDITION.sub(lambda line: f"{line[1]}\n" if line[2] == link else "", text)
+    text_for_link = _CONDITION.sub(lambda match: f"{match[1]}\n" if match[2] == link else "", text)
     return Template(text_for_link).substitute(values)
-
-
-#: The header of the section of pyproject.toml that lists the sensors.
-_ENTRY_POINTS = '[project.entry-points."lidarspec.sensors"]\n'
 
 
 def add_to_distribution(
@@ -196,7 +200,7 @@ def add_to_distribution(
         UsageError: if the folder has another distribution, or already has a file of this sensor.
         SourceError: if the files of the distribution cannot be read.
     """
-    vectors_path = f"{names.module}/vectors.json"
+    vectors_path = f"{names.package}/vectors.json"
     with system_errors(folder):
         project, readme = (
             (folder / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "README.md")
@@ -215,14 +219,15 @@ def add_to_distribution(
         module = f"model_{module}"
     test = f"tests/test_{names.id.replace('-', '_')}.py"
     new_files = {
-        f"{names.module}/{module}.py": texts[f"{names.module}/__init__.py"],
+        f"{names.package}/{module}.py": texts[f"{names.package}/__init__.py"],
         test: texts[test],
     }
     for name in new_files:
         if (folder / name).exists():
             raise UsageError(f"{folder / name} exists already: nothing was written")
-    entry = f'{names.id} = "{names.module}.{module}:{names.constant}"\n'
-    # Append the new vectors to the JSON array of the existing vectors, which keeps its format.
+    entry = f'{names.id} = "{names.package}.{module}:{names.constant}"\n'
+    # Append the new vectors to the existing JSON array as text, so that the existing lines do not
+    # change.
     existing_vectors = vectors.rstrip().removesuffix("]").rstrip()
     new_vectors = texts[vectors_path].strip().removeprefix("[")
     comma = "" if existing_vectors == "[" else ","
@@ -233,7 +238,7 @@ def add_to_distribution(
         "README.md": (
             f"{readme.rstrip()}\n\n"
             f"The {names.vendor} {names.model}, `{names.id}`,"
-            f" is in `{names.module}/{module}.py`.\n"
+            f" is in `{names.package}/{module}.py`.\n"
         ),
     }
 

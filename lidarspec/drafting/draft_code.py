@@ -79,13 +79,13 @@ class DraftField:
         yield f'{indent}"{self.name}"{separator}/ {self.code},'
 
 
-def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
+def make_template_values(draft: Draft, *, origin: str, link_code: str) -> dict[str, str]:
     """Return the values for the template of a module, as {name: text}.
 
     Args:
         draft: the analysed frames.
         origin: a description of the capture.
-        link: the code of the data link.
+        link_code: the Python expression of the data link.
     """
     fields = list(_iter_fields(draft))
     angles = _find_angles(draft)
@@ -140,7 +140,7 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
         "distance": f"0 * f.{angles[0]}" if angles else "np.zeros(1)",
         "arguments": "".join(f"    {line}\n" for line in sensor_arguments),
         "frame_arguments": ", ".join(frame_arguments),
-        "link_code": link,
+        "link_code": link_code,
     }
     return {**text, **_make_imports(text)}
 

@@ -235,7 +235,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
 def test_odd_ids_make_working_modules(tmp_path: Path, name: str) -> None:
     ran("new", name, "--into", tmp_path)
     names = DistributionNames(name)
-    assert ls.sensor(tmp_path / names.distribution / names.module / "__init__.py").id == name
+    assert ls.sensor(tmp_path / names.distribution / names.package / "__init__.py").id == name
     assert names.constant.isidentifier()
 
 

@@ -59,7 +59,7 @@ def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
     return ls.sensor(
         tmp_path
         / DistributionNames("acme-x9").distribution
-        / DistributionNames("acme-x9").module
+        / DistributionNames("acme-x9").package
         / "__init__.py"
     )
 
@@ -439,7 +439,7 @@ def write_draft(frames: list[bytes], *, datagrams: bool = False) -> dict[str, st
     return text_of(
         make_draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
         origin="the tests",
-        link="",
+        link_code="",
     )
 
 
