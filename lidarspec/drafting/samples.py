@@ -97,16 +97,17 @@ class CoveredSpan:
             return "all other bytes"
         if self.part == "before":
             return f"the bytes from {self.head} up to the checksum"
-        if self.part == "behind":
-            omitted = " and ".join(
-                [f"the first {self.head}"] * (self.head > 0)
-                + [f"the last {self.tail}"] * (self.tail > 0)
-            )
-            return "all bytes after the checksum" + (f", except {omitted}" if omitted else "")
-        omitted = ["the checksum"]
-        omitted += [f"the first {self.head}"] * (self.head > 0)
-        omitted += [f"the last {self.tail}"] * (self.tail > 0)
-        return f"all bytes except {', '.join(omitted[:-1])} and {omitted[-1]}"
+        omitted = []
+        if self.head > 0:
+            omitted.append(f"the first {self.head}")
+        if self.tail > 0:
+            omitted.append(f"the last {self.tail}")
+        if self.part == "all":
+            *others, last = ["the checksum", *omitted]
+            return f"all bytes except {', '.join(others)} and {last}"
+        if omitted:
+            return f"all bytes after the checksum, except {' and '.join(omitted)}"
+        return "all bytes after the checksum"
 
 
 @dataclass(frozen=True)
