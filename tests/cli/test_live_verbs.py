@@ -207,7 +207,7 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
     assert (
-        "expected a suffix of"
+        "expected a file name that ends in"
         in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
     )
 

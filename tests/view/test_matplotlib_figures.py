@@ -201,7 +201,7 @@ def test_figures_are_vectors_too_and_the_same_bytes_again(lossy: Path, tmp_path:
     assert printed[0] == printed[1]
     assert printed[0].startswith("<?xml")
     assert (
-        "expected a suffix of .png, .pdf, .svg"
+        "expected a file name that ends in .png, .pdf, .svg"
         in ran("plot", lossy, "-o", tmp_path / "a.jpg", code=2).stderr
     )
 
