@@ -527,8 +527,8 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
         require(
             back.min() >= 0,
             "LS509",
-            f"the time of packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before that"
-            f" of packet {index}",
+            f"packet {index + 1} of the sweep is {-back.min() / 1e9:g} s earlier than packet"
+            f" {index}",
             name,
         )
 
