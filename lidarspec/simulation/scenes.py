@@ -267,8 +267,8 @@ def _read_box(table: Mapping[str, Any], place: str) -> Box:
     low, high = (_read_numbers(table, name, 3, place) for name in ("low", "high"))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise UsageError(
-            f"{place}: each coordinate of high must be above that of low, got low {low} and high"
-            f" {high}"
+            f"{place}: each coordinate in high must be above the coordinate in low, got low {low}"
+            f" and high {high}"
         )
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 

@@ -1202,8 +1202,8 @@ class Escaped:
             or special & {b ^ self.xor for b in special}
         ):
             raise SpecError(
-                "flag and escape must be two different bytes, and no escaped byte may equal one"
-                " of them",
+                "flag and escape must be two different bytes, and no escaped byte may be"
+                " the flag or the escape",
                 path="wire",
             )
 

@@ -432,7 +432,7 @@ def test_a_scene_can_be_a_small_file(tmp_path: Path) -> None:
         (
             "high = [2.7, 1.6, 0.9]",
             "high = [2.7, 1.6, -2]",
-            r"box\[0\]: each coordinate of high must be",
+            r"box\[0\]: each coordinate in high must be",
         ),
         (
             "high = [4.6, 3.1, 1.6]",
