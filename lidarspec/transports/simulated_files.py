@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,8 +22,10 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.serving import due_chunks
 
-#: Step of the device's time between two writes to the file.
-_STEP_NS = SECOND // 100
+#: Minimum and maximum step of the device's time between two writes to the file. With the minimum,
+#: the frames of a fast sensor accumulate, as for a program that reads a port.
+_MIN_STEP_NS = SECOND // 1000
+_MAX_STEP_NS = SECOND // 100
 
 _Transfer = tuple[Chunk, Literal["in", "out"]]
 
@@ -85,17 +88,25 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
     start_ns = time.time_ns()
     opening = _list_opening_commands(sensor)
     now = 0
+    end_ns = round(seconds * SECOND)
     device.utc_offset_ns = start_ns
     device.start(now)
-    while now < seconds * SECOND:
+    while now < end_ns:
         if opening:
             name = opening.pop(0)
             data = build_command(sensor, name, {})
             yield Chunk(data, start_ns + now), "out"
             device.receive(data, now, sensor.commands[name].link)
-        now += _STEP_NS
+        now = min(now + _find_step(device, now), end_ns)
         for chunk in due_chunks(device, now, start_ns + now).get("data", []):
             yield chunk, "in"
+
+
+def _find_step(device: SimulatedDevice, now: int) -> int:
+    """Return the time until the device sends again, within the limits of a step, ns."""
+    if device.deadline is None or math.isinf(device.rate):
+        return _MAX_STEP_NS
+    return min(max(device.deadline - now, _MIN_STEP_NS), _MAX_STEP_NS)
 
 
 def _list_opening_commands(sensor: Sensor) -> list[str]:

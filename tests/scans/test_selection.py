@@ -271,14 +271,11 @@ def test_stamps_in_utc_follow_from_the_clock_and_changes_are_reported(tmp_path: 
 
 
 def test_stamps_of_a_free_clock_are_mapped_to_utc_by_arrival(recordings: dict[str, Path]) -> None:
-    """The simulated packets arrive up to 10 ms late.
-
-    The packets in which a scan starts are always 10 ms late.
-    """
+    """The simulated packets arrive up to 1 ms late, and the first packet arrives 1 ms late."""
     path = recordings["lsr"]
     with ls.open(path, ID) as device:
         first_arrival_ns = min(int(packets.host_ns.min()) for packets in device.packets())
-    power_on_ns = first_arrival_ns - 10_000_000
+    power_on_ns = first_arrival_ns - 1_000_000
     utc = [scan.stamp_ns for scan in scans(path, Selection(time="utc"))]
     own = [scan.stamp_ns for scan in scans(path)]
     errors_ms = (np.array(utc) - np.array(own) - power_on_ns) * 1e-6

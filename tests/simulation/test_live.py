@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from construct import Const, Int8ul, Struct
+from construct import Const, Int8ul, Int16ul, Struct
 
 import lidarspec as ls
 from lidarspec import SourceError, UsageError
@@ -25,7 +25,7 @@ from lidarspec.errors import SpecError, UnknownFormat
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
-from lidarspec.spec import Command, Frame, Simulation, Udp
+from lidarspec.spec import Command, Frame, OnChange, Polar, Scaled, Serial, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import FairLock, Served
@@ -288,6 +288,38 @@ def test_a_file_contains_the_bytes_of_the_live_sensor(
     write_file(again, tmp_path / f"again.{suffix}", seconds)
     if suffix == "bin":
         assert path.read_bytes() == (tmp_path / f"again.{suffix}").read_bytes()
+
+
+@pytest.mark.parametrize("rate", [15, 30, 60])
+def test_a_file_has_the_rate_that_the_spec_declares(rate: int, tmp_path: Path) -> None:
+    image = ls.Sensor(
+        "acme-image",
+        vendor="Acme",
+        model="Image",
+        frames={
+            "data": Frame(
+                Struct(
+                    "head" / Const(b"\xc5\x01"),
+                    "number" / Int8ul,
+                    "range" / Scaled(Int16ul, 0.001, "m"),
+                ),
+                data=True,
+            )
+        },
+        points=lambda fields: Polar(fields.range, 0.0),
+        scan=OnChange("number"),
+        links={"data": Serial(115_200)},
+        simulation=Simulation(lambda index: {"number": index % 256}, rate=rate),
+        range_limits=(0.05, 30.0),
+        status="manual",
+        source="invented",
+    )
+    path = tmp_path / "made.lsr"
+    write_file(SimulatedDevice(image, scene=Room()), path, 1.0)
+    with ls.open(path, image) as opened:
+        rates = [scan.rate_hz for scan in opened.scans() if scan.complete]
+    assert len(rates) > rate // 2
+    assert rates == pytest.approx([rate] * len(rates), rel=1e-6)
 
 
 def test_a_start_command_that_no_program_sends_does_not_silence_a_sensor(tmp_path: Path) -> None:
