@@ -16,7 +16,7 @@ from lidarspec._version import __version__
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, say
-from lidarspec.errors import SpecError
+from lidarspec.errors import LidarSpecError, SpecError
 from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors_text
 from lidarspec.trusted_files import FILE, TRUSTED, trust as trusted, user_folder
 
@@ -320,10 +320,12 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
 def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
     command = sensor.commands[name]
     args = {name: argument.to_dict() for name, argument in command.arguments.items()}
-    if command.frame is None or args:
-        frame = ""
-    else:
-        frame = sensor.command(name).hex(" ")
+    frame = ""
+    if command.frame is not None and not args:
+        try:
+            frame = sensor.command(name).hex(" ")
+        except LidarSpecError as error:
+            note(f"command {name} cannot be built: {error}; next: lidarspec check {sensor.id}")
     return {
         "frame": command.frame,
         "arguments": args,

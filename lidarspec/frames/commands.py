@@ -48,6 +48,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
         UnknownField: for an argument that the command does not have.
         MissingField: for an argument that is missing.
         OutOfRange: for a value that exceeds the limits of the argument.
+        SpecError: for a field of the frame without a value or an argument.
     """
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
@@ -82,7 +83,14 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     for path, template in command.templates.items():
         text = _fill_template(template, arguments, place)
         values = put_value(values, split_path(path), text)
-    return build(sensor, command.frame, None, values)
+    try:
+        return build(sensor, command.frame, None, values)
+    except MissingField as error:
+        raise SpecError(
+            f"values and args have no value for field {error.path!r} of {command.frame}",
+            path=f"commands.{name}",
+            sensor=sensor.id,
+        ) from error
 
 
 def _fill_template(template: Template, arguments: Mapping[str, Any], place: str) -> bytes:

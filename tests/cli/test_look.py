@@ -85,6 +85,35 @@ def test_show_prints_commands_and_their_bytes() -> None:
     assert "command start: aa 55 f0 0f, reply ack" in ran("show", "cspc-m1c1-mini").stdout
 
 
+def test_show_names_a_command_that_lacks_a_value(tmp_path: Path) -> None:
+    file = tmp_path / "acme.py"
+    file.write_text(
+        """
+from construct import Int8ub, Struct
+from lidarspec.spec import Command, Frame, Sensor, Serial, hookimpl
+
+@hookimpl
+def lidarspec_sensors():
+    return [
+        Sensor(
+            "acme-bus",
+            vendor="Acme",
+            model="Bus",
+            frames={"ask": Frame(Struct("id" / Int8ub, "value" / Int8ub), direction="out")},
+            commands={"start": Command("ask", {"id": 1})},
+            links={"data": Serial(9600)},
+            status="manual",
+            source="invented",
+        )
+    ]
+""",
+        encoding="utf-8",
+    )
+    done = ran("show", file)
+    assert "ask (to the sensor): 2 bytes" in done.stdout
+    assert "commands.start: values and args have no value for field 'value'" in done.stderr
+
+
 @pytest.mark.parametrize("sensor", REPRESENTATIVES)
 def test_show_has_every_frame_and_plan(sensor: str) -> None:
     check_shown_sensor(sensor)
