@@ -445,7 +445,8 @@ class Tokens:
             digits.
         check: the checksum before the end; None without a checksum.
         formats: the format of each float, by path, as manuals write it: "hhmmss.ss" means at least
-            six digits before the point and two digits after it.
+            six digits before the point and two digits after it. Every character except the point
+            stands for a digit, so "dddddd.dd" means the same.
         joined: the number of fields of bytes that together form the first token.
         padded: whether a token may be shorter than its field of bytes, which is then padded with
             zero bytes.
@@ -1179,6 +1180,9 @@ class Escaped:
     A flag or an escape byte in the content is sent as an escape byte, followed by the byte with
     some bits inverted. Two consecutive frames do not share a flag. Decoding accepts an escape
     before any byte. Encoding escapes only flags and escape bytes.
+
+    Frames with a length, in which some bytes are doubled or inserted, require a `WireForm` of their
+    own.
 
     Args:
         flag: the byte before and after a frame.
