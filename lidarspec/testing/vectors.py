@@ -209,6 +209,9 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
 def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     """Check that the points of vectors are in two quadrants and in the declared range."""
     vectors = [vector for vector in read_valid_entries(subject).values() if vector["frame"] == name]
+    if not vectors:
+        subject.picture[f"{name}: vectors"] = "the file has no vectors of this frame type"
+        return
     placed = [
         point
         for vector in vectors
@@ -240,14 +243,13 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
         f" at {far:g} m",
         name,
     )
-    if vectors:
-        require(
-            len(quadrants) > 1,
-            "LS712",
-            f"all points of the vectors are in {number}",
-            f"{name}.points",
-        )
-        subject.placed.add(name)
+    require(
+        len(quadrants) > 1,
+        "LS712",
+        f"all points of the vectors are in {number}",
+        f"{name}.points",
+    )
+    subject.placed.add(name)
 
 
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
@@ -502,7 +504,7 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: s
     except WireError as error:
         if ": checksum " not in error.reason:
             raise ViolationError(
-                "LS707", error.reason, f"{entry_key} {name}.{error.path}"
+                "LS707", error.reason, f"{entry_key} {name}.{error.path}".removesuffix(".")
             ) from error
         same = [
             parse_hex(entry["hex"])

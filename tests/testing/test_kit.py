@@ -67,7 +67,7 @@ from lidarspec.testing.frames import (
 from lidarspec.testing.geometry import angles_are_in_order, the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES, Property
 from lidarspec.testing.sensor_under_test import SensorUnderTest
-from lidarspec.testing.vectors import vectors_hold
+from lidarspec.testing.vectors import points_stand_in_two_quadrants, vectors_hold
 from tests.broken import (
     code_for_range,
     degrees,
@@ -496,6 +496,17 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     ]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert list_lacking(sound.sensor(), [ack]) == []
+    (finding,) = list_lacking(sound.sensor(), [{**ack, "hex": ack["hex"] + "00"}])
+    assert finding.startswith("LS707 vectors[0] ack: ")
+
+
+def test_a_file_without_vectors_of_the_data_says_nothing_of_returns(tmp_path: Path) -> None:
+    file = tmp_path / "vectors.json"
+    ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
+    file.write_text(json.dumps([ack]), encoding="utf-8")
+    subject = SensorUnderTest(sound.sensor(), vectors=file)
+    points_stand_in_two_quadrants(subject, "data")
+    assert subject.picture == {"data: vectors": "the file has no vectors of this frame type"}
 
 
 def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
