@@ -29,6 +29,7 @@ from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
 from lidarspec.frames.field_paths import split_path
+from lidarspec.frames.number_format import count_decimals, format_fixed
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
@@ -99,7 +100,7 @@ class Reply:
             if info.const is None and get_nested(self.values, info.path) is not _MISSING
         ]
         texts = [
-            f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
+            f"{info.path} {_format_physical(info, self[info.path])} {info.unit}".rstrip()
             for info in free[:MAX_SHOWN_FIELDS]
         ]
         more = ", ..." if len(free) > MAX_SHOWN_FIELDS else ""
@@ -224,6 +225,14 @@ def get_nested(values: Any, path: str) -> Any:
         else:
             return _MISSING
     return values
+
+
+def _format_physical(info: FieldInfo, value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_format_physical(info, element) for element in value)}]"
+    if isinstance(value, float):
+        return format_fixed(value, count_decimals(info))
+    return str(value)
 
 
 def _to_physical(info: FieldInfo, value: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
 from lidarspec.frames.commands import find_argument_slot, has_only_names, list_choices
+from lidarspec.frames.number_format import format_fixed
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
 from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
@@ -375,20 +376,6 @@ def to_json_number(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def format_fixed(value: float, digits: int | None) -> str:
-    """Format a number with `digits` decimals, and zero without a minus sign.
-
-    If `digits` is None, the text has seven significant digits.
-    """
-    if digits is None:
-        text = f"{value:.7g}"
-    else:
-        text = f"{value:.{digits}f}"
-    if text.strip("-0."):
-        return text
-    return text.removeprefix("-")
 
 
 def format_limits(low: float, high: float, between: str = "..") -> str:

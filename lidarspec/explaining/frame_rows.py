@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,18 +11,14 @@ from lidarspec.errors import WireError
 from lidarspec.explaining.formatting import ExplainedRow, FieldValue
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout_tree import frame_layouts
+from lidarspec.frames.number_format import count_decimals
 from lidarspec.frames.plain import list_plain_fields
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import format_bits, format_hex
 from lidarspec.spec import Frame
-from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
-
-#: The maximum number of decimals that are printed to distinguish all values of a field.
-MAX_DIGITS = 12
-#: The maximum number of further decimals that are printed to make each value exact.
-MAX_EXTRA_DIGITS = 2
+from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values
 
 
 class FrameRows:
@@ -192,33 +187,13 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
         field.raw,
         float(info.physical(field.raw)) if is_number else None,
         info.unit,
-        None if info.kind == "float" else _count_digits(info.scale, info.offset),
+        count_decimals(info),
         info.labels.get(field.raw, "") if isinstance(field.raw, int) else "",
         "" if field.bits is None else format_bits(field.bits),
         info.docs,
         field.start,
         b"\xff" * size if field.bits is None else field.bits.masks(size),
         bool(info.labels) and field.raw not in info.labels,
-    )
-
-
-@functools.lru_cache
-def _count_digits(scale: float, offset: float) -> int:
-    """Return the number of decimals that make all values of a field differ.
-
-    Up to `MAX_EXTRA_DIGITS` more decimals are used if each value is then exact.
-    """
-    steps = (to_exact(scale), to_exact(offset))
-    distinguishing = next(
-        (digits for digits in range(MAX_DIGITS) if abs(steps[0]) * 10**digits >= 1), MAX_DIGITS
-    )
-    return next(
-        (
-            digits
-            for digits in range(distinguishing, distinguishing + MAX_EXTRA_DIGITS + 1)
-            if all(step * 10**digits % 1 == 0 for step in steps)
-        ),
-        distinguishing,
     )
 
 

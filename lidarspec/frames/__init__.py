@@ -20,5 +20,6 @@ and build single frames, and to read tables of many frames. Modules in reading o
 * `commands`: builds the frame of a command from its arguments.
 * `field_paths`: paths of fields as names and indices.
 * `wire_table`: the table of a frame type: offsets, widths, units, descriptions.
+* `number_format`: physical values as text.
 * `arrays`: arrays that need almost no memory, and other array functions.
 """

@@ -8,11 +8,14 @@ import random
 from collections.abc import Sequence
 
 import pytest
+from construct import Array, Int8ul, Int16ul, Struct
 
 import lidarspec as ls
 from lidarspec import CommandError, Found, Sensor, Session, UsageError
+from lidarspec.device.session import Reply
 from lidarspec.errors import OutOfRange, ReplyTimeout, UnknownCommand, UnknownField
-from lidarspec.spec import Command, Count, Udp
+from lidarspec.framing.frame_engine import get_codec
+from lidarspec.spec import Command, Count, Frame, Scaled, Udp
 from tests.shapes.commands import SENSOR
 from tests.shapes.conversation import SENSOR as CONVERSATION
 
@@ -35,6 +38,19 @@ def list_sent_messages(session: Session) -> list[str]:
 def receive(sensor: Sensor, session: Session, data: bytes, now: int) -> None:
     decoder = sensor.decoder()
     session.receive(decoder.feed(data) + decoder.idle(), now)
+
+
+def test_a_reply_prints_the_decimals_of_its_fields() -> None:
+    struct = Struct(
+        "angle" / Scaled(Int16ul, 0.088, "deg"),
+        "distances" / Array(2, Scaled(Int16ul, 0.001, "m")),
+        "count" / Int8ul,
+    )
+    frame = Frame(struct)
+    fields = {info.path: info for info in get_codec(frame).schema.fields.values()}
+    values = frame.prepared.parse(bytes.fromhex("ff01de07e80302"))
+    reply = Reply("ask", "ack", values, confirmed=True, at=0, fields=fields)
+    assert repr(reply) == "Reply(ask, ack: angle 44.968 deg, distances [2.014, 1.000] m, count 2)"
 
 
 def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
