@@ -27,7 +27,7 @@ from lidarspec.framing.candidates import (
     PieceResult,
     SearchState,
 )
-from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
+from lidarspec.framing.results import IMPLAUSIBLE, PLUGIN, SHORT, VALID, Frames
 
 #: If at least this number of bytes is between two changes of the active types, the piece ends at
 #: the second change, so that its remaining bytes are not checked for types that are no longer
@@ -243,10 +243,9 @@ def count_rejected(
     candidates: Candidates,
     stays: list[tuple[int, str | None]],
 ) -> None:
-    """Count the rejected candidates of a piece.
+    """Count the rejected candidates outside of accepted frames.
 
-    Candidates inside accepted frames are not counted. A candidate at the first byte of a frame is
-    counted if its type is declared before the type of the frame.
+    A failure of the plugin at the first byte of an accepted frame is also counted.
 
     Args:
         stays: pairs of an offset and the value of `SearchState.after` after this offset.
@@ -274,7 +273,8 @@ def count_rejected(
             before = np.searchsorted(frames.starts, offsets, side="right") - 1
             held = np.maximum(before, 0)
             is_inside = (before >= 0) & (offsets < frames.starts[held] + frames.sizes[held])
-            is_first_byte = offsets == frames.starts[held]
-            is_counted &= ~is_inside | (is_first_byte & (kind < frames.kinds[held]))
+            # A failure of the plugin is reported even if another type accepts the bytes.
+            is_failure = (status[refused] == PLUGIN) & (offsets == frames.starts[held])
+            is_counted &= ~is_inside | (is_failure & (kind < frames.kinds[held]))
         if is_counted.any():
             piece.reject(np.bincount(status[refused[is_counted]]).tolist(), own.errors)

@@ -387,3 +387,28 @@ def test_a_weak_frame_counts_in_runs_of_the_declared_length(confirm: int) -> Non
     frame = weak.example("data")
     assert sensor.split(frame * (confirm - 1)) == []
     assert [found.data for found in sensor.split(frame * confirm)] == [frame] * confirm
+
+
+def test_a_frame_of_a_later_type_with_the_same_header_is_no_error() -> None:
+    head = "head" / Const(b"\x01")
+    sensor = lidarspec.spec.Sensor(
+        "acme-bus",
+        vendor="Acme",
+        model="Bus",
+        links={"data": lidarspec.spec.Serial(9600)},
+        frames={
+            "short": Frame(Checksummed(Struct(head, "x" / Int16ub, "s" / Byte), "s", Sum(8))),
+            "long": Frame(
+                Checksummed(Struct(head, "x" / Int16ub, "y" / Int16ub, "s" / Byte), "s", Sum(8))
+            ),
+        },
+        status="manual",
+        source="invented",
+    )
+    frame = sensor.build("long", x=0x2233, y=0x4455)
+    damaged = frame[:-1] + b"\xff"
+    decoder = sensor.decoder()
+    found = decoder.feed(frame * 10 + damaged + frame) + decoder.finish()
+    assert [item.frame for item in found] == ["long"] * 11
+    # Both types reject the damaged frame.
+    assert (decoder.stats.bad_checksum, decoder.stats.bytes_skipped) == (2, len(damaged))
