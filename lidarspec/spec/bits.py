@@ -1,9 +1,11 @@
 """Find the bits of each value of a bit block by probing its parser.
 
-A block is any nesting of ``BitStruct``, ``ByteSwapped``, ``BitsSwapped`` and ``BytesInteger``. Its
-values are linear functions of its bits: value = sum of bit * weight. To find the weights, the block
-is parsed once with no bit set, and once for each bit with only this bit set. The weights are then
-confirmed with random blocks. This module therefore needs no rules about the order of bits.
+A block is any nesting of ``BitStruct``, ``ByteSwapped``, ``BitsSwapped`` and ``BytesInteger``. Each
+bit of a value is one bit of the block. To find out which, the block is parsed once for each digit
+of the binary indices of its bits: in the block for digit k, the bits are set whose index has digit
+k set. The bits at one position of a value then spell out the index of the bit of the block. The
+result is confirmed with random blocks. This module therefore needs no rules about the order of
+bits.
 """
 
 from __future__ import annotations
@@ -101,7 +103,7 @@ Parse = Callable[[bytes], Mapping[tuple[str | int, ...], Any]]
 
 
 def probe(parse: Parse, size: int) -> list[BitField] | None:
-    """Return the bit fields of a block; None if its values are not linear in its bits.
+    """Return the bit fields of a block; None if its values are not made of its bits.
 
     Args:
         parse: a function that returns the values of a block; it must accept any bytes.
@@ -110,45 +112,60 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
     base = parse(bytes(size))
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
         return None
-    weights: dict[tuple[str | int, ...], list[tuple[int, int]]] = {keys: [] for keys in base}
-    for bit in range(8 * size):
-        for keys, value in parse((1 << bit).to_bytes(size, "little")).items():
-            if value:
-                weights[keys].append((bit, int(value)))
-    fields = [
-        _make_field(keys, pairs, flag=isinstance(base[keys], bool))
-        for keys, pairs in weights.items()
-    ]
-    complete = [field for field in fields if field is not None]
-    if len(complete) == len(fields) and _is_confirmed(parse, size, complete):
-        return complete
+    full = parse(b"\xff" * size)
+    index_bits = (8 * size - 1).bit_length()
+    patterns = [parse(_make_pattern(index_bit, size)) for index_bit in range(index_bits)]
+    fields = list[BitField]()
+    for keys, zero in base.items():
+        field = _make_field(
+            keys,
+            int(full[keys]),
+            [int(pattern[keys]) for pattern in patterns],
+            flag=isinstance(zero, bool),
+        )
+        if field is None:
+            return None
+        fields.append(field)
+    if _is_confirmed(parse, size, fields):
+        return fields
     return None
 
 
-def _make_field(
-    keys: tuple[str | int, ...], pairs: list[tuple[int, int]], *, flag: bool
-) -> BitField | None:
-    """Return the field with the given bits.
+@lru_cache(maxsize=64)
+def _make_pattern(index_bit: int, size: int) -> bytes:
+    """Return a block in which a bit is set if its index has the bit `index_bit` set."""
+    pattern = sum(1 << index for index in range(8 * size) if index >> index_bit & 1)
+    return pattern.to_bytes(size, "little")
 
-    Returns None unless each of the weights 1, 2, 4 ... occurs exactly once.
+
+def _make_field(
+    keys: tuple[str | int, ...], full: int, values: list[int], *, flag: bool
+) -> BitField | None:
+    """Return the field with these values; None if they cannot be those of a field.
 
     Args:
         keys: the keys of the field.
-        pairs: (bit of the block, weight) for each bit of the value.
+        full: the value of the field if all bits of the block are set.
+        values: the values of the field in the blocks of `_make_pattern`.
         flag: whether the field is parsed as False or True.
     """
-    width = len(pairs)
-    signed = any(weight < 0 for _, weight in pairs)
-    targets = {}
-    for bit, weight in pairs:
-        magnitude = abs(weight)
-        if magnitude & (magnitude - 1) or (weight < 0) != (
-            signed and magnitude == 1 << (width - 1)
-        ):
-            return None
-        targets[bit] = magnitude.bit_length() - 1
-    if sorted(targets.values()) != list(range(width)) or not width:
+
+    def find_index(position: int) -> int:
+        """Return the index of the bit of the block that is at this position of the value."""
+        return sum((value >> position & 1) << bit for bit, value in enumerate(values))
+
+    signed = full == -1
+    indices = [find_index(0)]
+    if signed:
+        # Above the top bit, Python repeats the sign bit.
+        while (index := find_index(len(indices))) != indices[-1]:
+            indices.append(index)
+    else:
+        indices += [find_index(position) for position in range(1, full.bit_length())]
+    width = len(indices)
+    if len(set(indices)) < width or full != (-1 if signed else (1 << width) - 1):
         return None
+    targets = {index: position for position, index in enumerate(indices)}
     return BitField(keys, tuple(_iter_segments(targets)), width, signed, flag)
 
 
