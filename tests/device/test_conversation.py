@@ -464,7 +464,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         (
             b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\nshort",
             Http(1),
-            "94 bytes of the reply are missing",
+            "the reply lacks 94 bytes",
         ),
         (b"something else\r\n\r\n", Http(1), "/status: something else"),
         (b"", Http(1, timeout=0.1), "/status: "),
