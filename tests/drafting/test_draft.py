@@ -192,7 +192,7 @@ def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
         "# rises by 200 from frame to frame, in 399 of 399 steps, wraps at 36000: hundredths of"
         in text
     )
-    assert "# the value is between angle_4 of this frame and angle_4 of the next frame:" in text
+    assert "# the value is between angle_4 of this frame and angle_4 of" in text
     assert "# correct in 256 of 256 frames, probability of a coincidence: 1 in " in text
     assert "algorithm=Crc(width=8, poly=0x4D),\n" in text
     assert 'scan=OnWrap("angle_4"),' in text

@@ -136,7 +136,8 @@ def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
         tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", "."
     )
     assert "sensor missing: mark the test with" in done.stdout
-    assert "5 passed, 1 error" in done.stdout, done.stdout
+    # On a busy machine, a warning that a plugin loads slowly comes between them.
+    assert re.search("5 passed,( [0-9]+ warnings?,)? 1 error", done.stdout), done.stdout
     assert "failed" not in done.stdout, done.stdout
 
 

@@ -529,12 +529,12 @@ def test_commands_are_those_of_the_protocol() -> None:
     )
 
 
-def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
+def on_free_ports(sensor: ls.Sensor, said: bytes, timeout: float = SLACK) -> ls.Sensor:
     """Return the sensor on free ports, with this reply to `get_calibration`."""
     answers = {"get_calibration": [("answer", {"payload": said})]}
     links = {"data": Udp(free_port()), "control": Tcp(free_port())}
     patient = {
-        name: dataclasses.replace(command, timeout=SLACK)
+        name: dataclasses.replace(command, timeout=timeout)
         for name, command in sensor.commands.items()
     }
     return dataclasses.replace(
@@ -548,7 +548,7 @@ def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
 @pytest.mark.slow
 def test_angles_are_requested_on_opening(tmp_path: Path) -> None:
     said = "Laser id,Elevation,Azimuth\n" + "".join(f"{i},{16.5 - i},0.25\n" for i in range(1, 33))
-    unit, file = on_free_ports(XT32, said.encode()), angles(tmp_path / "own.csv", 32)
+    unit, file = on_free_ports(XT32, said.encode(), TIMEOUT_S), angles(tmp_path / "own.csv", 32)
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
     with virtual_port(unit, to=data) as port:
         with ls.open(port.path, unit) as device:
