@@ -100,6 +100,10 @@ def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
         return None  # a name, or bytes
     raw = info.raw(physical)
     lowest, highest = info.limits
+    turn = 1 << info.bits
+    if np.isclose(turn * abs(info.scale), FULL_TURNS.get(info.unit, 0.0)):
+        # Such an angle wraps without a change of direction: 360 degrees are sent as 0.
+        lowest, highest = -turn, turn
     beyond = physical[(raw < lowest) | (raw > highest)]
     if len(beyond):
         return float(beyond[0])

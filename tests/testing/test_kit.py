@@ -777,3 +777,20 @@ def test_angles_of_a_signed_field_are_turned_within_its_limits() -> None:
         simulation=Simulation(signed_sweep),
     )
     consistency.turned_angles_turn_the_points(SensorUnderTest(sensor), "data")
+
+
+@pytest.mark.parametrize("field", [Int16ul, Int16sl])
+def test_an_angle_of_exactly_one_turn_may_wrap(field: Any) -> None:
+    binary = Scaled(field, 360 / 65536, "deg")
+
+    def simulate(first: float) -> SensorUnderTest:
+        return SensorUnderTest(
+            sound.sensor(
+                sound.frame(sound.make_frame(first=binary, last=binary)),
+                simulation=Simulation(lambda number: {**sound.sweep(number), "first": first}),
+            )
+        )
+
+    consistency.sweep_values_fit_their_fields(simulate(359.999), "data")
+    with pytest.raises(ViolationError, match="returns 36000 deg, but the field can represent"):
+        consistency.sweep_values_fit_their_fields(simulate(36000.0), "data")
