@@ -303,4 +303,4 @@ def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPa
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)
     if failure.number is not None:
         return Fault(COUNT, path, end, f"at most {examined.limit}", failure.number, end)
-    return Fault(LENGTH, path, end, f"of 1 to {examined.limit} bytes", None, end)
+    return Fault(LENGTH, path, end, f"a frame of 1 to {examined.limit} bytes", None, end)

@@ -245,3 +245,10 @@ def test_a_complete_frame_with_trailing_bytes_is_named_by_its_own_type() -> None
         with pytest.raises(ls.WireError) as caught:
             sensor.parse(sensor.example(name) + b"\0")
         assert (caught.value.frame, caught.value.kind) == (name, "trailing bytes")
+
+
+def test_a_frame_above_its_maximum_length_is_named_with_the_length() -> None:
+    struct = Struct("count" / Int8ub, "ranges" / Array(this.count, Int16ub))
+    sensor = against_construct.sensor(struct, max_length=20)
+    with pytest.raises(ls.WireError, match="ranges: expected a frame of 1 to 20 bytes"):
+        sensor.parse(b"\x0f" + bytes(30))
