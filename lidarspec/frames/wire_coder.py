@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import LidarSpecError, PluginError, SpecError
+from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
@@ -197,7 +197,10 @@ class FormCoder(Coder):
     def find_end(self, data: bytes) -> int:
         """Return the size of the frame at the start of some bytes, as `WireForm.find_end` does."""
         with _form_errors(self.form.find_end):
-            return int(self.form.find_end(data))
+            size = int(self.form.find_end(data))
+            if size > len(data):
+                raise ValueError(f"returned {size} for {len(data)} bytes")
+        return size
 
     def find_size(self, data: bytes) -> int | None:
         size = self.find_end(data[: self._limit])
@@ -293,7 +296,7 @@ def _form_errors(method: Callable[..., Any]) -> Iterator[None]:
     """
     try:
         yield
-    except LidarSpecError:
+    except SpecError:
         raise
     except Exception as error:
         if method.__module__.partition(".")[0] == "lidarspec":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import lidarspec as ls
 from lidarspec import Sensor, SpecError
 from lidarspec.detect import identification
 from lidarspec.detect.sample_bytes import SampleBytes
-from lidarspec.errors import PluginError
+from lidarspec.errors import PluginError, WireError
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Decoded, Frame, NumberRun, Problem, Serial, TextRun, WireForm
 from lidarspec.testing.check import CheckTarget, iter_reports
@@ -93,34 +94,40 @@ def test_a_missing_method_is_named_at_declaration() -> None:
             Frame(Struct("id" / Int8ub), max_length=20, wire=form())  # type: ignore[abstract]
 
 
-BROKEN = {
-    "begins": lambda self, texts: None,
-    "find_end": lambda self, data: data.index(b"?"),
-    "decode": lambda self, data, next_runs: None,
-    "encode": lambda self, struct, runs: None,
+def raise_wire_error(self: object, data: bytes) -> int:
+    raise WireError("no end")
+
+
+BROKEN: dict[str, dict[str, Any]] = {
+    "begins": {"begins": lambda self, texts: None},
+    "find_end": {"find_end": lambda self, data: data.index(b"?")},
+    "find_end with a WireError": {"find_end": raise_wire_error},
+    "find_end beyond the data": {"find_end": lambda self, data: len(data) + 1},
+    "decode": {"decode": lambda self, data, next_runs: None},
+    "encode": {"encode": lambda self, struct, runs: None},
 }
 
 
-def make_broken_sensor(method: str) -> Sensor:
-    """Return a sensor with a wire form with one method that raises or returns None."""
-    form = type("Broken", (HexLines,), {method: BROKEN[method]})()
+def make_broken_sensor(fault: str) -> Sensor:
+    """Return a sensor with a wire form with one method that has a fault."""
+    form = type("Broken", (HexLines,), BROKEN[fault])()
     frame = Frame(Struct("id" / Int8ub, "value" / Int16ub), max_length=20, wire=form)
     return replace(SENSOR, frames={"state": frame})
 
 
-@pytest.mark.parametrize("method", BROKEN)
-def test_a_failing_method_is_named_with_its_file(method: str) -> None:
-    sensor = make_broken_sensor(method)
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_failing_method_is_named_with_its_file(fault: str) -> None:
+    sensor = make_broken_sensor(fault)
     with pytest.raises(PluginError, match=r"wire form, .*test_own_wire_form.py:"):
         sensor.build("state", id=1, value=2)
 
 
-@pytest.mark.parametrize("method", ["begins", "find_end", "decode"])
+@pytest.mark.parametrize("fault", [fault for fault in BROKEN if fault != "encode"])
 def test_a_broken_wire_form_does_not_stop_other_sensors(
-    method: str, monkeypatch: pytest.MonkeyPatch
+    fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed = {
-        "acme-hex": make_broken_sensor(method),
+        "acme-hex": make_broken_sensor(fault),
         "ldrobot-ld06": ls.sensor("ldrobot-ld06"),
     }
     monkeypatch.setattr(identification, "sensors", lambda: installed)
@@ -131,6 +138,6 @@ def test_a_broken_wire_form_does_not_stop_other_sensors(
     assert verdict.sensor is installed["ldrobot-ld06"]
     (fitting,) = identification.find_fitting_sensors(frames[:1], datagrams=False)
     assert fitting is installed["ldrobot-ld06"]
-    fault = identification.find_nearest_fault(frames[0][:-1] + b"?")
-    assert fault is not None
-    assert fault.sensor == "ldrobot-ld06"
+    nearest = identification.find_nearest_fault(frames[0][:-1] + b"?")
+    assert nearest is not None
+    assert nearest.sensor == "ldrobot-ld06"
