@@ -6,6 +6,7 @@ The modules that only some of these verbs need are imported inside functions, so
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -143,7 +144,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     if as_json:
         frames = {name: _frame_to_dict(frame) for name, frame in sensor.frames.items()}
-        commands = {name: _command_to_dict(sensor, name) for name in sensor.commands}
+        commands = {name: _command_to_dict(sensor, name, sensor_id) for name in sensor.commands}
         emit_json({**_sensor_to_dict(sensor), "frames": frames, "commands": commands}, output)
         return
     from lidarspec.explaining.formatting import (
@@ -172,7 +173,9 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
             for name, fact in sensor.reported.items()
         ]
         parts.append(f"  reports {', '.join(facts)}")
-    parts += [f"  command {name}{_format_command(sensor, name)}" for name in sensor.commands]
+    parts += [
+        f"  command {name}{_format_command(sensor, name, sensor_id)}" for name in sensor.commands
+    ]
     for name, frame in sensor.frames.items():
         rows = [
             [row.offset, row.size, row.type, row.field, row.unit, row.meaning]
@@ -317,7 +320,14 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
+def _command_to_dict(sensor: Sensor, name: str, sensor_id: str) -> Mapping[str, Any]:
+    """Return the description of a command, and print a remark if its frame cannot be built.
+
+    Args:
+        sensor: the sensor.
+        name: the name of the command.
+        sensor_id: the sensor as the user named it, for the remark.
+    """
     command = sensor.commands[name]
     args = {name: argument.to_dict() for name, argument in command.arguments.items()}
     frame = ""
@@ -325,7 +335,8 @@ def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
         try:
             frame = sensor.command(name).hex(" ")
         except LidarSpecError as error:
-            note(f"command {name} cannot be built: {error}; next: lidarspec check {sensor.id}")
+            check = f"lidarspec check {shlex.quote(sensor_id)}"
+            note(f"command {name} cannot be built: {error}; next: {check}")
     return {
         "frame": command.frame,
         "arguments": args,
@@ -335,10 +346,10 @@ def _command_to_dict(sensor: Sensor, name: str) -> Mapping[str, Any]:
     }
 
 
-def _format_command(sensor: Sensor, name: str) -> str:
+def _format_command(sensor: Sensor, name: str, sensor_id: str) -> str:
     from lidarspec.explaining.formatting import describe_argument
 
-    command = _command_to_dict(sensor, name)
+    command = _command_to_dict(sensor, name, sensor_id)
     args = "".join(
         f" {argument}={describe_argument(sensor, name, argument)}"
         for argument in sensor.commands[name].arguments
