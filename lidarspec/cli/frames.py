@@ -252,7 +252,7 @@ class FrameSelection:
         at: int | None = None,
         stretch: str | None = None,
     ) -> None:
-        self._find_sensor = sensor
+        self._sensor = sensor
         self._frame = frame
         self._count = math.inf if count is None else count
         self._bad = bad
@@ -299,7 +299,7 @@ class FrameSelection:
 
     def _iter_within(self, piece: InputPiece) -> Iterator[tuple[InputPiece, Explanation]]:
         try:
-            for part, what in explain_piece(self._find_sensor, piece, self._frame):
+            for part, what in explain_piece(self._sensor, piece, self._frame):
                 if self._bad and what.is_filler:
                     continue
                 if self._frame not in (None, what.frame):
@@ -316,7 +316,7 @@ class FrameSelection:
                     if self._bad and self.damaged >= self._count:
                         return
         except WireError as fault:
-            raise suggest(fault, f"lidarspec show {self._find_sensor.id}") from None
+            raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
     def conclude(self, sample: SampleBytes) -> None:
         """Print the numbers of frames and other bytes, at the end of the input.
@@ -338,12 +338,12 @@ class FrameSelection:
                     others = ""
                 raise WireError(
                     f"no {self._frame} frame in {sample.source}{others}",
-                    sensor=self._find_sensor.id,
+                    sensor=self._sensor.id,
                 )
             raise (
-                no_frame_error(self._find_sensor, sample)
+                no_frame_error(self._sensor, sample)
                 if self._fault is None
-                else suggest(self._fault, f"lidarspec show {self._find_sensor.id}")
+                else suggest(self._fault, f"lidarspec show {self._sensor.id}")
             )
         if self._bad or self.others or ((self.damaged or self.unframed) and self._shown > 1):
             note(", ".join(self._iter_counts()))

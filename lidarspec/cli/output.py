@@ -82,7 +82,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._due = 0.0
         self._unit = unit
         self._period = period
-        self._make_bar: Bar | None = None
+        self._bar: Bar | None = None
 
     def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
         """Show a text if an update is due.
@@ -95,20 +95,20 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         if not self._is_shown or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + self._period
-        if self._make_bar is None:
-            self._make_bar = _make_bar(is_measured=done is not None)
-        (task,) = self._make_bar.tasks
+        if self._bar is None:
+            self._bar = _make_bar(is_measured=done is not None)
+        (task,) = self._bar.tasks
         rate = f"{self._unit(task.speed)}/s" if task.speed else ""
         completed, total = done or (0, 0)
-        self._make_bar.update(
+        self._bar.update(
             task.id,
             description=escape_controls(text()),
             completed=completed,
             total=total,
             rate=rate,
         )
-        self._make_bar.start()
-        self._make_bar.refresh()
+        self._bar.start()
+        self._bar.refresh()
 
     def show_progress(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
         """Run a task, print its remarks, and show progress while it runs.
@@ -130,9 +130,9 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
     def clear(self) -> None:
         """Remove the progress line."""
-        if self._make_bar is not None:
-            self._make_bar.stop()
-            self._make_bar = None
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
             self._due = 0.0
 
     def __exit__(self, *_: object) -> None:
