@@ -180,7 +180,9 @@ def _sum_up_recording(
             raise suggest(
                 CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
             )
-        raise suggest(WireError(f"{source} contains no data"), "lidarspec record --help")
+        raise suggest(
+            WireError(f"{source} contains no data from a sensor"), "lidarspec record --help"
+        )
     stats = device.stats if device is not None else None
     summary = f"{recorder.path}: {_describe_recording(task, recorder)}"
     if stats is not None and (damage := _describe_damage(stats)):

@@ -331,11 +331,14 @@ def test_unrecordable_sources_give_a_reason(stream: Path, datagrams: Path, tmp_p
     )
     assert not (tmp_path / "it.lsr").exists()
     (tmp_path / "empty.bin").touch()
-    assert (
-        "contains no data"
-        in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
-    )
-    assert not (tmp_path / "it.lsr").exists()
+    with Recorder(tmp_path / "sent.lsr") as recorder:
+        recorder.write(Chunk(b"\x01"), "out")
+    for name in ("empty.bin", "sent.lsr"):
+        assert (
+            "contains no data from a sensor"
+            in ran("record", tmp_path / name, "-o", tmp_path / "it.lsr", code=4).stderr
+        )
+        assert not (tmp_path / "it.lsr").exists()
 
 
 def test_a_silent_source_leaves_no_empty_file(tmp_path: Path) -> None:
