@@ -300,9 +300,10 @@ def _udp_checksum_over_ipv6(
 
 
 def _internet_checksum(words: bytes) -> int:
-    """Return the ones' complement of the ones' complement sum of 16-bit words.
+    """Return the complement of the ones' complement sum of 16-bit words.
 
-    The sum is the big-endian number of all bytes modulo 0xFFFF. A sum of 0 is written as 0xFFFF.
+    The ones' complement sum is the big-endian number of all bytes modulo 0xFFFF, or 0xFFFF if the
+    remainder is 0.
     """
     return 0xFFFF - (int.from_bytes(words) % 0xFFFF or 0xFFFF)
 

@@ -299,7 +299,10 @@ def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool)
 
 
 def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
-    """Return whether each byte at a place has enough distinct values for a CRC."""
+    """Return whether each byte of a possible checksum varies enough for a CRC.
+
+    A byte varies enough if it has enough distinct values in the sample frames.
+    """
     if len(samples) < 2:
         return True
     min_distinct = max(min(len(samples) // 2, 24), 2)

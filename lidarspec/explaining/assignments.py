@@ -14,7 +14,7 @@ from typing import Any
 
 from lidarspec.errors import OutOfRange, UnknownCommand, UnknownField, UsageError
 from lidarspec.frames.commands import find_argument_slot
-from lidarspec.frames.encode import read_given
+from lidarspec.frames.encode import read_given_value
 from lidarspec.frames.field_paths import Steps, is_index, put_value, split_path
 from lidarspec.frames.schema import Schema
 from lidarspec.sensor_operations import Sensor
@@ -154,7 +154,7 @@ def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str)
     if isinstance(declared, int):
         return declared
     try:
-        return int(evaluate(declared, functools.partial(read_given, given, table.fields)))  # type: ignore[arg-type]
+        return int(evaluate(declared, functools.partial(read_given_value, given, table.fields)))  # type: ignore[arg-type]
     except Exception:
         target: Any = given
         for name in path.removesuffix("[]").split("."):

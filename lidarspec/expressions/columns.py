@@ -202,8 +202,8 @@ class Column(NDArrayOperatorsMixin):
     def on(self, *axes: str) -> Column:
         """Return the same values along other arrays of the frame.
 
-        If more arrays are named than the column has, the column uses the innermost of them. If a
-        named array is longer than the column, the missing elements are nan.
+        The values are put along the innermost named arrays, one array for each axis of the column.
+        If such an array is longer than the axis, the missing elements are nan.
 
         Args:
             axes: the paths or the last names of the arrays.

@@ -556,7 +556,7 @@ def set_count(
         return
     holder, name = _find_holder(given, path)
     if isinstance(holder, dict) and holder.get(name) is None:
-        read = functools.partial(read_given, given, fields)
+        read = functools.partial(read_given_value, given, fields)
         holder[name] = _find_count(formula, read, holder, name, value, fields[path], axis)
 
 
@@ -651,7 +651,7 @@ def list_paths(root: Node) -> frozenset[str]:
     return frozenset(".".join(names[:depth]) for names in split for depth in range(len(names) + 1))
 
 
-def read_given(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
+def read_given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
     """Return a given value of a frame for a formula (see `lidarspec.spec.tree.Read`).
 
     Raises:

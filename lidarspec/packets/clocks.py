@@ -369,8 +369,8 @@ def clock_terms(
 ) -> list[tuple[str, Any, Any, int]]:
     """Return (path, step, zero, limit) of the fields that add up to a clock.
 
-    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. Raw values up to `limit`
-    cannot overflow; `limit` is 0 if `step` or `zero` is a fraction.
+    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. `limit` is the largest
+    raw value whose ns fit into 64 bits. It is 0 if `step` or `zero` is a fraction.
 
     Raises:
         SpecError: if a field has no unit of time, or does not have one value in each packet.

@@ -6,10 +6,10 @@ is late. Duplicates are dropped, and so are packets that arrive after a later pa
 At the start, `WINDOW` packets are held, because the first packet to arrive may not be the first
 that was sent.
 
-`Packets.order` is the sort key. With a counter, it is the index. With a clock alone, it is a time.
-The index and the breaks are then found in the sorted packets, so that scans do not depend on the
-order of arrival. A clock without a declared pace does not show that a packet is missing. With such
-a clock, `WINDOW` packets are always held.
+`Packets.order` is the sort key. It is the index of the packets if the sensor has a counter, else
+their time. If it is a time, the index and the places of missing packets are computed after sorting,
+so that scans do not depend on the order of arrival. A clock without a declared pace does not show
+that a packet is missing. With such a clock, `WINDOW` packets are always held.
 """
 
 from __future__ import annotations

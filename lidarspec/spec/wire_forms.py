@@ -849,7 +849,7 @@ class Echoes:
         Echoes of 0 at the end of a step are left out.
 
         Raises:
-            SpecError: if the characters are not whole steps.
+            SpecError: if `characters` does not consist of whole steps.
         """
         room = self.most * self.size
         if len(characters) % room:

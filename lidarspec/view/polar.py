@@ -110,7 +110,7 @@ def _draw_from_side(
 ) -> tuple[CellGrid, int]:
     """Return the view from the right side, and the magnification of heights.
 
-    Forward points to the right. The points are in the vertical middle of the view.
+    The forward direction is to the right. The points are in the vertical middle of the view.
     """
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale

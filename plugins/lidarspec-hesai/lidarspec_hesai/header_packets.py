@@ -43,7 +43,9 @@ def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) 
         "block_count" / Int8ul,
         "first_return" / Int8ul * "number of the return in the first block of each firing",
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "size of one distance step",
-        "return_count" / Int8ul * "returns per firing; some models send the maximum number",
+        "return_count"
+        / Int8ul
+        * "number of returns per firing; some models always send their largest number",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
     ]
     channel = Struct(

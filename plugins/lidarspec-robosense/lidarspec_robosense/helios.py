@@ -269,7 +269,7 @@ HELIOS_32 = dataclasses.replace(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(
-            "both halves of a block are equal, or one packet arrives every 1.33 ms",
+            "either both halves of a block are equal, or one packet arrives every 1.33 ms",
             has_equal_halves,
         ),
     },
