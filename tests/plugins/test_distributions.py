@@ -253,8 +253,7 @@ def test_check_names_both_plugins_with_one_id(site: Path, name: str) -> None:
         if finding["code"] == "LS005"
     ]
     assert taken["what"] == (
-        "lidarspec-broken has acme-x1: another sensor has this id already:"
-        " that of acme-lidars:acme_lidars"
+        "lidarspec-broken: acme-x1: this id is already used by acme-lidars:acme_lidars"
     )
     assert taken["path"] == "duplicate = lidarspec_broken.duplicate"
     source = reports["acme-x1"]["picture"].get("source")
