@@ -221,7 +221,7 @@ PROPERTIES = (
         "data",
         "LS506",
         lacks=_no_sweep,
-        unless=(*FAILING_RULES, "LS502"),
+        unless=(*FAILING_RULES, "LS216", "LS502"),
     ),
     Property(geometry.counters_run_on, "data", "LS509", lacks=_no_sweep, unless=FAILING_RULES),
     Property(

@@ -794,3 +794,9 @@ def test_an_angle_of_exactly_one_turn_may_wrap(field: Any) -> None:
     consistency.sweep_values_fit_their_fields(simulate(359.999), "data")
     with pytest.raises(ViolationError, match="returns 36000 deg, but the field can represent"):
         consistency.sweep_values_fit_their_fields(simulate(36000.0), "data")
+
+
+def test_an_unknown_field_of_the_scan_rule_is_reported_once() -> None:
+    sensor = sound.sensor(scan=OnChange("nope"))
+    (report,) = iter_reports(CheckTarget([sensor]), sensor.id, examples=3)
+    assert [(finding.code, finding.path) for finding in report.findings] == [("LS216", "scan")]
