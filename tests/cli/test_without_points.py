@@ -116,7 +116,7 @@ def test_a_simulation_follows_its_commands(tmp_path: Path) -> None:
     target = tmp_path / "recorded.lsr"
     summary = ran("record", f"sim:{RECEIVER}?rate=max", "-n", "20", "-o", target).stderr
     assert "packets" in summary
-    assert "decoding fails" not in summary
+    assert "decoding failed" not in summary
 
 
 @pytest.mark.parametrize("form", ["wireshark", "c", "ksy", "md", "svg", "json", "pyi"])
