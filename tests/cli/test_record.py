@@ -167,7 +167,8 @@ def test_recorded_replayed_and_recorded_again_it_is_the_same(
             921600,
         )
         times = [item.at for item in recording if item.direction == "in" and item.at]
-    assert 0.19 < (times[-1] - times[0]) / 1e9 < 0.2 * SLACK
+    # The stream lasts 0.2 s. The first frames may wait for a busy reader.
+    assert 0.1 < (times[-1] - times[0]) / 1e9 < 0.2 * SLACK
     with ls.open(stream) as one, ls.open(again) as other:
         assert [p.raw.tobytes() for p in one.packets()] == [
             p.raw.tobytes() for p in other.packets()

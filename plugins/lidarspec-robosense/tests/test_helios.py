@@ -371,8 +371,8 @@ def test_a_packet_of_another_model_is_a_warning(tmp_path: Path) -> None:
     with ls.open(path, SENSOR) as device:
         assert list(device.scans())
         told = (
-            "read as robosense-helios16p, but the frames are those of robosense-helios5515 (type 6,"
-            " Helios-5515); next: lidarspec detect"
+            "decoded as robosense-helios16p, but the frames are those of robosense-helios5515"
+            " (type 6, Helios-5515); next: lidarspec detect"
         )
         assert [told in warning for warning in device.warnings] == [True, False]
     path.write_bytes(b"".join(frames))
