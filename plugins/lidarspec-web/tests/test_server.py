@@ -113,7 +113,7 @@ def test_ten_pages_see_one_source(tmp_path: Path) -> None:
         for page in pages:
             assert page.scan(most=5000)[1]["x"].size
         assert station.broadcast.device.stats.queue_dropped == 0
-    assert station.said[-1].endswith("0 open")
+    assert station.said[-1].endswith("open pages: 0")
 
 
 @pytest.mark.slow
