@@ -223,7 +223,7 @@ def hostile(inputs: Inputs) -> Work:
     families = {
         tuple(sensor.frames): sensor
         for sensor in sorted(ls.sensors().values(), key=line_rate)
-        if line_rate(sensor)
+        if line_rate(sensor) and sensor.has_points
     }
     tasks: dict[str, tuple[ls.Sensor, list[bytes]]] = {}
     length = HOSTILE // QUICKER if inputs.is_quick else HOSTILE
