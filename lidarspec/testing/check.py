@@ -1,12 +1,8 @@
 """Check a sensor, a file or a distribution with every property and every rule.
 
-A name is resolved to a `CheckTarget`: the sensors to check, the errors of sensors that cannot be
-loaded, and the modules that declare the sensors. The source of these modules is parsed for two
-purposes. One is to find mistakes that are valid Python but have an unintended effect
-(`check_texts`). The other is to find the lines of fields, frames, functions, commands and sensors,
-so that a finding names file and line (`SourceTexts`). Then the declaration of each sensor is
-checked, and its properties in the order of `PROPERTIES`. The `Report` has the findings that the
-declaration does not acknowledge.
+`find_target` resolves a name to a `CheckTarget`. `iter_reports` checks the sensors of the target.
+`check_texts` finds mistakes in the source of a plugin that are valid Python but have an unintended
+effect. `SourceTexts` adds file and line to findings.
 """
 
 from __future__ import annotations
@@ -54,8 +50,7 @@ class CheckTarget:
         sensors: the sensors that could be loaded.
         findings: the reasons why sensors could not be loaded.
         files: the modules that declare the sensors.
-        vectors: the file of golden vectors; None if there is no such file. It is next to the
-            modules, in the source folder of the distribution, or in its folder of tests.
+        vectors: the file of golden vectors; None if there is no such file.
         family: the ids of all sensors of the checked file or distribution, which share the file of
             vectors.
     """
@@ -211,11 +206,7 @@ def _find_distribution_target(entries: list[EntryPoint]) -> CheckTarget:
 
 
 def _check_rivals(sensors: list[Sensor]) -> list[Finding]:
-    """Return a finding for each id or alias that several plugins use.
-
-    The path of the finding names the plugin whose sensor was not registered because of the
-    conflict.
-    """
+    """Return a finding for each id or alias that several plugins use."""
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
         plugin
@@ -247,9 +238,7 @@ def _check_taken_ids(sensors: list[Sensor], file: Path) -> list[Finding]:
 
 
 def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
-    """Return the sensors of one plugin.
-
-    The hooks of all installed plugins are applied to the sensors.
+    """Return the sensors of one plugin, changed by the hooks of all plugins.
 
     Raises:
         Exception: any error of the plugin.
@@ -321,10 +310,7 @@ def _find_loading_rule(error: BaseException, cause: BaseException) -> str:
 
 
 def find_module_files(value: str) -> list[Path]:
-    """Return the source files of the module or package of an entry point.
-
-    Returns an empty list if there is none.
-    """
+    """Return the source files of the module or package of an entry point, if any."""
     try:
         module = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
     except (Exception, SystemExit):
@@ -354,10 +340,7 @@ Location = tuple[str, int]
 
 
 class SourceTexts:
-    """Finds the file and line of declarations in the source of some modules.
-
-    Fields are found by the names in their paths, all other declarations by kind and name.
-    """
+    """Finds the file and line of declarations in the source of some modules."""
 
     def __init__(self, trees: Mapping[str, ast.Module]) -> None:
         self._iter_fields = [
@@ -393,11 +376,7 @@ class SourceTexts:
         )
 
     def _find_field(self, parts: tuple[str, ...]) -> Location | None:
-        """Return the location of a field in the source; None if there is no such field.
-
-        If several fields of the source match the end of the path `parts`, the field with the
-        longest path is selected.
-        """
+        """Return the location of a field in the source; None if there is no such field."""
         fitting = [
             (len(chain), location)
             for chain, location in self._iter_fields
@@ -428,10 +407,7 @@ def _find_function(frame: str, name: str, sensor: Sensor | None) -> Location | N
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Yield (kind, name, line) of each text that may name a part of a sensor.
-
-    The kind is "key" for the key of a dict, "frame" for a frame type, or "sensor" for an id.
-    """
+    """Yield (kind, name, line) of each text that may name a part of a sensor."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):
@@ -568,11 +544,7 @@ def _is_silent(body: list[ast.stmt]) -> bool:
 
 
 def _is_short_write(call: ast.Call, *, sockets: bool) -> bool:
-    """Return whether a call may write only a part of its data without an error.
-
-    Args:
-        sockets: whether the module uses sockets.
-    """
+    """Return whether a call may write only a part of its data without an error."""
     match call.func:
         case ast.Attribute(value=ast.Name(id="os"), attr="write"):
             return True
@@ -636,8 +608,7 @@ def iter_reports(
         strategies: "frame.field" -> a hypothesis strategy or function for its raw value. It is
             needed for fields whose valid values cannot be derived from the spec.
         vectors: the file of golden vectors; by default the file of the target.
-        tested: related models that are tested as well. Parts that they share with a sensor are not
-            tested again.
+        tested: related models; parts that they share with a sensor are not tested again.
         watch: called before each step with its name, the number of finished properties and the
             total number of properties.
     """
@@ -669,13 +640,7 @@ def iter_reports(
 
 
 def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -> None:
-    """Report the progress of one sensor as progress of the whole check.
-
-    Args:
-        before: number of properties of all sensors before this one.
-        total: number of properties of all sensors.
-        done: number of finished properties of this sensor.
-    """
+    """Report the progress of one sensor as progress of the whole check."""
     watch(text, before + done, total)
 
 

@@ -1,8 +1,4 @@
-"""Assertions about point clouds: the conventions of a cloud, and the equality of two clouds.
-
-Two evaluations of the same packets round differently, because NumPy uses different code for
-batches and for single packets. `assert_same_places` accepts only these differences.
-"""
+"""Assertions about point clouds: the conventions of a cloud, and the equality of two clouds."""
 
 from __future__ import annotations
 
@@ -23,10 +19,7 @@ STAMP_TOLERANCE_NS = 1000
 
 
 def assert_well_formed(cloud: PointCloud) -> None:
-    """Fail unless the cloud keeps the conventions of types, angles and REP-117.
-
-    REP-117 requires that points without a return have no coordinates.
-    """
+    """Fail unless the cloud keeps the conventions of types, angles and REP-117."""
     valid = cloud.valid
     assert cloud.x.dtype == cloud.y.dtype == cloud.z.dtype == cloud.range.dtype == np.float32
     assert cloud.time.dtype == np.float64
@@ -42,8 +35,8 @@ def assert_well_formed(cloud: PointCloud) -> None:
 def assert_same_places(cloud: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
     """Fail unless both clouds have the same columns, masks, positions and times.
 
-    The tolerance of coordinates grows with the range. Azimuths that differ by a full circle are
-    equal. Times may differ by a microsecond. All other columns have to be equal.
+    The tolerance of coordinates grows with the range. The tolerance of times is a microsecond. All
+    other columns have to be equal.
 
     Args:
         ulps: tolerance of coordinates and angles in units in the last place.
@@ -85,8 +78,6 @@ def _is_close(
     first: NDArray[Any], second: NDArray[Any], tolerance: Any, full_circle: float = 0.0
 ) -> bool:
     """Return whether two arrays differ by no more than a tolerance.
-
-    NaN equals NaN, and an infinity equals the same infinity.
 
     Args:
         full_circle: the period of angles; 0 compares plain numbers.

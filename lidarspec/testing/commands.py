@@ -29,8 +29,8 @@ def make_arguments(subject: SensorUnderTest, name: str, share: float) -> dict[st
     """Return a valid value for each argument of a command, by name.
 
     Args:
-        share: from 0 to 1: the position of a number between its limits, and the length of a text
-            relative to its maximum length.
+        share: position of a number between its limits, from 0 to 1; for a text, its length relative
+            to the maximum length.
     """
     return {
         key: _make_argument(subject.sensor, name, key, share)
@@ -55,10 +55,7 @@ def _make_argument(sensor: Sensor, name: str, key: str, share: float) -> Any:
 
 
 def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing a command's frame returns its fixed values and arguments.
-
-    Arguments may differ by half a step. Building the parsed values must give the same frame.
-    """
+    """Check that parsing a command's frame returns its fixed values and arguments."""
     for share in (0.0, 0.37, 1.0):
         try:
             _check_parses_back(subject.sensor, name, make_arguments(subject, name, share))
@@ -176,11 +173,7 @@ def replies_can_match(subject: SensorUnderTest, name: str) -> None:
 
 
 def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
-    """Check that the simulated sensor sends the documented reply before the timeout.
-
-    Three sets of arguments are tried; one reply is enough. A missing reply is accepted if `answers`
-    depends on the arguments, because the sensor need not support the tried values.
-    """
+    """Check that the simulated sensor sends the documented reply before the timeout."""
     command = subject.sensor.commands[name]
     if command.frame is None or not command.replies:
         return

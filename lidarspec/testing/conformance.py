@@ -1,7 +1,7 @@
 """A pytest test that a sensor conforms, with all checks of `lidarspec check`.
 
 Derive a class from `SensorConformance` and name the sensor, or call `assert_conformance` in your
-own test. In both cases there is one test, and its failure lists all findings.
+own test. A failure lists all findings.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ def assert_conformance(
 ) -> list[Report]:
     """Fail with all findings of `lidarspec check`, if there are any; return the reports.
 
-    Findings of rule LS005 are ignored. They report that another installed plugin uses the same id,
-    which is a fault of the environment, not of the sensor.
+    Findings of rule LS005 are ignored, because another installed plugin causes them.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
@@ -39,8 +38,8 @@ def assert_conformance(
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`. It is needed for fields whose valid values cannot be derived.
         vectors: a file of golden vectors; by default the file that `check` finds.
-        tested: related models that are tested as well. Frames and functions that they share with
-            the sensor are not tested again.
+        tested: related models; frames and functions that they share with the sensor are not tested
+            again.
     """
     __tracebackhide__ = True
     if isinstance(sensor, Sensor):

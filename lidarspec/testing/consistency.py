@@ -1,8 +1,4 @@
-"""Checks that the parts of a declaration agree: angles, points, clock and times.
-
-Packets are made from the sensor's `sweep`. Some packets are far into the sweep, because the first
-packets seldom cross the full circle or reach the time at which the clock wraps.
-"""
+"""Checks that the parts of a declaration agree: angles, points, clock and times."""
 
 from __future__ import annotations
 
@@ -61,10 +57,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
 
 
 def sweep_values_fit_their_fields(subject: SensorUnderTest, name: str) -> None:
-    """Check that angles and signed fields can represent the values of the sweep.
-
-    Other unsigned fields are not checked, because counters and clocks wrap.
-    """
+    """Check that angles and signed fields can represent the values of the sweep."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return
@@ -111,11 +104,7 @@ def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
 
 
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
-    """Check that the times of points agree with the clock.
-
-    The times of the points of n packets may cover at most n + `MAX_SPREAD_STEPS` steps. A step is
-    the mean time from packet to packet by the clock.
-    """
+    """Check that the times of points agree with the clock."""
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
         return
@@ -196,8 +185,6 @@ def _turn_angles(
 ) -> dict[str, Any]:
     """Return a packet's values with `shift` added to its angles.
 
-    An angle that its field cannot represent becomes negative: 350 degrees become -10 degrees.
-
     Args:
         angles: the fields of the angles, by path.
         full: the full circle, in the unit of the angles.
@@ -229,10 +216,7 @@ def _read_azimuths(
 def _angles_between(
     first: NDArray[np.float64] | None, second: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
-    """Return the differences of two arrays of azimuths, in radians.
-
-    Returns None if one of them is None, or if their shapes differ.
-    """
+    """Return the differences of two arrays of azimuths in radians, or None."""
     if first is None or second is None or first.shape != second.shape:
         return None
     finite = np.isfinite(first) & np.isfinite(second)

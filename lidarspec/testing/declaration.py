@@ -1,7 +1,4 @@
-"""Checks of a declaration that need no bytes from a real sensor.
-
-They concern units, sources, lengths, sync bytes, coverage by checksums, and `plausible`.
-"""
+"""Checks of a declaration that need no bytes from a real sensor."""
 
 from __future__ import annotations
 
@@ -190,11 +187,7 @@ def _check_clock(sensor: Sensor) -> Findings:
 
 
 def _check_options(sensor: Sensor) -> Findings:
-    """Yield findings for options without effect.
-
-    An option has no effect if `configure` never reads it, or if all its choices give the same
-    sensor.
-    """
+    """Yield findings for options without effect."""
     function = sensor.configure.function
     if isinstance(function, partial):
         plain = function.func
@@ -276,11 +269,7 @@ def _is_reply(sensor: Sensor, name: str) -> bool:
 
 
 def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    """Yield a finding if `max_length` is much larger than random frames.
-
-    If `max_length` is too large, the decoder waits too long for the end of a frame with a corrupt
-    length.
-    """
+    """Yield a finding if `max_length` is much larger than random frames."""
     if get_codec(frame).schema.endings:
         return  # the length of a text is not declared, and random texts are short
     sizes = list[int]()
@@ -302,10 +291,7 @@ def _check_max_length(subject: SensorUnderTest, name: str, frame: Frame) -> Find
 
 
 def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
-    """Yield the lengths of examples and of a simulated frame.
-
-    The simulated frame comes after the first examples, because it takes long and is seldom needed.
-    """
+    """Yield the lengths of examples and of a simulated frame."""
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_MEASURED_EXAMPLES))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
         yield len(frame_simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
@@ -317,10 +303,7 @@ def _iter_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
 
 
 def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
-    """Yield the lengths of valid frames with a large value in one header field.
-
-    Random headers seldom have large counts, and a `sweep` may have the same count in all packets.
-    """
+    """Yield the lengths of valid frames with a large value in one header field."""
     frame = subject.sensor.frames[name]
     engine = get_codec(frame)
     if not isinstance(engine, CompiledCodec) or engine.schema.has_measured_sizes:
@@ -342,10 +325,7 @@ def _iter_raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
 
 
 def _check_names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    """Yield findings for fields that are named like measured values but have no unit.
-
-    Fields that are declared as pure numbers, by `Scaled(..., "")`, give no finding.
-    """
+    """Yield findings for fields that are named like measured values but have no unit."""
     pure = _find_pure_numbers(frame) | (_find_range_fields(subject, name) if frame.data else set())
     for path, info in get_codec(frame).schema.all_fields.items():
         if (
@@ -379,9 +359,7 @@ def _find_range_fields(subject: SensorUnderTest, name: str) -> set[str]:
 
 
 def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
-    """Return the paths of fields that are declared as pure numbers.
-
-    These are `Scaled` fields with an empty unit.
+    """Return the paths of the `Scaled` fields that have an empty unit.
 
     Args:
         with_scale: whether to include fields with a scale, such as components of a direction.
@@ -420,11 +398,7 @@ def _check_plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findi
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
-    """Yield findings for fields that no checksum covers, in a frame with checksums.
-
-    Fields before the first covered byte are not reported, because many checksums begin after the
-    header.
-    """
+    """Yield findings for fields that no checksum covers, in a frame with checksums."""
     reported: set[str] = set()
     for layout in layouts:
         if not layout.seals:
@@ -533,10 +507,7 @@ def _check_points(subject: SensorUnderTest, name: str) -> Findings:
 
 
 def _check_intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
-    """Yield a finding if the intensity seems to come from the wrong field.
-
-    This is the case if another field is named like an intensity and no column uses it.
-    """
+    """Yield a finding if the intensity seems to come from the wrong field."""
     own = [
         find_field_of_node(subject, name, node)
         for node in find_fields(getattr(result, "intensity", None))

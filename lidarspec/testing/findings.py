@@ -1,8 +1,6 @@
 """The findings of `lidarspec check` and the test kit, and their rules.
 
-The rules are a table, which a test compares with the reference page. A property that does not hold
-raises `ViolationError`, mostly by `require`; the exception becomes a `Finding`. At the end,
-`list_unacknowledged` removes the findings that a declaration acknowledges with a reason.
+A property that does not hold raises `ViolationError`, which has a `Finding`.
 """
 
 from __future__ import annotations
@@ -223,11 +221,7 @@ class ViolationError(AssertionError):
 
 
 def require(holds: object, code: str, what: str, path: str = "") -> None:
-    """Raise a `ViolationError` if `holds` is false.
-
-    Raises:
-        ViolationError: with this code, text and path.
-    """
+    """Raise a `ViolationError` with this code, text and path if `holds` is false."""
     if not holds:
         raise ViolationError(code, what, path)
 
@@ -236,8 +230,8 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:
-        whole: whether all rules were checked. If they were, each acknowledgement without a finding
-            is itself reported as a finding.
+        whole: whether all rules were checked, so that each acknowledgement without a finding can be
+            reported.
     """
     given = {
         "": sensor.acknowledged,

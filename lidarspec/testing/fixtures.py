@@ -34,8 +34,8 @@ def virtual_port(
         sensor: an id or a Sensor.
         to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; with TCP port 0, a free port is
             chosen.
-        link: the name of a symbolic link to the pseudo-terminal. It stays valid if the sensor is
-            unplugged and plugged in again. The default is a link in a temporary folder.
+        link: the name of a symbolic link to the pseudo-terminal, which stays valid when the sensor
+            is unplugged; by default a link in a temporary folder.
         scene: the surroundings of the sensor; by default a random room with a walking person.
         seed: seed of the scene, the faults and the fillers.
         rate: speed relative to real time; with `inf`, the sensor sends as fast as the reader reads.
@@ -44,8 +44,9 @@ def virtual_port(
 
     Yields:
         An object with the attributes `path` (to open) and `device` (`device.commands_received`
-        lists the received commands), and the methods `wait_for_commands(names)`, `unplug`, `plug`,
-        `jump_clock(seconds)`, `delay(seconds)` and, with virtual time, `advance(seconds)`.
+            lists the received commands), and the methods `wait_for_commands(names)`, `unplug`,
+            `plug`, `jump_clock(seconds)`, `delay(seconds)` and, with virtual time,
+            `advance(seconds)`.
 
     Raises:
         SourceError: if the port cannot be opened.

@@ -1,9 +1,7 @@
 """Checks of single frames: valid examples, edited frames and damaged frames.
 
 construct may omit bits, truncate numbers and accept contradictory values without an error. To find
-each of these faults, a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
-which reduces a failure to the faulty field. A damaged frame must raise `WireError`, or be accepted
-if no checksum covers the changed bit. The share of such bits is measured.
+such faults, a frame is parsed and built again, with and without edits.
 """
 
 from __future__ import annotations
@@ -51,10 +49,7 @@ MAX_FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
-    """Check that examples of a frame type are valid, repeatable and different.
-
-    No example may be longer than `max_length`.
-    """
+    """Check that examples of a frame type are valid, repeatable and different."""
     frame = subject.sensor.frames[name]
     try:
         examples = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
@@ -116,11 +111,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
 
 
 def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing and building keeps all values if a byte of an example is changed.
-
-    Checksums may differ. Only frame types that are not compiled are tested, because their structs
-    may contain functions of the author that lose values.
-    """
+    """Check that parsing and building keeps all values if a byte of an example is changed."""
     engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
         return
@@ -169,10 +160,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
 
 
 def wrong_rebuild_values_are_invalid(subject: SensorUnderTest, name: str) -> None:
-    """Check that a frame is invalid if the value of a `Rebuild` field is wrong.
-
-    Otherwise, building the parsed values would give a different frame.
-    """
+    """Check that a frame is invalid if the value of a `Rebuild` field is wrong."""
     sensor = subject.sensor
     engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
@@ -406,8 +394,7 @@ def _make_value_strategy(info: FieldInfo, own: Any, st: Any) -> Any:
     """Return a strategy for the raw values of a field.
 
     Args:
-        own: a strategy or function of the plugin's author, which is preferred; None if there is
-            none.
+        own: the strategy or function of the plugin's author; None if there is none.
     """
     if own is not None and hasattr(own, "example"):
         return own
@@ -431,10 +418,7 @@ def has_free_values(info: FieldInfo | None) -> bool:
 
 
 def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing a truncated frame raises `WireError` with a valid offset.
-
-    The offset must not be after the end of the truncated frame.
-    """
+    """Check that parsing a truncated frame raises `WireError` with a valid offset."""
     data = subject.example(name, seed=2)
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.CUT_OFFSETS, MIN_CUT_OFFSETS), MAX_CUT_BYTES
@@ -462,10 +446,7 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
-    """Check that parsing a damaged frame raises no error other than `WireError`.
-
-    The frame is parsed with and without verification.
-    """
+    """Check that parsing a damaged frame raises no error other than `WireError`."""
     sensor = subject.sensor
     source = subject.make_random(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY_FRAME_TYPES else (name,)
@@ -483,10 +464,7 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str
 
 
 def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
-    """Check that flipping any bit that a checksum covers makes the frame invalid.
-
-    The share of bits that can be flipped without making the frame invalid is measured.
-    """
+    """Check that flipping any bit that a checksum covers makes the frame invalid."""
     engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
@@ -533,11 +511,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
 
 
 def _choose_flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
-    """Return the offsets of the bytes in which bits are flipped.
-
-    In a short frame, these are all bytes. In a long frame, they are one byte of each field and some
-    random bytes.
-    """
+    """Return the offsets of the bytes in which bits are flipped."""
     number = MAX_FLIPPED_BYTES // (8 * length)
     if number >= length:
         return range(length)

@@ -1,19 +1,11 @@
 """Checks of a sensor's points that are possible without its manual.
 
-Four kinds of frames are used:
+Four kinds of frames are used: random examples, packets of the sensor's `sweep`, frames with a
+changed angle, and packets that are simulated in a room. `distance_outside` computes the distance of
+points from the walls of the room without the code of the simulator.
 
-* Examples: their clouds must keep the conventions of `PointCloud`. Tracing `points` with them gives
-  the source fields of each column.
-* Packets of the sensor's `sweep`: directions must be in radians, turn clockwise or
-  counter-clockwise throughout, and cross the full circle without a jump. The point of a packet with
-  a single point must have a direction. Clock and counter must increase.
-* Frames with an angle that is changed by a few steps: the points must turn as the vendor's axes
-  declare.
-* Packets simulated in a room: the decoded points must lie on its walls. Their distances are
-  computed by `distance_outside`, not by the simulator.
-
-Measured values are reported (`SensorUnderTest.picture`), so that the author can compare them with
-the manual.
+The measured values are reported (`SensorUnderTest.picture`), so that the author can compare them
+with the manual.
 """
 
 from __future__ import annotations
@@ -126,8 +118,8 @@ def decode_frames(
 ) -> Packets:
     """Decode frames of one data type.
 
-    If several frame types have points, the sensor is configured for this type. If `by_clock` is
-    false, the clock of the sensor is not used.
+    Args:
+        by_clock: whether the clock of the sensor is used.
     """
     if by_clock:
         sensor = subject.sensor
@@ -178,10 +170,7 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
 
 
 def find_field_of_node(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
-    """Return the field that a traced node reads; None if it reads no field.
-
-    The field belongs to the frame type `name`, or to another type if the node reads the state.
-    """
+    """Return the field that a traced node reads; None if it reads no field."""
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
     if node.kind == "state":
@@ -198,8 +187,8 @@ def calculate_directions(
 ) -> list[NDArray[np.float64]] | None:
     """Return the azimuths and elevations of packets as `points` calculates them.
 
-    The angles are not reduced to one full circle. If `points` returns Cartesian coordinates, the
-    result has the directions that the simulation declares; None if there are none.
+    Azimuths may exceed a full circle. Returns None if `points` returns Cartesian coordinates and
+    the simulation declares no directions.
     """
     packets = packets.with_points
     batch = packets.batch()
@@ -236,11 +225,7 @@ def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np
 
 
 def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
-    """Check that clouds keep the conventions, and that `points` raises no error.
-
-    The conventions are: metres and radians in float32, azimuths in [-pi, pi), and NaN coordinates
-    of points without a return.
-    """
+    """Check that clouds keep the conventions, and that `points` raises no error."""
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
         packets = decode_frames(subject, name, frames)
@@ -282,10 +267,7 @@ def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
 
 
 def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
-    """Check that the point of a frame with a single point has a valid direction.
-
-    Only frame types with a field for the number of points are tested.
-    """
+    """Check that the point of a frame with a single point has a valid direction."""
     engine = get_codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
     if not isinstance(engine, CompiledCodec) or engine.schema.has_measured_sizes:
@@ -324,10 +306,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
 
 
 def the_full_circle_equals_zero(subject: SensorUnderTest, name: str) -> None:
-    """Check that an angle of exactly 360 degrees gives the same points as 0.
-
-    Nothing is tested if no frame with 360 degrees is plausible.
-    """
+    """Check that an angle of exactly 360 degrees gives the same points as 0."""
     for path, info in _find_point_angles(subject, name).items():
         full = _find_full_circle(info)
         if full is None:
@@ -359,11 +338,7 @@ def the_full_circle_equals_zero(subject: SensorUnderTest, name: str) -> None:
 
 
 def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
-    """Check that points turn in the direction that the vendor's axes declare.
-
-    No finding is reported if golden vectors have points in two quadrants, because these are better
-    evidence of the direction. The direction that was found is always part of the report.
-    """
+    """Check that points turn in the direction that the vendor's axes declare."""
     for path, info in _find_point_angles(subject, name).items():
         zero = _find_zero(info)
         if zero is None:
@@ -393,11 +368,12 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
 def _find_axis_sense(axes: tuple[str, str, str], zero: float) -> int:
     """Return the direction in which the vendor's angles increase.
 
-    The result is 1 for counter-clockwise, -1 for clockwise, and 0 if unknown.
-
     Args:
         axes: the directions of the vendor's x, y and z.
         zero: the azimuth at which the vendor's angle is 0, in radians.
+
+    Returns:
+        1 for counter-clockwise, -1 for clockwise, 0 if unknown.
     """
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
@@ -410,11 +386,7 @@ def _find_axis_sense(axes: tuple[str, str, str], zero: float) -> int:
 
 
 def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
-    """Check that the azimuths of each ring turn in one direction during the sweep.
-
-    The direction must be the same where azimuths cross the full circle. Sensors that do not rotate
-    are not tested.
-    """
+    """Check that the azimuths of each ring turn in one direction during the sweep."""
     frames = make_sweep(
         subject,
         name,
@@ -493,10 +465,7 @@ def _have_equal_packets(angles: NDArray[np.float64], packets: NDArray[np.intp]) 
 
 
 def counters_run_on(subject: SensorUnderTest, name: str) -> None:
-    """Check that the counter and the clock never run backwards in the sweep.
-
-    No packet may count as lost, late or duplicate.
-    """
+    """Check that the counter and the clock never run backwards in the sweep."""
     if name != subject.sensor.data_frame:
         return
     frames = make_sweep(
@@ -549,11 +518,7 @@ def _find_zero(info: FieldInfo) -> int | None:
 
 
 def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
-    """Return the angle fields of a frame type that may turn its points, by path.
-
-    These are the angle fields that `points` uses and all optional angle fields. If `points` cannot
-    be traced, all angle fields are returned.
-    """
+    """Return the angle fields of a frame type that may turn its points, by path."""
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
         result = trace_points(subject, name)
@@ -569,10 +534,7 @@ def _find_point_angles(subject: SensorUnderTest, name: str) -> dict[str, FieldIn
 
 
 def _find_full_circle(info: FieldInfo) -> tuple[int, int] | None:
-    """Return the raw values of 0 and of the full circle.
-
-    Returns None if the field cannot have both values.
-    """
+    """Return the raw values of 0 and of the full circle, or None."""
     zero = _find_zero(info)
     if zero is not None:
         circle = (FULL_TURNS[info.unit] - info.offset) / info.scale
@@ -593,8 +555,6 @@ def _decode_with_values(
     subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
     """Decode an example with each of several values of a field; return the points.
-
-    Returns an empty list if no example has the same number of points for all values.
 
     Raises:
         SpecError: if `points` fails.
@@ -628,13 +588,11 @@ def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) ->
     """Return the direction in which points turn if the value of a field increases.
 
     Args:
-        info: the field.
         nought: the points if the angle is 0.
         turned: the points if the raw value is higher by `ANGLE_CHANGE_STEPS`.
 
     Returns:
-        1 for counter-clockwise, -1 for clockwise. 0 if the points do not turn, for example because
-        the field is a rate or an elevation.
+        1 for counter-clockwise, -1 for clockwise, 0 if the points do not turn.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
@@ -646,10 +604,7 @@ def _find_turn_sense(info: FieldInfo, nought: PointCloud, turned: PointCloud) ->
 
 
 def _set_value(subject: SensorUnderTest, name: str, path: str, value: int, parsed: Any) -> bytes:
-    """Set every element of a field in `parsed`, and return the frame.
-
-    Returns b"" if the frame is not valid with this value.
-    """
+    """Set a field in `parsed`; return the frame, or b"" if the frame is invalid."""
     for holder, key, own in list(material.iter_integers(parsed)):
         if own == path:
             holder[key] = value
@@ -662,8 +617,6 @@ def _set_value(subject: SensorUnderTest, name: str, path: str, value: int, parse
 
 def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distance of each point from the nearest surface of a room, in metres.
-
-    The calculation is independent of the simulator.
 
     Args:
         xyz: the coordinates of the points in metres, (n, 3).
@@ -682,7 +635,7 @@ def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64
 def find_half_step(subject: SensorUnderTest, name: str) -> float:
     """Return half of the largest step of the length fields of a frame, in metres.
 
-    The result is `MIN_HALF_STEP_M` if the largest step is at most this value.
+    Returns `MIN_HALF_STEP_M` if no field has a larger step.
     """
     fields = subject.fields(name).values()
     metres = [

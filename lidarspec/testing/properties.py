@@ -1,10 +1,7 @@
 """The table of properties that every sensor must have, for `lidarspec check` and for pytest.
 
 A property is a function of a `SensorUnderTest` that raises an exception if the property does not
-hold. It tests the sensor's declaration, not the engine.
-
-This module imports neither pytest nor hypothesis, so that it can be imported without the extra
-`testing`. `conformance` makes a test for pytest from the table.
+hold. This module can be imported without the extra `testing`.
 """
 
 from __future__ import annotations
@@ -62,16 +59,14 @@ class Property:
     Attributes:
         function: raises an exception if the property does not hold. Its arguments are the subject
             and, unless `each` is "sensor", the name of a frame, data frame, command or vector.
-        each: what the property is tested for: the "sensor", or each "frame", "data" frame,
-            "command" or "vector".
+        each: "sensor", "frame", "data" (a data frame), "command" or "vector": the function is
+            called for each of these.
         rule: the code of the rule that is violated if the function raises a plain `AssertionError`.
         lacks: a function that returns the reason why the property does not apply to a sensor, or ""
             if it applies.
-        unless: codes of other rules. If one of them is violated, the property is not tested,
-            because the other rule describes the fault better.
-        depends_on: attributes of a sensor that determine the result. If a related model that is
-            tested as well has equal attributes, the property is not tested again. If empty, the
-            property is tested for each sensor.
+        unless: codes of other rules; if one of them is violated, the property is not tested.
+        depends_on: attributes of a sensor that determine the result. If a tested related model has
+            equal attributes, the property is not tested again.
     """
 
     function: Callable[..., None]
@@ -292,10 +287,7 @@ def _find_first_line(error: BaseException) -> str:
 
 
 def _make_unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
-    """Return the finding for an undocumented exception.
-
-    The finding has the file and line at which the plugin raised the exception, if any.
-    """
+    """Return the finding for an undocumented exception."""
     locations = [
         location
         for location in traceback.extract_tb(error.__traceback__)

@@ -27,10 +27,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def sensor(request: pytest.FixtureRequest) -> Sensor:
-    """Return the sensor under test.
-
-    It is the sensor of ``@pytest.mark.lidarspec("acme-x1")``, or of the test class.
-    """
+    """Return the sensor of the marker ``lidarspec("acme-x1")`` or of the test class."""
     from lidarspec.plugins import sensor as named
     from lidarspec.sensor_operations import Sensor
 
@@ -53,7 +50,7 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
     """Put a simulated sensor on a real port until the test ends.
 
-    The fixture is a function: `lidarspec.testing.fixtures.virtual_port`. Its first argument is an
+    The fixture is the function `lidarspec.testing.fixtures.virtual_port`. Its first argument is an
     id or a Sensor, by default the test's own `sensor`. Its result has a `path` to open.
     """
     from lidarspec.testing import fixtures as ports
@@ -70,10 +67,7 @@ def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Serve
 
 @pytest.fixture
 def bare_registry() -> Iterator[Registry]:
-    """Replace the registry by an empty registry until the test ends.
-
-    Installed plugins are not visible; `add` adds a plugin.
-    """
+    """Replace the registry by an empty registry until the test ends."""
     from lidarspec.plugins import Registry, use_registry
 
     with use_registry(Registry()) as registry:

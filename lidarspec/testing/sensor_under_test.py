@@ -1,7 +1,6 @@
 """A sensor under test, and functions that make, edit and truncate its examples.
 
-A `SensorUnderTest` makes example frames of its sensor, and collects values that the properties
-measure. All random values are seeded, so that a failure can be repeated.
+All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -33,11 +32,7 @@ def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
 
 
 def pick_offsets(length: int, source: random.Random, count: int = CUT_OFFSETS) -> list[int]:
-    """Return offsets at which a frame is cut.
-
-    A short frame is cut at all offsets. A long frame is cut at `count` random offsets, and near its
-    ends.
-    """
+    """Return offsets at which a frame is cut; all offsets if the frame is short."""
     if length <= MAX_SHORT_BYTES * count // CUT_OFFSETS:
         return list(range(length))
     ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
@@ -49,12 +44,10 @@ def mutate(
 ) -> bytes:
     """Return a copy of the bytes with a few random changes.
 
-    Bytes are changed, dropped, doubled, inserted, or overwritten.
-
     Args:
         words: byte strings to insert or to write over existing bytes, for example values at the
             edge of a range.
-        offsets: offsets for half of the changes, for example the offsets of fields. By default, all
+        offsets: offsets for half of the changes, for example the offsets of fields; by default, all
             offsets are random.
     """
     mutated = bytearray(data)
@@ -84,8 +77,6 @@ def iter_integers(
     parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
 ) -> Iterator[tuple[Any, Any, str]]:
     """Yield (container, key, field path) for each integer of a parsed frame.
-
-    The integer is ``container[key]``.
 
     Args:
         parsed: a dict or list of the frame.
@@ -207,10 +198,7 @@ class SensorUnderTest:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that are tested for this sensor.
-
-        Frame types that a related model in `tested` has as well are omitted.
-        """
+        """The frame types to test, without types that a tested related model has as well."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -218,11 +206,7 @@ class SensorUnderTest:
 
     @property
     def commands(self) -> list[str]:
-        """The commands that are tested for this sensor.
-
-        A command is omitted if a related model in `tested` has the same command with the same
-        frames, links and simulated replies.
-        """
+        """The commands to test, without commands that a tested related model has as well."""
         return [
             name
             for name in self.sensor.commands
@@ -239,8 +223,6 @@ class SensorUnderTest:
 
     def seeds(self, name: str, share: float = 1.0) -> range:
         """Return the seeds of the examples with which a property tests a frame type.
-
-        There are fewer seeds if the frame type is long, or if the sensor has many frame types.
 
         Args:
             name: the frame type.
@@ -276,10 +258,7 @@ class SensorUnderTest:
         return max(rounds * self.examples // USUAL_EXAMPLES, least)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """Return the bytes of a valid frame with seeded content.
-
-        If the author gives a strategy for a value, the value is drawn from the strategy.
-        """
+        """Return the bytes of a valid frame with seeded content."""
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)
             source = random.Random(f"{self.sensor.id} {frame} {seed}")
@@ -307,12 +286,10 @@ class SensorUnderTest:
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
         """Return frames as the sensor could send them: (type, bytes) of each frame.
 
-        Each round contains all incoming types. If a type is only valid after another type
-        (`after`), a frame of that type precedes it.
-
         Args:
             seed: selects the content of the frames.
-            rounds: number of rounds; None to derive it from `examples`.
+            rounds: maximum number of rounds, which contain all incoming types; None to derive it
+                from `examples`.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0
@@ -357,10 +334,7 @@ def _has_same_exchange(sensor: Sensor, other: Sensor, name: str) -> bool:
 
 
 def _make_pool(strategy: Any) -> Callable[[random.Random], int]:
-    """Return a function that chooses from values of a hypothesis strategy.
-
-    The values are the same in every run.
-    """
+    """Return a function that chooses from values of a hypothesis strategy."""
     from hypothesis import HealthCheck, Phase, given, settings
 
     pool: list[int] = []

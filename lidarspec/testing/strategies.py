@@ -7,13 +7,7 @@
     def test_distances_are_positive(value): ...
 
 Each field is drawn separately, so that a failure is reported with the smallest value of each field.
-First, the fields that determine the layout are drawn (counts, lengths, keys of a `Switch`). Then
-the other fields of the layout are drawn, within the ranges that the struct and `plausible` accept
-(`lidarspec.testing.value_ranges`). Constants, lengths and checksums are filled in. In a long array,
-all elements have the same drawn value except a few.
-
-If a frame type has parts, or only construct can parse it, its values are drawn in the order of the
-struct. If such values are seldom valid together, one of a few examples is drawn instead.
+Constants, lengths and checksums are filled in.
 """
 
 from __future__ import annotations
@@ -112,8 +106,8 @@ def values(
 ) -> SearchStrategy[dict[str, Any]]:
     """Return a strategy for the values of valid frames, as plain dicts and lists.
 
-    `Sensor.parse` returns these values for the frame, and `Sensor.build` accepts them: raw values
-    of all fields, with constants, counts and checksums.
+    The values are raw values of all fields, with constants, counts and checksums, as returned by
+    `Sensor.parse` and accepted by `Sensor.build`.
 
     Args:
         sensor: an id or a Sensor.
@@ -211,16 +205,13 @@ def streams(
 ) -> SearchStrategy[Any]:
     """Return a strategy for input that `Sensor.decode`, `split` and `scans` accept.
 
-    The input consists of valid frames of all incoming types. The input is bytes, or a list of
-    datagrams if the sensor sends datagrams. If a frame type is only valid after another type
-    (`after`), that type comes first. If a frame type is only valid after several such frames in a
-    row (`confirm`), the input has at least this number of frames in a row. Without noise, every
-    byte belongs to a frame.
+    The input consists of valid frames of all incoming types: bytes, or a list of datagrams if the
+    sensor sends datagrams.
 
     Args:
         sensor: an id or a Sensor.
-        noise: with True, random bytes and truncated frames are inserted, as datagrams if the sensor
-            sends datagrams. With a strategy, the bytes that it draws are inserted.
+        noise: True to insert random bytes and truncated frames; or a strategy for the bytes to
+            insert.
     """
     resolved = _find_sensor(sensor)
     runs = [_consecutive_frames(resolved, name) for name in resolved.incoming]
@@ -262,8 +253,8 @@ def _truncated(draw: DrawFn, sensor: Sensor) -> list[bytes]:
 def scans(sensor: str | Sensor, *, lost: int = 3) -> SearchStrategy[Scan]:
     """Return a strategy for scans of a simulated sensor in a room.
 
-    These are drawn: the walls, the boxes in the room, the number of the scan since power-on, and
-    the lost packets. Hypothesis simplifies a failure towards a complete scan of an empty room.
+    The walls, the boxes in the room, the number of the scan since power-on, and the lost packets
+    are drawn.
 
     Args:
         sensor: an id or a Sensor.
@@ -325,10 +316,7 @@ def _boxes(draw: DrawFn) -> Box:
 
 
 def _join_frames(sensor: Sensor, packets: list[bytes]) -> Any:
-    """Return data frames as the data link transmits them.
-
-    If data frames must follow a frame of another type, a frame of this type is the first.
-    """
+    """Return data frames as the data link transmits them."""
     announced = [make_opening_frame(sensor), *packets]
     if sensor.datagrams:
         return [data for data in announced if data]
@@ -439,22 +427,14 @@ def _floats(width: int) -> SearchStrategy[float]:
 
 
 def _draw_leaf(draw: DrawFn, leaf: Leaf, element: SearchStrategy[Any]) -> NDArray[Any]:
-    """Draw the values of a field as an array of the shape (1, *leaf.shape).
-
-    Args:
-        leaf: the field.
-        element: a strategy for each element.
-    """
+    """Draw the values of a field as an array of the shape (1, *leaf.shape)."""
     count = math.prod(leaf.shape)
     drawn = _draw_array(draw, count, functools.partial(draw, element))
     return np.array(drawn, leaf.info.dtype).reshape(1, *leaf.shape)
 
 
 def _draw_array(draw: DrawFn, count: int, draw_one: Callable[[], Any]) -> list[Any]:
-    """Draw the elements of an array.
-
-    In a long array, all elements except a few have the same value.
-    """
+    """Draw the elements of an array."""
     if count <= MAX_SINGLE_DRAWS:
         return [draw_one() for _ in range(count)]
     drawn = [draw_one()] * count

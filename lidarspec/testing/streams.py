@@ -1,9 +1,7 @@
 """Properties of a sensor's streams: no lost frame, repeatable results, equal scans in batches.
 
-The properties find two kinds of faults. One is a frame that is mistaken for another type. The other
-is a function of the sensor (`plausible`, `points`, `clock`) that depends on more than its
-arguments, for example on earlier calls, random numbers, or other packets of the same batch. The
-engine itself is tested elsewhere.
+The properties find frames that are mistaken for another type, and functions of the sensor whose
+result depends on more than their arguments.
 """
 
 from __future__ import annotations
@@ -62,10 +60,7 @@ def _make_loss_violation(
 
 
 def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
-    """Check that decoding the same bytes twice gives the same points.
-
-    `points` is evaluated without tracing, so that the function is called in both runs.
-    """
+    """Check that decoding the same bytes twice gives the same points."""
     data = material.make_input(subject.sensor, subject.conversation(rounds=1))
     first = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
     second = evaluate_plainly(subject.sensor.decode(data).with_points).cloud

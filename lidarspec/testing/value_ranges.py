@@ -1,10 +1,8 @@
 """The ranges of values that are valid in one layout, for drawing field by field.
 
-Conditions of the struct and the sensor's `plausible` accept or reject a whole frame. Therefore, one
-valid frame, the *base*, is searched first. Then each field is varied alone in the base. The range
-of a field extends in both directions from its value in the base to the last value that is accepted,
-which is found by bisection. Values from these ranges are mostly valid together. If they are not,
-`LayoutRanges.repair` replaces some of them by values of the base.
+One valid frame, the base, is searched first. The range of a field contains values that are valid if
+all other fields keep their values of the base. `LayoutRanges.repair` replaces drawn values that are
+not valid together.
 """
 
 from __future__ import annotations
@@ -49,8 +47,7 @@ class LayoutRanges:
 
     Attributes:
         layout: the layout.
-        free: the fields to draw. These are all fields except header fields, constants, lengths and
-            checksums.
+        free: the fields to draw: all fields except header fields, constants, lengths and checksums.
     """
 
     def __init__(
@@ -76,9 +73,7 @@ class LayoutRanges:
         ]
 
     def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
-        """Return a valid struct with these values; invalid values are replaced.
-
-        Returns None if no valid struct has the values of the fixed fields.
+        """Return a valid struct with these values, or None; invalid values are replaced.
 
         Args:
             fixed: the paths of the fields whose values must not be replaced.
@@ -106,11 +101,7 @@ class LayoutRanges:
     def repair(
         self, values: Mapping[str, Values], fixed: Mapping[str, Values]
     ) -> Mapping[str, Values]:
-        """Return the fixed values, and the `values` that are valid together with them.
-
-        Invalid values are left out, so that the struct keeps the values of `base`. In an array,
-        elements of `base` replace invalid elements.
-        """
+        """Return the fixed values, and the `values` that are valid together with them."""
         kept = dict(fixed)
         for leaf in self.free:
             path = leaf.info.path
@@ -131,8 +122,6 @@ class LayoutRanges:
 
         Args:
             kept: the values of other fields, by path.
-            leaf: the field with the array.
-            values: the elements, valid and invalid.
         """
         base = leaf.load(self._base)
         mixed = base.copy()
@@ -186,10 +175,7 @@ class LayoutRanges:
         return {path: (low[path], high[path]) for path in starts}
 
     def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
-        """Set each field of `base` to the valid value nearest to 0.
-
-        Returns whether a value has changed.
-        """
+        """Move each field of `base` towards 0; return whether a value has changed."""
         before = self._base.copy()
         for leaf in leaves:
             path = leaf.info.path
@@ -252,7 +238,7 @@ def find_ends(
     """Return the valid value nearest to a wanted value for each field, by bisection.
 
     Args:
-        wanted: the path of each field -> (a value that is valid, the wanted value).
+        wanted: the path of each field -> (a valid value, the wanted value).
         are_valid: a function that returns for each (path, value) whether the value is valid.
     """
     valid = {path: start for path, (start, _) in wanted.items()}
@@ -364,10 +350,7 @@ def _are_valid(
 
 @functools.lru_cache(maxsize=1024)
 def find_valid_frames(sensor: Sensor, frame: str) -> list[bytes]:
-    """Return a few valid frames of a type that is not compiled, the shortest first.
-
-    Returns an empty list if none is found.
-    """
+    """Return a few valid frames of a type that is not compiled, the shortest first."""
     frames: set[bytes] = set()
     with contextlib.suppress(SpecError):
         for seed in range(KNOWN_FRAMES):
@@ -393,9 +376,7 @@ def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
 def find_value_ranges(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
     """Return the lowest and highest valid raw value of integer fields of a frame.
 
-    Each field is varied in one valid frame. Two kinds of fields are left out: fields that decide
-    which fields follow, such as counts, and fields with a single valid value. The frame type may be
-    one that is not compiled.
+    Fields with a single valid value, and fields that decide which fields follow, are left out.
     """
     if sensor.frames[frame].plausible is None:
         return {}

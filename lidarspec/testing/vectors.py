@@ -110,8 +110,6 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
     """Check that the frames of golden vectors have the stated values and points.
 
-    Building the parsed values must give the same frame.
-
     Args:
         only: the key of the vector to check; by default all vectors are checked until one fails.
     """
@@ -149,10 +147,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
 
 
 def describe_missing_vectors(subject: SensorUnderTest) -> str:
-    """Return the reason why the sensor has no vectors.
-
-    Returns "" if it has vectors, or if the file is invalid (`vectors_hold` reports that).
-    """
+    """Return the reason why the sensor has no vectors, or ""."""
     if subject.vectors is None:
         return "there is no file with golden vectors"
     try:
@@ -253,11 +248,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
 
 
 def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
-    """Check that each checksum is verified by a `Checksummed`.
-
-    A checksum is recognized by its name, or by a search in the vectors. A checksum may stay
-    unverified if the docs of its field say so and the search finds no algorithm.
-    """
+    """Check that each checksum is verified by a `Checksummed`."""
     sealing = _find_verified_fields(subject, name)
     free = [
         path
@@ -293,10 +284,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
 
 
 def _find_verified_fields(subject: SensorUnderTest, name: str) -> set[str]:
-    """Return the fields of a frame type that store a verified checksum.
-
-    Several examples are searched, because some headers omit the part with the checksum.
-    """
+    """Return the fields of a frame type that store a verified checksum."""
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
     return set().union(
@@ -310,10 +298,7 @@ def _find_verified_fields(subject: SensorUnderTest, name: str) -> set[str]:
 def _find_matches(
     subject: SensorUnderTest, name: str, path: str, frames: list[bytes], frame: bytes
 ) -> list[ChecksumMatch]:
-    """Return the checksums that match frames and lie in the field at `path`.
-
-    Checksums that need a new class are returned only if no checksum of `lidarspec.spec` matches.
-    """
+    """Return the checksums that match frames and lie in the field at `path`."""
     engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         layout = engine.tree.layout(frame)
@@ -352,10 +337,7 @@ def _describe_match(match: ChecksumMatch, length: int) -> str:
 
 
 def _find_common_matches(frames: list[bytes]) -> list[ChecksumMatch]:
-    """Return the checksums that match all frames.
-
-    Long frames are searched one by one, and only at offsets where checksums usually are.
-    """
+    """Return the checksums that match all frames."""
     if max(map(len, frames), default=0) <= MAX_SHORT_BYTES:
         return search(frames)
     first, *others = [
@@ -404,10 +386,7 @@ def read_valid_entries(subject: SensorUnderTest) -> dict[str, Any]:
 
 
 def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
-    """Return the vectors of the sensor by their keys.
-
-    An invalid entry is represented by its `ViolationError`.
-    """
+    """Return the vectors of the sensor, or their `ViolationError`, by their keys."""
     if subject.vectors is None:
         return {}
     try:
@@ -431,8 +410,6 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
 
 def _check_entry(subject: SensorUnderTest, vector: Any, entry_key: str) -> bool:
     """Check an entry of the file, and return whether it belongs to the sensor.
-
-    If the entry is for a command and has no key "frame", the key is added.
 
     Raises:
         ViolationError: if the entry is invalid.
@@ -470,8 +447,8 @@ def _belongs_to(subject: SensorUnderTest, vector: Mapping[str, Any], entry_key: 
     """Return whether an entry belongs to the sensor.
 
     Raises:
-        ViolationError: if the entry names an unknown sensor, or if it names no sensor although
-            several share the file.
+        ViolationError: if the entry names an unknown sensor, or if the entry has to name a sensor
+            but does not.
     """
     named = vector.get("sensor", [])
     family = subject.family
@@ -496,8 +473,7 @@ def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, entry_key: s
     """Parse the frame of a vector, and return its values.
 
     Raises:
-        ViolationError: if the frame cannot be parsed. If its checksum is wrong, the message names
-            checksums that would be valid.
+        ViolationError: if the frame cannot be parsed.
     """
     try:
         return subject.sensor.parse(data, frame=name)
