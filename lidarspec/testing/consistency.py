@@ -92,15 +92,23 @@ def _find_beyond_limits(info: FieldInfo, value: Any) -> float | None:
     if physical.dtype.kind not in "iuf":
         return None  # a name, or bytes
     raw = info.raw(physical)
-    lowest, highest = info.limits
-    turn = 1 << info.bits
-    if np.isclose(turn * abs(info.scale), FULL_TURNS.get(info.unit, 0.0)):
-        # Such an angle wraps without a change of direction: 360 degrees are sent as 0.
-        lowest, highest = -turn, turn
+    lowest, highest = _find_raw_limits(info)
     beyond = physical[(raw < lowest) | (raw > highest)]
     if len(beyond):
         return float(beyond[0])
     return None
+
+
+def _find_raw_limits(info: FieldInfo) -> tuple[int, int]:
+    """Return the lowest and highest raw value that a sweep may return for a field.
+
+    A field that represents exactly one turn may wrap: 360 degrees are sent as 0.
+    """
+    raw_turn = 1 << info.bits
+    full_turn = FULL_TURNS.get(info.unit)
+    if full_turn is not None and np.isclose(raw_turn * abs(info.scale), full_turn):
+        return -raw_turn, raw_turn
+    return info.limits
 
 
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:

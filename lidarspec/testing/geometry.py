@@ -405,15 +405,15 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     cloud = evaluated.cloud
     packet = np.repeat(np.arange(evaluated.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
-    scan_ends = np.empty(0, np.intp)
-    if not isinstance(subject.sensor.scan, OnWrap):
-        ends = EndFinder(subject.sensor).find(packets, evaluated)
-        scan_ends = np.array([end.point for end in ends], np.intp)
+    is_cut_by_wrap = isinstance(subject.sensor.scan, OnWrap)
+    scan_ends = []
+    if not is_cut_by_wrap:
+        scan_ends = [end.point for end in EndFinder(subject.sensor).find(packets, evaluated)]
+    scan = np.searchsorted(scan_ends, np.arange(len(cloud)), "right")
     for ring in np.unique(rings)[:4]:
         selected = (rings == ring) & np.isfinite(cloud.azimuth)
         angle = cloud.azimuth[selected].astype(np.float64)
         number = packet[selected]
-        scan = scan_ends.searchsorted(np.flatnonzero(selected), "right")
         steps = (np.diff(angle) + np.pi) % (2 * np.pi) - np.pi
         moving = np.abs(steps) > 1e-9
         if moving.sum() < 8:
@@ -426,21 +426,20 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
                 f"{abs(np.rad2deg(median)):.3g} deg {turning} from point to point along the sweep",
             )
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
-        back = steps * np.sign(median) < -max(
-            MAX_BACK_STEP_RAD, MAX_BACK_STEP_MEDIANS * abs(median)
-        )
         if one_way < MIN_ONE_WAY_SHARE:
             message = (
                 f"only {one_way:.0%} of the steps of the azimuth have the same direction, but a"
                 " scan ends where the azimuth wraps"
             )
-            require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
+            require(not is_cut_by_wrap, "LS506", message, f"{name}.points")
             continue
-        back &= np.diff(scan) == 0
-        if not isinstance(subject.sensor.scan, OnWrap) and _have_equal_packets(angle, number):
-            back &= np.diff(number) > 0
-        if back.any():
-            index = int(np.flatnonzero(back)[0])
+        largest_back_step = max(MAX_BACK_STEP_RAD, MAX_BACK_STEP_MEDIANS * abs(median))
+        is_back = steps * np.sign(median) < -largest_back_step
+        is_back &= np.diff(scan[selected]) == 0
+        if not is_cut_by_wrap and _have_equal_packets(angle, number):
+            is_back &= np.diff(number) > 0  # each packet may contain several rows of an image
+        if is_back.any():
+            index = int(np.flatnonzero(is_back)[0])
             before, after = np.rad2deg(angle[index : index + 2])
             message = (
                 f"the azimuth steps back from {before:.1f} to {after:.1f} degrees in packet"
