@@ -256,7 +256,7 @@ class Checksummed(layer.SealedStruct):
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        obj = self._measured._parsereport(stream, context, path)
+        obj = self._measured_struct._parsereport(stream, context, path)
         end = stream.tell()
         if not layer.is_verifying(context):
             return obj
@@ -282,7 +282,7 @@ class Checksummed(layer.SealedStruct):
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replace(blank, name, self._make_zero(name) if value is None else value)
-        con = self._measured
+        con = self._measured_struct
         trial = io.BytesIO()
         con._build(blank, trial, context, path)
         data = trial.getvalue()
@@ -296,7 +296,7 @@ class Checksummed(layer.SealedStruct):
         )
 
     @property
-    def _measured(self) -> Construct:
+    def _measured_struct(self) -> Construct:
         """The struct, which adds the offsets of its members to the parsed value.
 
         In a frame, the engine has already prepared the struct. A struct that is used without a
@@ -380,7 +380,7 @@ class Checksummed(layer.SealedStruct):
 
         The range of a bit field includes all bytes that contain its bits.
         """
-        con = self._measured
+        con = self._measured_struct
         parts = name.split(".")
         for depth, part in enumerate(parts):
             start, end = obj["_spans"][part]
