@@ -24,7 +24,7 @@ from lidarspec.trusted_files import FILE, TRUSTED, trust as trusted, user_folder
 if TYPE_CHECKING:
     from lidarspec.plugins import Plugin
     from lidarspec.sensor_operations import Sensor
-    from lidarspec.spec.description import Frame
+    from lidarspec.spec.description import Command, Frame
 
 #: Number of simulated packets for which a plan is made. A single packet is not enough, because some
 #: packets of a revolution may be shorter.
@@ -144,7 +144,10 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     if as_json:
         frames = {name: _frame_to_dict(frame) for name, frame in sensor.frames.items()}
-        commands = {name: _command_to_dict(sensor, name, sensor_id) for name in sensor.commands}
+        commands = {
+            name: _command_to_dict(sensor.commands[name], data)
+            for name, data in _build_commands(sensor, sensor_id).items()
+        }
         emit_json({**_sensor_to_dict(sensor), "frames": frames, "commands": commands}, output)
         return
     from lidarspec.explaining.formatting import (
@@ -174,7 +177,8 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         ]
         parts.append(f"  reports {', '.join(facts)}")
     parts += [
-        f"  command {name}{_format_command(sensor, name, sensor_id)}" for name in sensor.commands
+        f"  command {name}{_format_command(sensor, name, data)}"
+        for name, data in _build_commands(sensor, sensor_id).items()
     ]
     for name, frame in sensor.frames.items():
         rows = [
@@ -320,48 +324,52 @@ def _frame_to_dict(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _command_to_dict(sensor: Sensor, name: str, sensor_id: str) -> Mapping[str, Any]:
-    """Return the description of a command, and print a remark if its frame cannot be built.
+def _build_commands(sensor: Sensor, sensor_id: str) -> dict[str, bytes]:
+    """Return the frame of each command, by name; b"" if a command has arguments or no frame.
+
+    Prints a remark for each command that cannot be built.
 
     Args:
         sensor: the sensor.
-        name: the name of the command.
         sensor_id: the sensor as the user named it, for the remark.
     """
-    command = sensor.commands[name]
-    args = {name: argument.to_dict() for name, argument in command.arguments.items()}
-    frame = ""
-    if command.frame is not None and not args:
+    built = dict[str, bytes]()
+    for name, command in sensor.commands.items():
+        built[name] = b""
+        if command.frame is None or command.arguments:
+            continue
         try:
-            frame = sensor.command(name).hex(" ")
+            built[name] = sensor.command(name)
         except LidarSpecError as error:
             check = f"lidarspec check {shlex.quote(sensor_id)}"
             note(f"command {name} cannot be built: {error}; next: {check}")
+    return built
+
+
+def _command_to_dict(command: Command, data: bytes) -> Mapping[str, Any]:
     return {
         "frame": command.frame,
-        "arguments": args,
-        "hex": frame,
+        "arguments": {name: argument.to_dict() for name, argument in command.arguments.items()},
+        "hex": data.hex(" "),
         "reply": " or ".join(command.replies) or None,
         "only_stopped": command.only_stopped,
     }
 
 
-def _format_command(sensor: Sensor, name: str, sensor_id: str) -> str:
+def _format_command(sensor: Sensor, name: str, data: bytes) -> str:
     from lidarspec.explaining.formatting import describe_argument
 
-    command = _command_to_dict(sensor, name, sensor_id)
-    args = "".join(
-        f" {argument}={describe_argument(sensor, name, argument)}"
-        for argument in sensor.commands[name].arguments
+    command = sensor.commands[name]
+    text = "".join(
+        f" {argument}={describe_argument(sensor, name, argument)}" for argument in command.arguments
     )
-    if command["reply"]:
-        answer = (
-            f", reply {command['reply']}"
-            f"{' (only while stopped)' if command['only_stopped'] else ''}"
-        )
-    else:
-        answer = ""
-    return f"{args}{': ' if command['hex'] else ''}{command['hex']}{answer}"
+    if data:
+        text += f": {data.hex(' ')}"
+    if command.replies:
+        text += f", reply {' or '.join(command.replies)}"
+        if command.only_stopped:
+            text += " (only while stopped)"
+    return text
 
 
 def _format_links(links: Mapping[str, KnownLink]) -> str:
