@@ -50,10 +50,9 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
     """
     first = FirstFrames()
     missing = set(sensor.state)
-    reference_frame: str | None = None
+    reference_frame: str | None = None  # while it is searched for
     if sensor.clock is not None and sensor.clock.reference is not None:
         reference_frame, _ = sensor.clock.reference
-    needs_reference = reference_frame is not None
     has_reference_frame = False
     seen_bytes = 0
     for batch in batches:
@@ -64,15 +63,16 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
                 if len(rows):
                     first.state[name] = frames.data(int(rows[0]))
             missing -= set(first.state)
-            if reference_frame is not None and needs_reference and first.reference is None:
+            if reference_frame is not None:
                 rows = _find_rows(frames, reference_frame)
                 if len(rows):
                     has_reference_frame = True
                     first.reference = _find_reference(sensor, reference_frame, frames, rows)
-        never_arrives = not has_reference_frame and seen_bytes > REFERENCE_SEARCH_BYTES
-        if first.reference is not None or never_arrives:
-            needs_reference = False
-        if not missing and not needs_reference:
+            if first.reference is not None:
+                reference_frame = None
+        if not has_reference_frame and seen_bytes > REFERENCE_SEARCH_BYTES:
+            reference_frame = None
+        if not missing and reference_frame is None:
             break
     return first
 
