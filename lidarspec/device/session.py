@@ -29,7 +29,7 @@ from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
 from lidarspec.frames.field_paths import split_path
-from lidarspec.frames.number_format import count_decimals, format_fixed
+from lidarspec.frames.number_format import find_number_format
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
@@ -153,17 +153,21 @@ class ExpectedReply:
     Attributes:
         tables: the frame types of the possible replies, with their fields: frame type -> path ->
             field.
-        values: the values that the reply must have: path -> value. Paths that a frame type does
+        matches: the values that the reply must have: path -> value. Paths that a frame type does
             not have are ignored.
+        echoes: the values that the reply or a refusal must have in addition, like `matches`.
         refusal: the frame type of a refusal; None if the sensor sends no refusals.
-        echoes: the values that a refusal must repeat if its frame type has these fields: path ->
-            value.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
-    values: Mapping[str, Any]
-    refusal: str | None = None
+    matches: Mapping[str, Any]
     echoes: Mapping[str, Any] = field(default_factory=dict)
+    refusal: str | None = None
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The values that the reply must have: path -> value."""
+        return {**self.matches, **self.echoes}
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
         """Return a list of the differences between a frame and the expected reply.
@@ -231,7 +235,7 @@ def _format_physical(info: FieldInfo, value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_format_physical(info, element) for element in value)}]"
     if isinstance(value, float):
-        return format_fixed(value, count_decimals(info))
+        return find_number_format(info).format(value)
     return str(value)
 
 
@@ -405,8 +409,7 @@ class Session:
             wait = _to_ns(timeout)
         pending = PendingReply(f"{self.sensor.id} {name}")
         if tables:
-            values = {**command.matches, **echoes}
-            expected = ExpectedReply(tables, values, command.refusal, echoes)
+            expected = ExpectedReply(tables, command.matches, echoes, command.refusal)
         else:
             expected = None
         self._lines.setdefault(command.link, _LinkQueue()).queue.append(

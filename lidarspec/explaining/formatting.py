@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
 from lidarspec.frames.commands import find_argument_slot, has_only_names, list_choices
-from lidarspec.frames.number_format import format_fixed
+from lidarspec.frames.number_format import WHOLE, NumberFormat, format_fixed
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
 from lidarspec.spec.enum_values import UNKNOWN_CODE, format_code
@@ -90,7 +90,7 @@ class FieldValue:
         raw: the raw value, a number or bytes.
         physical: the value in `unit`; None if the value is not a number.
         unit: the unit; "" if the field has none.
-        digits: number of decimals to print; None for a float field.
+        number_format: the digits to print.
         label: the name of the raw value; "" if it has none.
         is_unknown: whether other values of the field have names, but this value has none.
         bits: a text with the bits of the field, e.g. ".. 000001.."; "" if the field consists of
@@ -104,7 +104,7 @@ class FieldValue:
     raw: Any
     physical: float | None = None
     unit: str = ""
-    digits: int | None = 0
+    number_format: NumberFormat = WHOLE
     label: str = ""
     bits: str = ""
     docs: str = ""
@@ -145,11 +145,11 @@ class FieldValue:
             return format_code(self.raw, self.label)
         if self.is_unknown:
             return format_code(self.raw, UNKNOWN_CODE)
-        plain = isinstance(self.raw, int) and self.digits == 0 and self.physical == float(self.raw)
-        if plain:
+        is_unscaled = isinstance(self.raw, int) and self.physical == float(self.raw)
+        if is_unscaled and self.number_format.decimals == 0:
             text = str(self.raw)
         else:
-            text = format_fixed(self.physical, self.digits)
+            text = self.number_format.format(self.physical)
         if self.unit == "deg/s":
             turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz"
         else:
@@ -337,7 +337,7 @@ class FieldDifference:
             or self.before.label
         ):
             return ""
-        step = format_fixed(self.after.physical - self.before.physical, self.before.digits)
+        step = self.before.number_format.format(self.after.physical - self.before.physical)
         return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
 
     def to_dict(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from lidarspec.errors import WireError
 from lidarspec.explaining.formatting import ExplainedRow, FieldValue
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout_tree import frame_layouts
-from lidarspec.frames.number_format import count_decimals
+from lidarspec.frames.number_format import find_number_format
 from lidarspec.frames.plain import list_plain_fields
 from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
@@ -187,7 +187,7 @@ def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
         field.raw,
         float(info.physical(field.raw)) if is_number else None,
         info.unit,
-        count_decimals(info),
+        find_number_format(info),
         info.labels.get(field.raw, "") if isinstance(field.raw, int) else "",
         "" if field.bits is None else format_bits(field.bits),
         info.docs,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 from lidarspec.spec.tree import FieldInfo, to_exact
 
@@ -12,11 +13,38 @@ MAX_DIGITS = 12
 MAX_EXTRA_DIGITS = 2
 
 
-def count_decimals(info: FieldInfo) -> int | None:
-    """Return the number of decimals to print of a field's values; None for a float field."""
-    if info.kind == "float":
-        return None
-    return _count_digits(info.scale, info.offset)
+#: The number of significant digits that are printed of a 64-bit float, and of a shorter float.
+DOUBLE_DIGITS = 15
+FLOAT_DIGITS = 7
+
+
+class NumberFormat(NamedTuple):
+    """The digits with which the values of a field are printed.
+
+    Attributes:
+        decimals: the number of decimals; None if the number of significant digits is fixed.
+        significant: the number of significant digits if `decimals` is None.
+    """
+
+    decimals: int | None
+    significant: int = 0
+
+    def format(self, value: float) -> str:
+        """Format a number. Zero has no minus sign."""
+        if self.decimals is not None:
+            return format_fixed(value, self.decimals)
+        return _remove_sign_of_zero(f"{value:.{self.significant}g}")
+
+
+#: The format of numbers without decimals.
+WHOLE = NumberFormat(0)
+
+
+def find_number_format(info: FieldInfo) -> NumberFormat:
+    """Return the digits that distinguish the values of a field."""
+    if info.kind != "float":
+        return NumberFormat(_count_digits(info.scale, info.offset))
+    return NumberFormat(None, DOUBLE_DIGITS if info.bits > 32 else FLOAT_DIGITS)
 
 
 @functools.lru_cache
@@ -39,15 +67,12 @@ def _count_digits(scale: float, offset: float) -> int:
     )
 
 
-def format_fixed(value: float, digits: int | None) -> str:
-    """Format a number with `digits` decimals, and zero without a minus sign.
+def format_fixed(value: float, decimals: int) -> str:
+    """Format a number with this number of decimals. Zero has no minus sign."""
+    return _remove_sign_of_zero(f"{value:.{decimals}f}")
 
-    If `digits` is None, the text has seven significant digits.
-    """
-    if digits is None:
-        text = f"{value:.7g}"
-    else:
-        text = f"{value:.{digits}f}"
+
+def _remove_sign_of_zero(text: str) -> str:
     if text.strip("-0."):
         return text
     return text.removeprefix("-")

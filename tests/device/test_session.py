@@ -8,7 +8,7 @@ import random
 from collections.abc import Sequence
 
 import pytest
-from construct import Array, Int8ul, Int16ul, Struct
+from construct import Array, Float32l, Float64l, Int8ul, Int16ul, Struct
 
 import lidarspec as ls
 from lidarspec import CommandError, Found, Sensor, Session, UsageError
@@ -45,12 +45,18 @@ def test_a_reply_prints_the_decimals_of_its_fields() -> None:
         "angle" / Scaled(Int16ul, 0.088, "deg"),
         "distances" / Array(2, Scaled(Int16ul, 0.001, "m")),
         "count" / Int8ul,
+        "time" / Scaled(Float64l, 1, "s"),
+        "gain" / Float32l,
     )
     frame = Frame(struct)
     fields = {info.path: info for info in get_codec(frame).schema.fields.values()}
-    values = frame.prepared.parse(bytes.fromhex("ff01de07e80302"))
+    floats = Float64l.build(1_700_000_000.1) + Float32l.build(0.1)
+    values = frame.prepared.parse(bytes.fromhex("ff01de07e80302") + floats)
     reply = Reply("ask", "ack", values, confirmed=True, at=0, fields=fields)
-    assert repr(reply) == "Reply(ask, ack: angle 44.968 deg, distances [2.014, 1.000] m, count 2)"
+    assert repr(reply) == (
+        "Reply(ask, ack: angle 44.968 deg, distances [2.014, 1.000] m, count 2,"
+        " time 1700000000.1 s, gain 0.1)"
+    )
 
 
 def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
