@@ -37,6 +37,8 @@ except ImportError:  # not a POSIX system; `has_terminals` then returns False
 LOCALHOST = "127.0.0.1"
 _LOOPBACK_BROADCAST = "127.255.255.255"
 _READ_BYTES = 1 << 16
+#: The event that the program at the other end of a port has closed it, as text.
+READER_LEFT = "the reader has disconnected"
 #: Maximum number of bytes that wait for a slow reader of a TCP connection; further bytes are
 #: dropped. The next constant is the maximum for a reader of a pseudo-terminal.
 _MAX_CONNECTION_BACKLOG_BYTES = 1 << 20
@@ -121,11 +123,15 @@ class OutletLine:
             port: the port.
         """
 
-    def await_listener(self) -> None:
-        """Wait until a new program listens, so that it receives all bytes.
+    def await_listener(self) -> bool:
+        """Wait until a program listens, so that it receives all bytes.
 
         For links without connections, such as UDP, this returns at once.
+
+        Returns:
+            Whether the program that listened before has disconnected by itself.
         """
+        return False
 
     def unplug(self) -> None:
         """Disconnect every listener until `plug` is called."""
@@ -444,11 +450,12 @@ class TcpLine(OutletLine):
                 wait_ready([], [client], POLL_S)
                 self._flush(client)
 
-    def await_listener(self) -> None:
+    def await_listener(self) -> bool:
         self.finish()
         while not self._clients:
             wait_for([self], 1.0)
             self.receive()
+        return False
 
     def unplug(self) -> None:
         for client in list(self._clients):
@@ -616,14 +623,18 @@ class PtyLine(OutletLine):
                 self._handle_hangup()
             self._flush()
 
-    def await_listener(self) -> None:
+    def await_listener(self) -> bool:
         """Wait until a reader has kept the terminal open for `_READER_SETTLE_S`."""
+        had_listener = self.has_listener
+        has_left = False
         since = time.monotonic()
         while time.monotonic() - since < _READER_SETTLE_S:
             wait_for([self], _LISTENER_POLL_S)
             self.receive()
             if not self.has_listener:
+                has_left = had_listener
                 since = time.monotonic()
+        return has_left
 
     def finish(self) -> None:
         """Wait until all bytes are read, because closing discards unread bytes."""
@@ -748,11 +759,11 @@ class Outlet:
         if self.data.has_listener:
             self.data.send([chunk], patient=True)
         if not self.data.has_listener:
-            raise Disconnected(f"{self.local_source}: the reader has disconnected")
+            raise Disconnected(f"{self.local_source}: {READER_LEFT}")
 
-    def await_listener(self) -> None:
-        """Wait until a new program reads the data; see `OutletLine.await_listener`."""
-        self.data.await_listener()
+    def await_listener(self) -> bool:
+        """Wait until a program reads the data; see `OutletLine.await_listener`."""
+        return self.data.await_listener()
 
     def unplug(self) -> None:
         """Disconnect every listener until `plug` is called."""

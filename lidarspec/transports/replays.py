@@ -15,7 +15,7 @@ from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import open_transport
-from lidarspec.transports.outlets import Outlet
+from lidarspec.transports.outlets import READER_LEFT, Outlet
 from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, name_senders
 
 _SECOND_NS = 1_000_000_000
@@ -160,7 +160,9 @@ class Replay:
         """
         while True:
             if isinstance(self._destination, Outlet):
-                self._destination.await_listener()
+                has_reader_left = self._destination.await_listener()
+                if has_reader_left:
+                    yield f"{self._destination.local_source}: {READER_LEFT}"
             if not self.chunks:
                 self._start = time.monotonic()
             yield from self._run_once()

@@ -417,8 +417,7 @@ def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
 def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
     stream: Path, tmp_path: Path, started: Callable[..., Running]
 ) -> None:
-    # A turn of the loop lasts two seconds, so that each reader leaves during a turn.
-    player = started("replay", stream, "--loop", "--speed", "0.1x")
+    player = started("replay", stream, "--loop")
     place = player.hears(r"replaying \S+ to (/dev/\S+) when")[1]
     for number, name in enumerate(("one.lsr", "two.lsr"), start=1):
         ran("record", place, "-s", STREAM, "-o", tmp_path / name, "-n", 60)

@@ -291,6 +291,31 @@ def test_a_flooding_reader_does_not_delay_the_end(monkeypatch: pytest.MonkeyPatc
 
 
 @posix
+def test_a_reader_that_leaves_between_two_turns_is_reported(tmp_path: Path) -> None:
+    path, count = tmp_path / "short.lsr", 5
+    with Recorder(path, STREAM) as kept:
+        for number in range(count):
+            kept.write(Chunk(bytes(100), 10**18 + number))
+    target = Outlet(PtyLine())
+    opened = [os.open(target.local_source, os.O_RDWR | os.O_NOCTTY)]
+
+    def return_later() -> None:
+        until(lambda: not target.has_listener)
+        opened.append(os.open(target.local_source, os.O_RDWR | os.O_NOCTTY))
+
+    played = Replay(path, target, speed=None, loop=True).run()
+    assert [next(played) for _ in range(count)] == [""] * count
+    os.close(opened.pop())
+    returning = threading.Thread(target=return_later, daemon=True)
+    returning.start()
+    assert next(played) == f"{target.local_source}: the reader has disconnected"
+    assert next(played) == ""
+    returning.join()
+    os.close(opened.pop())
+    target.close()
+
+
+@posix
 def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
     target = Outlet(PtyLine())
     received = bytearray()
