@@ -1,8 +1,7 @@
 """Packets: the frames of one type as columns, with their times and losses.
 
 These modules turn the `Frames` of a decoder into `Packets`. Each packet gets a time from the
-sensor's clock and an index from its counter, so that lost packets are known. Frames of other types
-that the packets need are kept with them. Modules in reading order:
+sensor's clock and an index from its counter. Modules in reading order:
 
 * `packets`: the columns of n frames, raw and physical.
 * `clocks`: reads and unwraps the sensor's clock, in integer nanoseconds.

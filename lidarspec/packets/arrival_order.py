@@ -1,12 +1,8 @@
 """Count losses among packets that always arrive in order.
 
-Such packets come from byte streams, or are datagrams with neither a counter nor a clock.
-
-`ArrivalOrder` numbers the packets as they arrive, and leaves out a number for each missing packet.
-It estimates the missing packets in two ways. Skipped bytes are divided by the size of the largest
-packet so far. If the sensor has a clock with a declared pace, the time since the previous packet is
-divided by the pace. If the resolution of the clock is at most half the pace, the estimate by the
-clock is used. Otherwise the larger of the two estimates is used.
+The packets come from byte streams, or are datagrams with neither a counter nor a clock.
+`ArrivalOrder` estimates the number of lost packets from skipped bytes, and from the clock if its
+pace is declared.
 """
 
 from __future__ import annotations
@@ -45,11 +41,9 @@ class ArrivalOrder:
     def push(
         self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
     ) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet in the stream, and the breaks before packets.
+        """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
-        Both have the shape (n,). The index has gaps for lost packets. There is a break before a
-        packet if packets are lost before it, or if `batch` has a break there because of skipped
-        bytes.
+        The index has gaps for lost packets.
 
         Args:
             batch: the packets.
@@ -82,10 +76,7 @@ class ArrivalOrder:
     def _count_skipped(
         self, batch: Batch, skipped: NDArray[np.int64]
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows after skipped bytes, and the number of packets lost before each.
-
-        This number is the number of skipped bytes divided by the size of a packet.
-        """
+        """Return the rows after skipped bytes, and the number of packets lost before each."""
         sizes = batch.table.sizes
         size = broadcast_value(sizes)
         rows = np.empty(0, np.intp)
@@ -108,17 +99,9 @@ class ArrivalOrder:
         skipped_rows: NDArray[np.intp],
         skipped_packets: NDArray[np.int64],
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows after possible gaps, and the number of packets missing in each.
-
-        The missing packets are added to `Counters.lost`, unless the clock was set.
-
-        Args:
-            clock: the clock of the packets.
-            batch: the packets.
-            times: times by this clock, (n,) ns.
-            skipped_rows: the rows after skipped bytes, (k,).
-            skipped_packets: the number of packets that the skipped bytes may have contained, (k,).
-        """
+        """Return the rows after possible gaps, and the number of packets missing in each."""
+        # If the clock resolves half the pace, it is more precise than the skipped bytes. A coarse
+        # clock may miss packets, so that the larger of both estimates is used.
         steps = np.diff(times, prepend=times.item(0) - 1 if self._time is None else self._time)
         self._time = times.item(-1)
         paces = read_paces(clock, batch)
@@ -146,7 +129,7 @@ class ArrivalOrder:
 def _make_index_with_gaps(
     first: int, count: int, rows: NDArray[np.intp], missing: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return consecutive indices from `first` on, (count,), with gaps for losses.
+    """Return `count` consecutive indices from `first` on, with gaps for losses.
 
     Args:
         rows: the rows of the packets after each gap.

@@ -1,21 +1,12 @@
 """Convert the times of a sensor to times of the host, by the arrival of packets.
 
-The sensor's time has an arbitrary start, runs fast or slow by some millionths, and may restart. The
-arrival time, by the host's clock, has the correct rate, but is late by some milliseconds, which
-vary from packet to packet with the line and the operating system. A packet is never early.
+The sensor's clock may start at any time, run fast or slow, and restart. The host's clock is
+correct, but a packet arrives some milliseconds after it was sent.
 
-In this module, the delay of a packet is its arrival time minus the sensor's time. Over the sensor's
-time, all delays lie above a line, and many lie close to it. This line is the shortest delay that a
-packet can have. Its height is the offset between the clocks, and its slope is the drift.
-
-The estimate keeps one sample for each quarter of a second of the last half minute: the smallest
-delay. The line lies below all samples, as high as possible. Its slope is limited by two slopes of
-the lower convex hull of the samples, shortly before and shortly after the middle. If the previous
-slope is between these limits, the line keeps it, because the samples do not determine a better
-slope. If the line changes, the delays of stamps approach it smoothly.
-
-A jump of the clock is detected in two cases: several consecutive samples are far below the line, or
-all samples of a second are far above the line, compared with the differences between their delays.
+In this module, the delay of a packet is its arrival time minus the sensor's time. If the delays are
+drawn over the sensor's time, all of them lie above a line, which is the shortest possible delay.
+The height of the line is the offset between the clocks, and its slope is the drift. `fit_line` fits
+the line to the smallest delay of each quarter of a second.
 
 Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network delay
 measurements, INFOCOM 1999 (the line); L. Zhang, Z. Liu, C. H. Xia, Clock synchronization algorithms
@@ -68,13 +59,7 @@ class ClockSample(NamedTuple):
 
 
 class ClockLine(NamedTuple):
-    """The shortest delay of packets as a linear function of the sensor's time.
-
-    Attributes:
-        device: any time by the sensor's clock, ns.
-        delay: the shortest delay at this time, ns.
-        slope: the change of the delay divided by the change of the sensor's time.
-    """
+    """The shortest delay of packets as a linear function of the sensor's time."""
 
     device: int
     delay: int
@@ -100,12 +85,10 @@ class ClockJump(NamedTuple):
 class DeviceClock:
     """Converts the times of a sensor to times of the host.
 
-    A constant delay looks the same as an offset. The results are therefore late by the shortest
-    time that a packet needs in the sensor and on the line to the host.
+    All results are late by the shortest time that a packet needs to reach the host.
 
     Args:
-        parts: the duration to which the line is fitted, in quarters of a second. A longer duration
-            makes the drift more precise. With a shorter duration, the drift follows changes sooner.
+        parts: the duration to which the line is fitted, in quarters of a second.
 
     Attributes:
         jumps: how often the sensor's clock was set.
@@ -156,12 +139,7 @@ class DeviceClock:
         return host - device - expected
 
     def observe(self, device_ns: ArrayLike, host_ns: ArrayLike) -> list[ClockJump]:
-        """Update the conversion with packets, and return the jumps of the clock.
-
-        Args:
-            device_ns, host_ns: the times of the packets by the sensor's clock, and their arrival
-                times; int64 ns, shape (n,) or one number each.
-        """
+        """Update the conversion with packets, and return the jumps of the clock."""
         jumps = []
         device = np.atleast_1d(np.asarray(device_ns, np.int64))
         delays = np.asarray(host_ns, np.int64) - device
@@ -175,7 +153,7 @@ class DeviceClock:
     def stamp(self, device_ns: int, host_ns: int) -> int:
         """Return the time of a scan by the host's clock, ns.
 
-        The time is later than all earlier stamps. The scan updates the conversion.
+        Each call returns a later time than the previous call.
 
         Args:
             device_ns: the time of the scan's first point by the sensor's clock, ns.
@@ -193,7 +171,7 @@ class DeviceClock:
     def stamp_packets(self, device: Times, host: Times) -> Times:
         """Return the times of packets by the host's clock, (n,) ns.
 
-        Each time is later than all earlier stamps. The packets update the conversion.
+        Each time is later than the previous time, also from call to call.
 
         Args:
             device: the times of the packets by the sensor's clock, (n,) ns.
@@ -218,10 +196,8 @@ class DeviceClock:
         return bool(-EARLY_LIMIT_NS < lowest < LATE_LIMIT_NS)
 
     def _stamp_part(self, device: Times, host: Times) -> Times:
-        """Return the times of regular packets by the host's clock, (n,) ns.
-
-        The packets are from one quarter of a second, in which the delay changes evenly.
-        """
+        """Return the times of regular packets by the host's clock, (n,) ns."""
+        # The packets are from one quarter of a second, in which the delay changes evenly.
         before = self._last_stamped
         assert before is not None
         self.observe(device, host)
@@ -239,10 +215,8 @@ class DeviceClock:
         return stamps
 
     def _find_slewed_delay(self, device: int) -> int:
-        """Return the delay to add to a time of the sensor to get its stamp, ns.
-
-        If the line has changed, the delay approaches it smoothly.
-        """
+        """Return the delay to add to a time of the sensor to get its stamp, ns."""
+        # If the line changes, stamps approach it smoothly.
         if self._last_stamped is None:
             return self._line.delay_at(device)
         step = device - self._last_stamped.device
@@ -252,10 +226,7 @@ class DeviceClock:
         return unchanged + round(min(max(correction, -limit), limit))
 
     def _add_sample(self, sample: ClockSample) -> ClockJump | None:
-        """Update the line with a sample, or store the sample as an outlier.
-
-        Returns a jump of the clock if the outliers show one.
-        """
+        """Update the line with a sample; return a jump of the clock if there is one."""
         deviation = self._find_deviation(sample)
         has_paused = (
             bool(self._min_delays)
@@ -312,10 +283,7 @@ class DeviceClock:
         )
 
     def _restart_at_outliers(self) -> ClockJump:
-        """Restart the estimate with the newest outliers, and return the clock's jump.
-
-        The drift is kept.
-        """
+        """Restart the estimate with the newest outliers, and return the clock's jump."""
         outliers = list(self._outliers)[-CERTAIN_OUTLIERS:]
         self.jumps += 1
         host_ns = outliers[-1].host
@@ -349,12 +317,12 @@ class DeviceClock:
 def fit_line(samples: Sequence[ClockSample], slope_before: float) -> ClockLine:
     """Fit a line below the samples, as high as possible, and return it.
 
-    The line keeps the slope `slope_before`, unless the lower hull of the samples contradicts it.
-
     Args:
         samples: one or more samples in order.
-        slope_before: the previous slope.
+        slope_before: the slope of the previous line.
     """
+    # The slope of the hull just before and just after the middle limits the slope of the line.
+    # Between these limits the samples determine no better slope, so the previous one is kept.
     hull = lower_hull(samples)
     last = samples[-1]
     slope = slope_before
@@ -387,10 +355,7 @@ def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
 
 
 def slope_at(index: float, samples: Sequence[ClockSample], hull: Sequence[int]) -> float:
-    """Return the slope of the hull's edge at an index.
-
-    The index may be between two samples.
-    """
+    """Return the slope of the hull's edge at an index, which may be a fraction."""
     end = min(max(bisect_left(hull, index), 1), len(hull) - 1)
     left, low = samples[hull[end - 1]]
     right, high = samples[hull[end]]

@@ -1,8 +1,4 @@
-"""Findings about a sensor's clock: the code, the text and the next step of each.
-
-A `ClockFinding` is either a state, such as a clock that runs on TAI, or an event with a time, such
-as a clock that was set. Programs compare codes; the texts are for people.
-"""
+"""Findings about a sensor's clock: the code, the text and the next step of each."""
 
 from __future__ import annotations
 
@@ -14,9 +10,7 @@ from lidarspec.spec.timing import DAY_S
 
 
 class FindingType(NamedTuple):
-    """A kind of finding.
-
-    A name in braces in a text is replaced by the attribute of `ClockFinding` with this name.
+    """The text and the advice of one kind of finding, with names in braces to fill in.
 
     Attributes:
         text: what was found.
@@ -106,7 +100,7 @@ class ClockFinding:
         code: a key of `FINDING_TYPES`.
         host_ns: the arrival time of the first packet after an event, ns since 1970; 0 for a state.
         value: the drift in ppm, or the offset or step in seconds; 0 if the code has no value.
-        state: the meaning of the clock's status, as the sensor declares it; "" if unknown.
+        state: the meaning of the clock's status; "" if unknown.
         epoch: the declared epoch, a key of `spec.timing.EPOCHS`.
     """
 

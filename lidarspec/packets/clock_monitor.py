@@ -1,10 +1,7 @@
 """Watch a sensor's clock: its epoch, lock, offset, drift and faults.
 
-A `ClockMonitor` reads the packets of one sensor in turn. Their arrival times show the offset and
-the drift of the clock (`clock_estimate`); a change of the offset is an event. A change of the
-status that the sensor sends (`clock_status`) is an event as well. The measured offset is compared
-with the offset of the declared epoch, and with the offsets of other time scales, which differ by
-leap seconds.
+`ClockMonitor` measures the offset and the drift of the clock by the arrival times of packets. It
+compares the offset with the epoch that the sensor declares.
 """
 
 from __future__ import annotations
@@ -63,7 +60,7 @@ class OffsetSample:
     Attributes:
         host_ns: arrival time, ns since 1970.
         offset_s: the sensor's time minus the host's, s.
-        jitter_ms: the 95th percentile of the delays of packets, see `ClockReport`, ms.
+        jitter_ms: the 95th percentile of the delays of packets, ms.
     """
 
     host_ns: int
@@ -79,10 +76,10 @@ class ClockReport:
         epoch: the declared epoch of the clock, a key of `spec.timing.EPOCHS`; "" if unknown.
         state: the meaning of the clock's status; "" if the sensor has not sent the status.
         locked: whether the clock is locked; None if unknown.
-        offset_s: the sensor's time minus the host's, s; nan if unknown. It is too low by the
-            time that the fastest packet needs from the sensor to the host.
-        error_s: the offset minus the difference between the time scales of sensor and host, s; nan
-            if the clock has no date.
+        offset_s: the sensor's time minus the host's, s; nan if unknown. It is too low by the time
+            that the fastest packet needs from the sensor to the host.
+        error_s: the difference between the offset and the offset expected for the epoch, s; nan if
+            the clock has no date.
         drift_ppm: how much faster the sensor's clock runs than the host's, in millionths; nan if
             unknown.
         jitter_ms: the 95th percentile of the delays of packets, ms. The fastest packets have a
@@ -155,11 +152,7 @@ class ClockMonitor:
         self._late_uncertain = 0  # late packets since the clock may have been set
 
     def add(self, packets: Packets) -> list[ClockFinding]:
-        """Add packets, and return the events of the clock that they show.
-
-        Args:
-            packets: the next packets. Packets of a frame type with another clock are only counted.
-        """
+        """Add packets, and return the events of the clock that they show."""
         clock = self._clock
         self._packets += len(packets)
         if not len(packets) or clock is None:
@@ -293,10 +286,8 @@ class ClockMonitor:
         return event
 
     def _has_restarted(self, jump: ClockJump) -> bool:
-        """Return whether a jump shows a restart of the sensor.
-
-        It does if the clock went back by more than a day, or to about 0 without a wrap.
-        """
+        """Return whether a jump shows a restart of the sensor."""
+        # After a restart, the clock begins at about 0, or at an old date.
         if jump.change_ns < -DAY_S * 1e9:
             return True
         around = [
@@ -311,10 +302,7 @@ class ClockMonitor:
         )
 
     def _find_error_s(self) -> float:
-        """Return the error of the clock, s; nan if the clock has no date.
-
-        The error is the offset minus the difference between the time scales of sensor and host.
-        """
+        """Return the offset minus the expected offset, s; nan if the clock has no date."""
         epoch = self._epoch
         if epoch == "hour":
             return (self._offset_s + HOUR_S / 2) % HOUR_S - HOUR_S / 2
@@ -354,10 +342,7 @@ class ClockMonitor:
             yield ClockFinding("ok")
 
     def _judge_offset(self, epoch: str) -> ClockFinding | None:
-        """Return the finding about the offset of the clock.
-
-        Returns None if the offset is correct, or if the clock has no date.
-        """
+        """Return the finding about the offset of the clock; None if there is none."""
         error_s = self._find_error_s()
         if math.isnan(error_s) or abs(error_s) < OFFSET_LIMIT_S:
             return None
@@ -394,10 +379,8 @@ def _find_changes(values: NDArray[np.float64], before: float) -> list[int]:
 
 
 def _is_at_month_end(host_ns: int) -> bool:
-    """Return whether a time is near the end of a month in UTC.
-
-    Leap seconds are inserted at the end of a month.
-    """
+    """Return whether a time is near the end of a month in UTC."""
+    # Leap seconds are inserted at the end of a month.
     moment = np.datetime64(host_ns, "ns")
     nearest_day = (moment + np.timedelta64(DAY_S // 2, "s")).astype("datetime64[D]")
     is_first = nearest_day == nearest_day.astype("datetime64[M]")

@@ -1,21 +1,11 @@
 """Find lost, late and duplicate datagrams by their clock, if they have no counter.
 
-`ClockOrder` compares each datagram with the newest packets, which it stores in the order of their
-times. A datagram directly follows the newest packet, comes after a gap, is late, is a duplicate, or
-shows that the clock was set. It is a duplicate if a stored packet has the same time and the same
-bytes; bytes are compared by their CRC-32. A late packet is inserted between its neighbours, and the
-number of packets missing between them is corrected. In the end, the counters are the same as if the
-packets had arrived in order.
+`ClockOrder` compares each datagram with the newest packets. A datagram is a duplicate if a stored
+packet has the same time and the same bytes. Each packet gets an index, a sequence number with gaps
+for missing packets, and an order, by which `Reorder` sorts the packets. The order is the time since
+the first packet in nanoseconds.
 
-Each packet gets an index, a sequence number that leaves out a number for each missing packet, and
-an order, which is its sort key. The order is the time of the packet since the first packet, in
-nanoseconds. Packets of equal time that are not duplicates get different orders. If the clock was
-set or the sensor restarted, the order increases by `2 * MAX_STEP_NS`. `Reorder` sorts the packets
-by their order, and uses a second `ClockOrder` to find the index and the breaks of the sorted
-packets.
-
-If the pace of the clock is not declared, lost packets are not found, and the index has no gaps. A
-gap at a masked sector (`masked_sector`) is not a loss.
+If the pace of the clock is not declared, lost packets are not found, and the index has no gaps.
 """
 
 from __future__ import annotations
@@ -50,7 +40,7 @@ _time_of = attrgetter("time")
 
 @dataclass
 class RecentPacket:
-    """One of the newest packets.
+    """A packet that was received recently.
 
     Attributes:
         time: the time by the sensor's clock, ns.
@@ -130,10 +120,7 @@ class ClockOrder:
         return index, order
 
     def forget(self) -> None:
-        """Forget all stored packets, because input was lost.
-
-        The next packet is treated as if the clock had been set before it.
-        """
+        """Forget all stored packets, because input was lost."""
         self._arrived = None
         self._neighbours.clear()
         if self._gaps is not None:
@@ -157,12 +144,7 @@ class ClockOrder:
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Store consecutive packets, and return the index of the first of them.
-
-        Args:
-            start: the row of the first packet.
-            stop: the row after the last packet.
-        """
+        """Store consecutive packets, and return the index of the first of them."""
         assert self._newest is not None
         first = self._newest.index + 1
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
@@ -178,11 +160,8 @@ class ClockOrder:
         return first
 
     def _place(self, batch: Batch, row: int, time: int, pace: float) -> RecentPacket:
-        """Store a packet that does not directly follow the newest packet, and return it.
-
-        For a duplicate, returns the packet that was stored first. The counters of lost, late and
-        duplicate packets are updated.
-        """
+        """Store a packet that does not directly follow the newest packet, and return it."""
+        # For a duplicate, the packet that was stored first is returned.
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
             return self._restart(batch, row, time, checksum)
@@ -246,10 +225,7 @@ class ClockOrder:
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
     def _restart(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
-        """Store the first packet of the stream, or the first one after the clock was set.
-
-        If the clock was set, one index is left out.
-        """
+        """Store the first packet of the stream, or the first one after the clock was set."""
         before = self._newest
         if before is None:
             self._offset = -time
@@ -271,11 +247,7 @@ class ClockOrder:
     def _insert(
         self, position: int, row: int, time: int, pace: float, checksum: int
     ) -> RecentPacket:
-        """Store a late packet, and correct the number of packets missing around it.
-
-        Args:
-            position: the position at which to insert the packet into `_neighbours`.
-        """
+        """Store a late packet, and correct the number of packets missing around it."""
         self._stats.late += 1
         after = self._neighbours[position]
         missing_after = _count_missing(after.time - time, pace)

@@ -15,14 +15,7 @@ Values = NDArray[np.float64]
 
 
 def read_clock_status(packets: Packets) -> Values:
-    """Return the clock's status at each packet, (n,).
-
-    `ClockStatus.state_of` gives the meaning of a value. The value is nan if the sensor does not
-    send its status in this frame type, or has not sent it before the packet.
-
-    Args:
-        packets: packets of a frame type that has a clock.
-    """
+    """Return the clock's status at each packet, (n,); nan if it was not sent."""
     clock = find_clock(packets.sensor, packets.frame)
     unknown = np.full(len(packets), np.nan)
     if clock is None or clock.status is None:
@@ -38,11 +31,7 @@ def read_clock_status(packets: Packets) -> Values:
 
 
 def frame_status(status: ClockStatus, frames: Table) -> Values:
-    """Return the clock's status in each frame, (n,); nan in frames without the field.
-
-    Args:
-        frames: frames of the type that has the field.
-    """
+    """Return the clock's status in each frame, (n,); nan in frames without the field."""
     if callable(status.source):
         batch = Batch(frames, np.zeros(len(frames), np.bool_))
         column = status.source(Fields(batch))

@@ -28,27 +28,16 @@ _MAX_READING_NS = 9 * 10**18
 
 
 class Unwrapper:
-    """Unwraps the readings of a clock that starts again after `wraps_at` seconds.
-
-    The result is exact over any number of wraps.
-
-    A reading that is ahead by more than half a wrap period counts as a step backward, because the
-    packet is late. Arrival times are used in two cases. After a pause of more than three quarters
-    of a period, they give the number of wraps. After a pause of more than half a period, they can
-    show that the step was forward.
-    """
+    """Unwraps the readings of a clock that starts again after `wraps_at` seconds."""
 
     def __init__(self, wraps_at: float | None) -> None:
         self._period_ns = to_exact_ns(wraps_at) if wraps_at else 0
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
-        """Return the readings of the next packets, unwrapped, (n,) ns.
-
-        Args:
-            ns: the readings, (n,) ns.
-            host: arrival times, (n,) ns; 0 if unknown.
-        """
+        """Return the readings of the next packets, unwrapped, (n,) ns."""
+        # A reading that is ahead by more than half a period is the step back of a late packet,
+        # unless the arrival times show a pause of more than half a period.
         if not self._period_ns or not len(ns):
             return ns
         raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
@@ -97,19 +86,18 @@ class ClockReference:
 
 
 class ClockEpoch:
-    """The offset from unwrapped times to times since 1970.
+    """Finds the offset from the times of a clock to times since 1970.
 
-    The date comes from frames of another type (see `Clock.reference`).
+    The date comes from frames of another type (`Clock.reference`).
 
     Args:
         sensor: the sensor that declares the clock.
         clock: the clock.
-        reference: the reference that dates the clock from the first packet on; None if the offset
-            is unknown until a frame reports the date.
+        reference: a date that applies from the first packet on; None if unknown.
 
     Attributes:
         frame: the type of the frames that report the date.
-        ns: the offset, ns, to add to the times of an `Unwrapper`; None while it is unknown.
+        ns: the offset, ns; None while it is unknown.
     """
 
     def __init__(
@@ -127,10 +115,7 @@ class ClockEpoch:
     def push(
         self, batch: Batch, readings: Times, times: Times, host: Times, *, whole: bool = False
     ) -> Times:
-        """Return the offset to add to the times of packets, (n,) ns.
-
-        The offset is 0 for packets before the first frame that reports the date, unless `whole` is
-        set.
+        """Return the offset to add to the times of packets, (n,) ns; 0 if unknown.
 
         Args:
             batch: the packets.
@@ -167,7 +152,6 @@ class ClockEpoch:
         """Return the offset from unwrapped times to times since 1970, ns.
 
         Args:
-            reference: the date of a clock reading.
             reading: the clock reading of any packet, ns.
             time: the unwrapped time of this packet, ns.
             host: the arrival time of this packet, ns; 0 if unknown.
@@ -178,13 +162,11 @@ class ClockEpoch:
         return self._find_nearest_time(reference.reading_ns, reference.reported_s) - time - passed
 
     def _find_nearest_time(self, reading: int, seconds: float) -> int:
-        """Return the time at which the clock shows a reading, ns since 1970.
-
-        The clock shows each reading repeatedly. The result is the time nearest to `seconds`.
+        """Return the time nearest to a date at which the clock shows a reading, in ns.
 
         Args:
             reading: the reading, ns.
-            seconds: a date, seconds since 1970.
+            seconds: the date, seconds since 1970.
         """
         return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
@@ -209,8 +191,7 @@ def reference_readings(sensor: SensorDescription, table: Table) -> Times:
 def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     """Return the clock reading of each packet, (n,) int64 ns, not unwrapped.
 
-    If the clock is in the parts of a frame, the reading is that of the first part. A frame without
-    parts gets the reading of the previous frame.
+    A frame without a reading gets the reading of the previous frame.
     """
     which, readings = read_clock(sensor, batch)
     if which is None:
@@ -221,8 +202,7 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
     """Return the rows of packets that have a clock reading, and the readings in ns.
 
-    The rows are None if all packets have a reading. A frame has no reading if it lacks a field of
-    the clock. If the clock is in the parts of a frame, the reading is that of the first part.
+    The rows are None if all packets have a reading.
     """
     assert sensor.clock is not None
     fields = clock_fields(sensor.clock)
@@ -252,8 +232,7 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     Args:
         which: the rows of the packets that have a time, ascending, (k,).
         times: the times of these packets, (k,).
-        before: a time for each packet, (n,). It is used for packets before the first packet that
-            has a time.
+        before: the times to use before the first row of `which`, (n,).
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
@@ -286,10 +265,7 @@ def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
 
 @lru_cache(maxsize=256)
 def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
-    """Return the axis and the kind of the parts that contain a clock's fields.
-
-    Returns None if the frame itself has these fields.
-    """
+    """Return the axis and the kind of the parts that contain a clock, or None."""
     places = set[tuple[str, str]]()
     for path in fields:
         if path in schema.fields:
@@ -310,16 +286,13 @@ def part_times(
     which: NDArray[np.intp],
     times: Times,
 ) -> Times:
-    """Return the times of parts, (k,) ns.
-
-    Parts without a clock of their own get the times of their frames.
+    """Return the times of the parts of frames, (k,) ns.
 
     Args:
         place: the axis and the kind of the parts.
         table: the parts.
         which: the row of the frame of each part, (k,).
-        times: for each part, the time of its frame, (k,). If the clock is in the parts, this is the
-            time of the first part.
+        times: for each part, the time of its frame, (k,).
     """
     if not len(which) or sensor.clock is None or not _has_fields_in_parts(sensor.clock, place):
         return times
@@ -369,8 +342,9 @@ def clock_terms(
 ) -> list[tuple[str, Any, Any, int]]:
     """Return (path, step, zero, limit) of the fields that add up to a clock.
 
-    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. `limit` is the largest
-    raw value whose ns fit into 64 bits. It is 0 if `step` or `zero` is a fraction.
+    `step` is the ns per raw step, and `zero` is the ns at the raw value 0. They are integers or
+    fractions. `limit` is the largest raw value that can be converted with int64; it is 0 for
+    fractions.
 
     Raises:
         SpecError: if a field has no unit of time, or does not have one value in each packet.
@@ -398,11 +372,7 @@ def clock_terms(
 
 
 def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Return the ns per raw step of a field, and the ns at its raw value 0.
-
-    The results are ints if both are whole, else fractions. Returns None if `unit` is not a unit of
-    time.
-    """
+    """Return the ns per raw step and the ns at raw 0; None for other units than time."""
     per_unit = factor(unit, "s")
     if per_unit is None:
         return None
@@ -413,10 +383,10 @@ def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | N
 
 
 def _compute_steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
-    """Return the difference of each value from the value before it, (n,).
+    """Return the difference of each value from the previous value, (n,).
 
     Args:
-        before: the value before the first.
+        before: the previous value of the first value.
     """
     steps = np.empty(len(values), np.int64)
     steps[0] = values[0] - before

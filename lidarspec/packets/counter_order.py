@@ -1,15 +1,11 @@
 """Find lost, late and duplicate packets by their counter (`PacketCounter`).
 
-`CounterOrder` gives each packet an index, which is the unwrapped counter. The index leaves out a
-number for each missing packet, and a late packet gets the number that was left out for it. Lost,
-late and duplicate packets and the completeness of scans follow from the index.
+`CounterOrder` gives each packet an index, which is the unwrapped counter with gaps for missing
+packets. A late packet fills the gap that was left for it.
 
-A clock with a declared pace also shows how often the counter wrapped in a gap, and whether a jump
-of the counter comes from a corrupt value. Without a pace, the loss of a whole period of the counter
-is not found. A single corrupt value then breaks the stream before and after its packet, but no
-packet is counted as lost.
-
-A gap at a masked sector (`masked_sector`) is not a loss.
+If the pace of the clock is declared, the clock shows how often the counter wrapped in a gap, and
+whether a value of the counter is corrupt. Without a pace, the loss of a whole period of the counter
+is not found.
 """
 
 from __future__ import annotations
@@ -92,10 +88,7 @@ class CounterReadings:
 
 @dataclass
 class CountedLoss:
-    """The numbers of lost and of masked packets in a gap of the counter.
-
-    See `masked_sector.GapLoss`.
-    """
+    """The numbers of lost and of masked packets in a gap of the counter."""
 
     missing: int
     masked: int = 0
@@ -107,7 +100,7 @@ class CounterJump:
 
     Attributes:
         number: the counter of the packet before the jump.
-        loss: the loss counted for the jump; None if the sensor seemed to have restarted.
+        loss: the loss counted for the jump; None if no loss was counted.
     """
 
     number: int
@@ -145,13 +138,13 @@ class CounterOrder:
         self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet in the stream, and the breaks before packets.
+        """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
-        Both have the shape (n,). The index has gaps for lost packets.
+        The index has gaps for lost packets.
 
         Args:
-            batch: the packets. `batch.breaks` marks the packets with skipped bytes before them. The
-                returned breaks contain these marks, and marks for lost packets.
+            batch: the packets. `batch.breaks` marks skipped bytes; the returned breaks contain
+                these marks.
             times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
@@ -165,10 +158,7 @@ class CounterOrder:
     def _place_all(
         self, batch: Batch, times: Times | None
     ) -> tuple[NDArray[np.int64] | range, NDArray[np.bool_]]:
-        """Return the index of each packet in the stream, and the breaks before packets.
-
-        The index has gaps for lost packets.
-        """
+        """Return the index of each packet in the stream, and the breaks before packets."""
         count = len(batch)
         readings = self._read_batch(batch, times)
         self._gaps.read(batch.table)
@@ -241,10 +231,8 @@ class CounterOrder:
         return int(last)
 
     def _find_unexpected(self, readings: CounterReadings) -> list[int]:
-        """Return the rows of packets that do not directly follow the previous packet.
-
-        Row 0 is not included.
-        """
+        """Return the rows of packets that do not directly follow the previous packet."""
+        # Row 0 is not included.
         numbers = readings.numbers
         if readings.has_counter is not None and not readings.has_counter.all():
             return list(range(len(numbers)))
@@ -270,11 +258,8 @@ class CounterOrder:
     def _count_places_ahead(
         self, readings: CounterReadings, row: int
     ) -> tuple[int | None, int | None]:
-        """Return how many places a packet is ahead of the newest, and its counter value.
-
-        The counter value is corrected by the clock. The number of places is None if the sensor has
-        restarted.
-        """
+        """Return how many places a packet is ahead of the newest, and its counter value."""
+        # The number of places is None if the sensor has restarted.
         number = readings.number(row)
         if number is None:
             return 1, self._number
@@ -305,9 +290,7 @@ class CounterOrder:
         return self._correct(number, time, pace, by_clock)
 
     def _count_by_number(self, ahead: int, period: int) -> int | None:
-        """Return how many places a packet is ahead of the newest, by the counter alone.
-
-        Returns None if the sensor has restarted.
+        """Return how many places a packet is ahead; None if the sensor has restarted.
 
         Args:
             ahead: the counter minus the newest packet's counter, modulo `period`.
@@ -326,14 +309,9 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Correct a counter that contradicts the clock.
-
-        If the counter continues the previous counter that contradicted the clock, the sensor has
-        reset its counter. The counter is then returned unchanged.
-
-        Returns:
-            How many places the packet is ahead of the newest packet, by the clock; and the counter.
-        """
+        """Return the places to advance by the clock, and the corrected counter."""
+        # A sensor that has reset its counter contradicts the clock again and again. Its counter is
+        # not corrected.
         ahead = max(round(by_clock), 1)
         suspect = self._suspect
         self._suspect = (number, time)
@@ -348,11 +326,7 @@ class CounterOrder:
     def _place(
         self, readings: CounterReadings, row: int, ahead: int | None, number: int | None
     ) -> tuple[int, bool]:
-        """Return the index of a packet that does not directly follow the newest.
-
-        Returns:
-            The index, and whether there is a break before the packet.
-        """
+        """Return the index of an unexpected packet, and whether a break precedes it."""
         if ahead is not None and ahead <= 0:
             return self._place_late(-ahead), False
         jump = self._jump
@@ -381,19 +355,14 @@ class CounterOrder:
             self._jump = CounterJump(self._number, loss)
 
     def _is_continued(self, jump: CounterJump, number: int | None) -> bool:
-        """Return whether a counter value continues the sequence before a jump.
-
-        If so, the value at the jump was corrupt.
-        """
+        """Return whether a counter value continues the sequence before a jump."""
+        # If so, the value at the jump was corrupt.
         if number is None:
             return False
         return 0 < (number - jump.number) % self._period <= MAX_PLACES_LATE
 
     def _add_loss(self, row: int, ahead: int) -> CountedLoss:
-        """Advance the index to a packet, and count the packets missing before it as lost.
-
-        Packets that a masked sector leaves out are not counted as lost.
-        """
+        """Advance the index to a packet, and count the packets missing before it as lost."""
         loss = CountedLoss(ahead - 1)
         before = self._index
         self._index += ahead
@@ -411,10 +380,7 @@ class CounterOrder:
         return loss
 
     def _restart(self, number: int | None) -> None:
-        """Begin with the first packet, or begin again after the sensor restarted.
-
-        No loss is counted. After a restart, one index is left out.
-        """
+        """Begin with the first packet, or begin again after the sensor restarted."""
         if self._index < 0 and number is not None:
             self._index = (number - self._rule.first) % self._period % MAX_INDEX_STEP
         else:

@@ -1,7 +1,4 @@
-"""The IMU samples of packets, and the buffer that assigns them to scans.
-
-Samples are in SI units and in the axes of the points.
-"""
+"""The IMU samples of packets, and the buffer that assigns them to scans."""
 
 from __future__ import annotations
 
@@ -33,10 +30,9 @@ class ImuSamples:
 
     Attributes:
         time_ns: (N,) int64, by the same clock as the times of the packets.
-        angular_velocity: (N, 3) float64 rad/s about x, y and z.
-        linear_acceleration: (N, 3) float64 m/s2 along x, y and z, including gravity.
-
-    A value is nan if the frame does not contain it.
+        angular_velocity: (N, 3) float64 rad/s about x, y and z; nan if not sent.
+        linear_acceleration: (N, 3) float64 m/s2 along x, y and z, including gravity; nan if not
+            sent.
     """
 
     time_ns: NDArray[np.int64]
@@ -100,12 +96,11 @@ def read_samples(
     Args:
         frame: the name of a frame type, or "name.path" for the parts of a frame.
         batch: the packets.
-        time_ns: the time of each packet, (n,). A sample whose `Imu.time` is nan has this time.
+        time_ns: the time of each packet, (n,), for samples without a time of their own.
 
     Raises:
         SpecError: if the frame type has no IMU data.
-        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
-            is chained.
+        PluginError: if the plugin's function fails or returns columns of a wrong shape.
     """
     function = sensor.imu_of(frame)
     # The padding of arrays and damaged packets may contain any values.
@@ -137,11 +132,7 @@ def read_samples(
 
 
 class WaitingSamples:
-    """A buffer that keeps IMU samples until their scan has ended.
-
-    `ScanStream` takes the samples when a scan ends. A scan has the samples from its first point to
-    the first point of the next scan. The first scan has all earlier samples as well.
-    """
+    """A buffer that keeps IMU samples until their scan has ended."""
 
     def __init__(self) -> None:
         self._parts: list[ImuSamples] = []
@@ -152,13 +143,7 @@ class WaitingSamples:
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Keep only the samples that were added last, so that memory is limited.
-
-        Samples are dropped when more than twice `most` are stored.
-
-        Args:
-            most: the number of samples to keep.
-        """
+        """Drop all but the newest `most` samples if more than twice as many are stored."""
         if sum(map(len, self._parts)) > 2 * most:
             self._parts = [join_samples(self._parts)[-most:]]
 

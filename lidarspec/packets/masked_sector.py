@@ -1,12 +1,10 @@
 """Detect masked sectors, in which a rotating sensor sends no packets.
 
-A user can configure many rotating sensors to mask a part of each revolution. At a masked sector the
-clock advances and the angle leaps, as if packets were lost. A gap belongs to a masked sector if it
-recurs at the same angles and no packet has ever come from these angles. After a real loss, packets
-from the missing angles arrive in other revolutions.
+A user can configure many rotating sensors to mask a part of each revolution. At a masked sector,
+the time and the angle advance as if packets were lost. A gap is a masked sector if it recurs at the
+same angles and no packet has ever come from these angles.
 
-All angles in this module are in turns, from 0 to 1. Widths are measured in the direction of
-rotation.
+All angles are in turns, from 0 to 1. Widths are measured in the direction of rotation.
 """
 
 from __future__ import annotations
@@ -48,13 +46,7 @@ VARYING_PACKETS = 2
 
 @dataclass(frozen=True)
 class Sector:
-    """A sector of a revolution.
-
-    Attributes:
-        start: the angle at which the sector begins, in turns.
-        width: the width of the sector, in turns.
-        direction: 1 if angles grow as the sensor rotates, else -1.
-    """
+    """A sector of a revolution."""
 
     start: float
     width: float
@@ -90,10 +82,7 @@ class Sector:
 
 
 def forward_step(step: float, direction: int) -> float:
-    """Return a step, measured in the direction of rotation, in turns from 0 to 1.
-
-    A step back by less than `MAX_JITTER_TURNS` counts as 0.
-    """
+    """Return a step in the direction of rotation, in turns from 0 to 1; 0 for jitter."""
     ahead = (direction * step) % 1
     if ahead > 1 - MAX_JITTER_TURNS:
         return 0.0
@@ -103,13 +92,8 @@ def forward_step(step: float, direction: int) -> float:
 class AngleReader:
     """Reads the angle at which each packet begins.
 
-    The sensor's rule for scans names the field of the angle.
-
-    Args:
-        sensor: the sensor that sends the packets.
-
     Attributes:
-        is_available: whether the sensor sends datagrams and its rule uses an angle field.
+        is_available: whether the sensor sends datagrams and its scans are cut by an angle field.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -126,10 +110,7 @@ class AngleReader:
         self.is_available = bool(self._path) and sensor.datagrams
 
     def angles(self, table: Table) -> Angles | None:
-        """Return the angle at which each packet begins, (n,), in turns.
-
-        Returns None if this angle cannot be read.
-        """
+        """Return the angle at which each packet begins, (n,), in turns; None if unknown."""
         if self.is_available:
             info = table.schema.fields.get(self._path)
         else:
@@ -147,10 +128,7 @@ class AngleReader:
         return np.mod((first * info.scale + info.offset) / full, 1.0)
 
     def direction(self, table: Table) -> int:
-        """Return the direction of rotation in the first packet of a table: 1 or -1.
-
-        Returns 0 if the packet does not show the direction.
-        """
+        """Return the direction of rotation in the first packet: 1 or -1; 0 if unknown."""
         if self._grows:
             return 1
         info = table.schema.fields[self._path]
@@ -191,12 +169,11 @@ class SectorFinder:
         Args:
             start: the angle of the packet before the gap, in turns.
             stop: the angle of the packet after the gap, in turns.
-            step: the angle from one packet to the next, in turns. The edges of a gap may vary by
-                about one step, because packets do not begin exactly at the edges of the sector.
+            step: the angle from one packet to the next, in turns.
 
         Returns:
-            The earlier gaps at the same sector: 1 for the newest of the earlier gaps, 2 for the
-            next older gap, and so on. The list is empty if no sector is found.
+            The earlier gaps at the same sector, numbered from the newest gap, which is 1; empty
+                without a sector.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
@@ -220,10 +197,7 @@ class SectorFinder:
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether all packets so far began outside of a sector.
-
-        Returns False if the sector is too narrow to tell.
-        """
+        """Return whether no packet has begun in a sector; False for a narrow sector."""
         edge = EDGE_STEPS * step + 1 / ANGLE_BINS
         inner = sector.width - 2 * edge
         if inner < step + 1 / ANGLE_BINS:
@@ -238,7 +212,7 @@ class GapLoss(Protocol):
 
     Attributes:
         missing: the number of packets that count as lost.
-        masked: the number of packets that a masked sector leaves out; they do not count as lost.
+        masked: the number of packets that a masked sector leaves out.
     """
 
     missing: int
@@ -247,11 +221,6 @@ class GapLoss(Protocol):
 
 class MaskedGaps:
     """Decides which gaps in one stream are at the masked sector, and which are losses.
-
-    The packets may be in any order. A gap counts as a loss until it recurs one revolution later.
-
-    Args:
-        sensor: the sensor that sends the packets.
 
     Attributes:
         masked: the number of packets that the masked sector leaves out; 0 until it is known.
@@ -297,7 +266,7 @@ class MaskedGaps:
         return self._angles.item(row)
 
     def count_masked(self, start: float, stop: float, missing: int) -> int:
-        """Return how many missing packets a masked sector leaves out; 0 if none is known.
+        """Return how many missing packets a masked sector leaves out; 0 without a sector.
 
         Args:
             start: the angle of the packet before the gap, in turns.
@@ -317,15 +286,13 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def revoke_losses(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """Count a loss and the earlier losses at the same angles as masked.
-
-        Nothing is changed if there is no earlier loss at these angles.
+        """Count a recurring loss, and earlier losses at the same angles, as masked.
 
         Args:
             row: the row of the packet after the loss.
             start: the angle of the packet before the loss, in turns.
             stop: the angle of the packet after the loss, in turns.
-            loss: the counts of the loss; changed if the loss is masked.
+            loss: the counts of the loss, which this method changes.
 
         Returns:
             The number of packets that no longer count as lost.

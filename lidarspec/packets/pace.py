@@ -1,7 +1,6 @@
 """Read the declared time from each packet to the next (`Clock.pace`).
 
-Without a declared pace, the clock cannot show lost packets. The pace is not estimated from the
-stream, because a stream with regular losses has regular steps as well.
+The pace is not estimated, because a stream with regular losses has regular steps as well.
 """
 
 from __future__ import annotations
@@ -23,10 +22,7 @@ MAX_STEP_NS = 3600 * 10**9
 
 
 def read_paces(clock: Clock, batch: Batch) -> Paces:
-    """Return the time from each packet to the next, (n,) ns; nan if not declared.
-
-    If all packets have one pace, the result is a zero-stride array.
-    """
+    """Return the time from each packet to the next, (n,) ns; nan if not declared."""
     if clock.pace is None:
         return np.broadcast_to(np.nan, (len(batch),))
     (seconds,) = header_function(clock.pace, batch.table.schema, _to_seconds)(batch)

@@ -1,8 +1,4 @@
-"""Decide how packets of one frame type are timed and how their losses are found.
-
-Both follow from the declaration of the sensor, so they are decided once for each frame type, not
-for each stream.
-"""
+"""Decide how packets of one frame type are timed and how their losses are found."""
 
 from __future__ import annotations
 
@@ -29,13 +25,11 @@ class PacketType:
         others: the names of the other frame types that packets of this type need as their state.
         clock: the clock of the packets; None without a clock.
         timed_sensor: the sensor, with its clock replaced by `clock`.
-        loss_clock: the clock that shows losses. None without a clock, or if the clock is in the
-            parts of a frame, because a frame without parts then has no time.
+        loss_clock: the clock that shows losses; None if there is no such clock.
         loss_clock_step_ns: the resolution of `loss_clock`, ns; 0 if a function computes the clock.
         clock_of_counter: the clock that checks the packet counter; None if there is no such clock.
         is_counted: whether the packets have a counter.
-        is_ordered_by_clock: whether the packets are ordered by their clock, because they are
-            datagrams that have a clock but no counter.
+        is_ordered_by_clock: whether the packets are datagrams that have a clock but no counter.
     """
 
     sensor: SensorDescription
@@ -99,12 +93,8 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 
 
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
-    """Return the clock of a frame type; None if it has no clock.
-
-    A frame type uses the clock that it declares, or else the clock of the sensor, if the frame has
-    the fields of this clock. In a sensor with points, a frame type without points and IMU data uses
-    only the clock that it declares.
-    """
+    """Return the clock of a frame type; None if it has no clock."""
+    # In a sensor with points, a type without points and IMU data does not use the sensor's clock.
     declared = sensor.frames[frame]
     shared = sensor.clock
     if declared.clock is not None or shared is None:
@@ -122,10 +112,8 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 
 
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
-    """Return whether packets of a frame type have a field.
-
-    Returns True if no frame type has the field, so that reading the field raises an error.
-    """
+    """Return whether packets of a frame type have a field."""
+    # If no type has the field, the answer is True, so that reading the field raises an error.
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [
         name

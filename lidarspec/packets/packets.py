@@ -30,9 +30,7 @@ StateOf = tuple[Table | None, NDArray[np.intp]]
 
 
 class Packets:
-    """n frames of one type, in stream order.
-
-    All arrays are read-only, because some of them share memory.
+    """n frames of one type, in stream order, as read-only arrays.
 
     Attributes:
         sensor: the sensor.
@@ -89,10 +87,7 @@ class Packets:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The index of each packet in the stream, (n,), with gaps for missing packets.
-
-        If the sensor has a counter, the index is the unwrapped counter.
-        """
+        """The index of each packet in the stream, (n,), with gaps for missing packets."""
         if callable(self._index):
             return self._index()
         return to_array(self._index)
@@ -126,7 +121,7 @@ class Packets:
         Values are nan in frames that lack the field.
 
         Raises:
-            UnknownField: if the frame has no such field. The error suggests the closest path.
+            UnknownField: if the frame has no such field.
         """
         info = self.table.schema.columns.get(path)
         if info is None:
@@ -193,14 +188,13 @@ class Packets:
         """Return the points with the returns of each firing along the last axis.
 
         The fields of the structured array are the columns of the points, "valid", and "missing" for
-        a return whose packet is lost. Its shape depends on the packets:
+        a return whose packet is lost. The shape depends on the sensor:
 
-        - If consecutive packets contain the returns (`PacketCounter.returns`): (groups of packets,
-          *shape of the points of a packet, returns), ordered by `return_index`, or by the counter
-          if the return indices of a group's packets are equal.
-        - If a packet contains all returns of its firings, at the same places in each packet:
-          (packets, *shape of the firings of a packet, returns).
-        - Otherwise: (firings, returns).
+        - The returns of a firing are in consecutive packets (`PacketCounter.returns`): (groups of
+          packets, *shape of the points of a packet, returns).
+        - A packet contains all returns of its firings, at the same places in each packet: (packets,
+          *shape of the firings of a packet, returns).
+        - For all other sensors: (firings, returns).
 
         Raises:
             SpecError: as for `points`.
@@ -211,9 +205,7 @@ class Packets:
         return arrange_returns(packets, packets.index)
 
     def imu(self) -> ImuSamples:
-        """Return the samples of the sensor's IMU in all packets, in stream order.
-
-        Columns are in SI units. Each sample has its own time.
+        """Return the samples of the sensor's IMU in all packets, in SI units.
 
         Raises:
             SpecError: if this frame type has no IMU data, or if its `imu` function fails or returns
@@ -250,11 +242,7 @@ class Packets:
         return packets
 
     def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
-        """Return those arguments of `Packets` that have one value per packet.
-
-        Args:
-            indices: the selected packets, (k,).
-        """
+        """Return the per-packet arguments of `Packets` for some of the packets."""
         columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
         order = None if self._order is None else self._order[indices]
         if self.masked is None:
@@ -266,15 +254,12 @@ class Packets:
     def parts(self, path: str) -> Packets:
         """Return the parts of all packets, in stream order, as packets.
 
-        Parts are frames within frames. They have the times, indices and state of their frames.
-
         Args:
-            path: the path of the parts, such as "blocks"; with several kinds of parts, path and
-                kind, such as "tlvs.points".
+            path: the path of the parts, such as "blocks", or with the kind, such as "tlvs.points".
 
         Raises:
-            UnknownField: if the frame does not have these parts, or if it has several kinds and the
-                path does not name one.
+            UnknownField: if the frame does not have these parts, or if there are several kinds and
+                none is named.
         """
         place = self.table.schema.split_part_path(path)
         if place is None:
@@ -316,10 +301,7 @@ class Packets:
 
     @property
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
-        """The frames that contain the packets, and the row of each packet's frame, (n,).
-
-        If the packets are whole frames, returns their own table, and a slice of all rows.
-        """
+        """The frames that contain the packets, and the row of each packet's frame, (n,)."""
         table, which = self.state.get(AROUND, (None, slice(None)))
         if table is None:
             return (self.table, slice(None))
@@ -381,12 +363,7 @@ def join_tables(tables: Sequence[Any]) -> Table:
 def _nested_dtype(
     schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str
 ) -> np.dtype[Any]:
-    """Return the structured dtype of one level of the struct.
-
-    Raises:
-        SpecError: if a name is a value in some branches of the struct, and a struct or an array in
-            others.
-    """
+    """Return the structured dtype of one level of the struct."""
     members: list[Any] = []
     seen: set[str] = set()
     for path, info in schema.columns.items():
@@ -416,11 +393,8 @@ def _nested_dtype(
 
 
 def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms that the path `here` has in the branches of a struct.
-
-    A form is a pair: whether the path is a value (else it is a struct), and the number of array
-    axes at this path.
-    """
+    """Return the forms of a path: whether it is a value, and its number of array axes."""
+    # A struct with branches can have a value in one branch, and a struct in another one.
     parts = [
         (path, info)
         for path, info in schema.columns.items()

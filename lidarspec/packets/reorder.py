@@ -1,15 +1,10 @@
 """Sort packets and drop duplicates.
 
 If a packet is missing, the packets after it are held until it arrives, or until more than `WINDOW`
-packets are held. All other packets are released at once, so sorting adds no delay unless a packet
-is late. Duplicates are dropped, and so are packets that arrive after a later packet was released.
-At the start, `WINDOW` packets are held, because the first packet to arrive may not be the first
-that was sent.
+packets are held. Packets without a gap before them are released at once.
 
-`Packets.order` is the sort key. It is the index of the packets if the sensor has a counter, else
-their time. If it is a time, the index and the places of missing packets are computed after sorting,
-so that scans do not depend on the order of arrival. A clock without a declared pace does not show
-that a packet is missing. With such a clock, `WINDOW` packets are always held.
+`WINDOW` packets are held at the start, because the first packet to arrive may not be the first that
+was sent. They are always held if the packets are sorted by a clock without a declared pace.
 """
 
 from __future__ import annotations
@@ -39,10 +34,7 @@ class Reorder:
         self._clock_order: ClockOrder | None = None
 
     def push(self, packets: Packets) -> list[Packets]:
-        """Add packets, and return a list of the packets that are released.
-
-        The list has at most one batch.
-        """
+        """Add packets, and return a list of at most one batch of released packets."""
         if not len(packets):
             return []
         held_count = 0

@@ -1,9 +1,8 @@
 """Find the returns of each firing, in consecutive packets or in one packet.
 
 Some sensors send each return of their firings in a packet of its own (`PacketCounter.returns`).
-These packets form a group with consecutive counters. A group is incomplete if some of its packets
-are lost; its firings then lack a return. `GroupCounter` counts incomplete groups, and
-`arrange_returns` puts the returns of each firing next to each other.
+These packets form a group with consecutive counters. A group is incomplete if one of its packets is
+lost.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def read_groups(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return each packet's group, its position in the group, and the group's size.
 
-    Each result has the shape (n,). A group is identified by the index of its first packet.
+    Each result has the shape (n,). The number of a group is the index of its first packet.
 
     Args:
         index: the index of each packet, (n,).
@@ -64,8 +63,6 @@ def describe_incomplete_groups(count: int) -> str:
 class GroupCounter:
     """Counts the incomplete groups of packets.
 
-    The packets of a group contain the returns of the same firings.
-
     Args:
         rule: the counter of the packets.
         stats: the counters; the groups are added to `incomplete_returns`.
@@ -81,11 +78,7 @@ class GroupCounter:
         self._counted = set[int]()  # those of them that are counted
 
     def push(self, batch: Batch, index: NDArray[np.int64]) -> None:
-        """Add packets, and count the groups that turn out to be incomplete.
-
-        Args:
-            index: the index of each packet, (n,).
-        """
+        """Add packets, and count the groups that turn out to be incomplete."""
         if not len(batch):
             return
         groups, places, sizes = read_groups(self._rule, batch, index)
@@ -111,10 +104,7 @@ class GroupCounter:
             self._forget(group)
 
     def _count_ended(self) -> None:
-        """Count the groups that have ended, and are incomplete.
-
-        A group has ended when its last packet or a later packet has arrived.
-        """
+        """Count the groups that have ended, and are incomplete."""
         for group, end in list(self._ends.items()):
             if end <= self._newest and group not in self._counted:
                 self._stats.incomplete_returns += 1
@@ -140,13 +130,7 @@ def _find_incomplete(
 
 
 def arrange_returns(packets: PacketBatch, index: NDArray[np.int64]) -> NDArray[Any]:
-    """Return the points of packets, with the returns of a firing along the last axis.
-
-    See `Packets.returns`.
-
-    Args:
-        index: the index of each packet, (n,).
-    """
+    """Return the points of packets, with the returns of a firing along the last axis."""
     points = evaluate(packets)
     cloud = points.cloud
     shape = points.counts.shape[1:]
@@ -172,13 +156,12 @@ def _place_by_return_index(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return `members`, with the return index of each packet as its position.
 
-    If the packets of a group do not have different return indices, their positions are unchanged.
-
     Args:
         members: for each packet, its group, its position in the group, and the size of the group,
             (n,).
         numbers: the return index of the points of each packet, (n, points).
     """
+    # If return indices occur twice in a group, its positions are kept.
     groups, places, sizes = members
     if not numbers.size:
         return members
@@ -215,14 +198,8 @@ def _join_packets(
 
 
 def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
-    """Return the indices of points, arranged by firings: (n, *firings, returns).
-
-    Returns None if the return indices differ between packets, if the returns have different numbers
-    of points, or if the return index varies along several axes.
-
-    Args:
-        numbers: the return index of each point, (n, ...).
-    """
+    """Return the indices of points, arranged by firings: (n, *firings, returns)."""
+    # The result is None if the packets do not have all returns at the same places.
     if not len(numbers) or (numbers != numbers[0]).any():
         return None
     first = numbers[0]
@@ -245,10 +222,7 @@ def _split_axis(numbers: NDArray[Any]) -> NDArray[np.intp] | None:
 
 
 def _gather(cloud: PointCloud, indices: NDArray[np.intp]) -> NDArray[Any]:
-    """Return a structured array of the points at some indices.
-
-    The point at the index `MISSING` is not valid.
-    """
+    """Return a structured array of the points at some indices."""
     columns = {**cloud.columns, "valid": cloud.valid}
     is_missing = indices == MISSING
     kinds = [(name, column.dtype) for name, column in columns.items()]

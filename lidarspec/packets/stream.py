@@ -1,10 +1,7 @@
 """Make packets from frames, with their times, losses, order and state.
 
-A `PacketStream` keeps the state that the next batch needs: the last clock reading, the newest
-packet, the last frame of each other type, and the number of bytes that were skipped since the last
-packet. Losses are found by the counter of the packets (`counter_order`). Without a counter, they
-are found by the clock of datagrams (`clock_order`), or else by skipped bytes and the order of
-arrival (`arrival_order`).
+`PacketStream` finds lost packets by their counter (`counter_order`). Without a counter, it uses the
+clock of datagrams (`clock_order`), or skipped bytes (`arrival_order`).
 """
 
 from __future__ import annotations
@@ -50,11 +47,10 @@ class PacketStream:
     Args:
         sensor: the sensor that sends the packets.
         frame: the frame type of the packets.
-        stats: the decoder's counters; lost, duplicate and late packets are added to them.
+        stats: the decoder's counters, to which lost, duplicate and late packets are added.
         backend: the back end that computes points: "auto", "numpy" or "jit".
-        state: frames of other types, by name, that are used as if they had arrived before the first
-            packet.
-        reference: the date of a clock reading, which is used from the first packet on; None if
+        state: frames of other types, by name, which apply from the first packet on.
+        reference: the date of a clock reading, which applies from the first packet on; None if
             unknown.
 
     Raises:
@@ -102,8 +98,8 @@ class PacketStream:
 
         Args:
             batches: frames of all types, in stream order.
-            whole: whether the frames are the whole input. If so, packets before the first frame of
-                another type use this frame as their state.
+            whole: whether the frames are the whole input. If so, the first frame of each other type
+                applies from the first packet on.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join_columns([self._read_columns(part) for part in parts])
@@ -151,11 +147,8 @@ class PacketStream:
     def _find_losses(
         self, batch: Batch, time: Integers | None, skipped: Integers
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
-        """Return the index of packets, the breaks before them, and their order, (n,) each.
-
-        Lost, late and duplicate packets are counted. The order is None unless the packets are
-        ordered by their clock. If the plugin raises, the packets keep the order of arrival.
-        """
+        """Return the index of packets, the breaks before them, and their order, (n,) each."""
+        # If the plugin raises, the packets keep the order of arrival.
         fallback = (range(len(batch)), batch.breaks)
         if self._clock_order is not None and time is not None:
             push = self._clock_order.push
@@ -177,13 +170,10 @@ class PacketStream:
         batch: Batch,
         *args: Any,
     ) -> Any:
-        """Call a function that runs plugin code and return its result.
-
-        If the function raises, the error is counted and `fallback` is returned.
+        """Call a function of a plugin; on an error, count it and return `fallback`.
 
         Args:
-            declaration: the part of the spec that contains the plugin code, such as "clock", for
-                the error.
+            declaration: the part of the spec that contains the function, such as "clock".
         """
         try:
             return function(batch, *args)
@@ -193,8 +183,6 @@ class PacketStream:
 
     def _read_times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
         """Return the unwrapped clock times of packets, (n,) ns, and store the last one.
-
-        A packet without a clock reading gets the time of the last packet with a reading.
 
         Args:
             batch: the packets.
@@ -218,10 +206,7 @@ class PacketStream:
         return hold_values(which, times, before)
 
     def _date_times(self, times: Integers) -> Integers:
-        """Return times in ns since 1970, if a frame has reported the date.
-
-        Otherwise return the times unchanged and set `stats.undated`, which is shown as a warning.
-        """
+        """Return times in ns since 1970; unchanged if no frame has reported the date."""
         if self._epoch is None or not len(times):
             return times
         if self._epoch.ns is None:
@@ -234,11 +219,8 @@ class PacketStream:
         return times + self._epoch_offset_ns
 
     def _count_skipped_bytes(self, part: OwnFrames) -> Integers:
-        """Return the number of bytes outside frames before each packet, (n,).
-
-        The bytes after the last packet are added to the count of the first packet in the next piece
-        of input.
-        """
+        """Return the number of bytes outside frames before each packet, (n,)."""
+        # The bytes after the last packet belong to the first packet of the next piece of input.
         gaps = part.piece.gaps
         rows = part.rows
         count = len(part.frames)
@@ -269,11 +251,7 @@ class PacketStream:
     def _find_states(
         self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return the frames that packets need as their state, by frame type.
-
-        For each type, the result has the frames, and an array (n,) with the row of the last frame
-        before each packet.
-        """
+        """Return the frames that packets need as their state, by frame type."""
         others = self._select_others(parts)
         return {
             name: self._find_state(
@@ -305,14 +283,8 @@ class PacketStream:
     def _find_state(
         self, name: str, others: Sequence[OtherFrames], *, packet_count: int, whole: bool
     ) -> StateOf:
-        """Return the frames of a type, and the row of the last frame before each packet.
-
-        The row is -1 if there is no earlier frame. The newest frame is stored for the next packets.
-
-        Args:
-            name: the frame type.
-            others: the new frames of this type.
-        """
+        """Return the frames of a type, and the row of the last frame before each packet."""
+        # The row is -1 if there is no earlier frame.
         last_frame = self._last_frames.get(name)
         if not others:
             return last_frame, repeat(-1 if last_frame is None else 0, packet_count)
@@ -341,9 +313,8 @@ class ImuStream:
         state: frames of other types, by name, see `PacketStream`.
 
     Attributes:
-        waiting: the samples of scans that have not ended. None if the sensor has no IMU, or if the
-            times of samples and points cannot be compared, because only some of the frame types
-            have a clock.
+        waiting: the samples of scans that have not ended; None without an IMU, or if only some of
+            the frame types have a clock.
     """
 
     def __init__(
@@ -365,8 +336,6 @@ class ImuStream:
         self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
     ) -> ImuSamples:
         """Return the IMU samples among the next frames, and add them to `waiting`.
-
-        Errors of a plugin are counted.
 
         Args:
             found: frames of all types, in stream order.
@@ -403,11 +372,7 @@ class ImuStream:
 
 
 def read_imu(packets: Packets) -> ImuSamples:
-    """Return the IMU samples of packets; an error of the plugin's function is counted.
-
-    Args:
-        packets: packets of a frame type with IMU samples.
-    """
+    """Return the IMU samples of packets; an error of the plugin's function is counted."""
     try:
         return packets.imu()
     except SpecError as error:
@@ -417,13 +382,7 @@ def read_imu(packets: Packets) -> ImuSamples:
 
 @dataclass(frozen=True, eq=False)
 class OwnFrames:
-    """The frames of one type in a piece of input.
-
-    Attributes:
-        frames: the frames of the type.
-        piece: all frames of the piece.
-        rows: the indices of `frames` in `piece`; a slice if they are consecutive.
-    """
+    """The frames of one type in a piece of input."""
 
     frames: Frames
     piece: Frames
@@ -453,12 +412,8 @@ class OwnFrames:
 
 
 def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
-    """Return the default data frame type of an input.
-
-    If the sensor has several data frame types, and none is configured, this is the type of the
-    first data frame in the input, or None if there is no data frame. Returns None for a sensor
-    without points.
-    """
+    """Return the default data frame type of an input; None without data frames."""
+    # Of several types, the type of the first data frame in the input is the default.
     names = sensor.data_frames
     if not sensor.has_points:
         return None
@@ -473,14 +428,7 @@ def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> s
 
 
 class _Columns(NamedTuple):
-    """The columns of some frames of one type, (n,) each.
-
-    Attributes:
-        table: the raw columns.
-        offset: offsets in the input; a `range` if the frames are consecutive and of one size.
-        at: arrival times, ns; -1 if unknown.
-        skipped: number of bytes outside frames before each frame.
-    """
+    """The columns of some frames of one type, (n,) each."""
 
     table: Table
     offset: Numbers
@@ -515,10 +463,7 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
-    """Return the values of all pieces of input.
-
-    If all values are equal, the result is a zero-stride array (`repeat`).
-    """
+    """Return the values of all pieces of input as one array."""
     values = {broadcast_value(part) for part in parts}
     if len(values) == 1:
         only = values.pop()

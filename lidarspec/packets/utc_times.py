@@ -1,13 +1,9 @@
 """Convert the times of one sensor to UTC.
 
-The time of a packet has one of three sources. If the sensor's clock has a date, UTC follows from
-what it counts (`Clock.epoch`) and from the leap seconds. If the clock counts from the full hour,
-the arrival time determines the hour. Every other clock counts from power-up or was never set. Its
-times are converted to the clock of the host by the arrival times of the fastest packets
-(`clock_estimate`).
-
-The source can change, for example if the clock gains or loses its lock, if a frame reports the
-date, or if the sensor restarts. Each change is kept with its time, and described in `warnings`.
+UTC comes from one of three sources: from the sensor's clock, if the clock has a date; from the
+clock and the arrival time, if the clock counts from the full hour; from arrival times alone in all
+other cases. If the source changes, for example because the clock loses its lock, the change is kept
+with its time.
 """
 
 from __future__ import annotations
@@ -39,10 +35,9 @@ class UtcSource:
     """The source of UTC.
 
     Attributes:
-        kind: "clock" if the sensor's clock has a date; "hour" if the clock counts from the full
-            hour and the arrival time gives the hour; "arrival" if UTC comes from arrival times
-            alone.
-        epoch: what the clock counts, a key of `spec.timing.EPOCHS`.
+        kind: "clock" for a clock with a date; "hour" for a clock that counts from the full hour;
+            "arrival" if UTC comes from arrival times alone.
+        epoch: the declared epoch, a key of `spec.timing.EPOCHS`.
         locked: whether the clock is locked; None if unknown.
         state: the meaning of the clock's status; "" if unknown.
     """
@@ -113,7 +108,7 @@ class UtcTimes:
         name: the name of the source, for messages.
 
     Attributes:
-        changes: the sources of UTC so far, each with the time at which it begins to apply.
+        changes: the sources of UTC so far.
     """
 
     def __init__(self, sensor: str, clock: Clock | None, name: object = "the source") -> None:
@@ -169,19 +164,11 @@ class UtcTimes:
         return int(utc_ns.item())
 
     def convert(self, packets: Packets) -> Times:
-        """Return the UTC of packets, (n,) ns.
-
-        Raises:
-            UsageError: as for `to_utc`.
-        """
+        """Return the UTC of packets, (n,) ns."""
         return self._convert(packets.time_ns, packets.host_ns, read_clock_status(packets))
 
     def _convert(self, times: Times, host: Times, status: NDArray[np.float64]) -> Times:
-        """Return the UTC of times by the sensor's clock, (n,) ns since 1970.
-
-        Args:
-            times, host, status: as for `to_utc`, (n,).
-        """
+        """Return the UTC of times by the sensor's clock, (n,) ns since 1970."""
         status = self._fill_status(status)
         utc_ns = np.empty(len(times), np.int64)
         known_status = np.nan_to_num(status)
