@@ -1,17 +1,11 @@
 """Convert many files, large files in pieces, in several processes or on a cluster.
 
-The captures are given by path, pattern or URL. `convert` writes a file of points for each capture,
-or several files if the capture is larger than a piece, and a manifest. `read` returns a Dask
-dataframe with a partition for each piece. Tasks are run by `concurrent.futures`, or by a Dask
-cluster.
+`convert` writes files of points and a manifest. `read` returns a Dask dataframe with a partition
+for each piece of a file.
 
-A large file is cut by `device.file_scans`. The starts of its pieces are found one after the other:
-a task reads through a piece without computing points, and returns the bookmark of the next piece.
-Meanwhile, other tasks compute the points of pieces whose starts are known.
-
-The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: the
-input, the sensor and versions, and the output or the error. If all lines and results of a file
-exist, the file is not read again. Each line is written after its result.
+The manifest is the file `manifest.jsonl` in the folder of the results. For each piece, it has a
+line of JSON with the input, the sensor, the versions, and the output or the error. A file is not
+converted again if all its lines and results exist.
 """
 
 from __future__ import annotations
@@ -92,11 +86,10 @@ class FilePiece:
         source: the path or URL of the file.
         sensor: the sensor's id; "" to detect the sensor.
         options: the sensor's options, by name.
-        target: the output file; "" without output. If the source has several pieces, the number of
-            the piece is added to the file's name.
+        target: the path of the output, without the number of the piece; "" without output.
         every_point: whether to include points without a valid return.
-        size: size of a piece in bytes.
-        select: the selected scans. If they are selected by time or number, the file is not cut.
+        size: the size of a piece in bytes.
+        select: the selected scans of the file.
         number: the number of the piece in the file, from 0.
         first: the number of the piece's first scan in the file, from 0.
         count: the number of scans in the piece; None for all scans up to the end of the file.
@@ -190,12 +183,7 @@ def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """Count the scans of a piece, and find the next piece.
-
-    Returns:
-        A copy of the piece with the number of scans, followed by the next piece of the file if
-        there is one.
-    """
+    """Return the piece with its number of scans, and the next piece if there is one."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -236,7 +224,7 @@ def _count_scans(piece: FilePiece, scans: Iterator[Scan], counts: Record) -> Ite
 
 
 def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
-    """Write scans to the output of the piece. The file appears when it is complete."""
+    """Write scans to the output of the piece."""
     if not is_remote(piece.output):
         with system_errors(piece.output):
             Path(piece.output).parent.mkdir(parents=True, exist_ok=True)
@@ -258,7 +246,7 @@ def make_pieces(
     size: int,
     select: Selection,
 ) -> list[FilePiece]:
-    """Return all files that match paths, patterns and URLs, each as one piece.
+    """Return a piece for each file that matches the paths, patterns and URLs.
 
     Raises:
         SourceError: if no file matches.
@@ -312,9 +300,6 @@ def _is_record(value: Any) -> bool:
 class Manifest:
     """The records of the pieces in a folder, from this run and earlier runs.
 
-    Args:
-        folder: the path or URL of the folder.
-
     Raises:
         SourceError: if the folder cannot be written to.
 
@@ -350,11 +335,7 @@ class Manifest:
             return []
 
     def _store_line(self, line: str, number: int) -> bool:
-        """Store the record of a line; return False if the line is incomplete or damaged.
-
-        Raises:
-            SourceError: if the brackets of the line are nested too deeply.
-        """
+        """Store the record of a line; return False if the line is damaged."""
         try:
             record = json.loads(line)
         except ValueError:
@@ -470,12 +451,7 @@ def _exit_with_parent() -> None:
 
 @contextlib.contextmanager
 def _open_executor(jobs: int, scheduler: str) -> Iterator[Executor]:
-    """Yield an executor: this process, other processes, or a Dask cluster.
-
-    Raises:
-        UsageError: if Dask is not installed.
-        SourceError: if the scheduler cannot be reached.
-    """
+    """Yield an executor: this process, other processes, or a Dask cluster."""
     if scheduler:
         distributed = import_library("distributed", "dask")
         try:
@@ -517,24 +493,23 @@ def convert(
 ) -> Iterator[tuple[Record, bool]]:
     """Write the points of many files into a folder.
 
-    For each finished piece, a tuple is yielded: the record of the piece, and whether the piece was
-    finished in an earlier run. If a piece fails, its record has an "error", and the other pieces
-    are still converted.
+    Yields the record of each finished piece, and whether an earlier run finished the piece. If a
+    piece fails, its record has the key "error", and the function continues with the next piece.
 
     Args:
         sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
-        folder: the path or URL of the folder. The path of an output in the folder is the path of
-            its source, without the part of the pattern before the first wildcard.
+        folder: the path or URL of the folder. With the pattern above, the points of drives/a/b.pcap
+            are written to a/b.parquet in this folder.
         to: the suffix of a format, such as "parquet".
         sensor: an id, a path or a Sensor; by default, the sensor of each file is detected.
         jobs: number of processes on this computer.
-        scheduler: the address of a Dask scheduler whose workers are used. They must have access to
-            the sources and the folder.
+        scheduler: the address of a Dask scheduler. Its workers need access to the sources and the
+            folder.
         every_point: whether to include points without a valid return.
-        select: the selected scans of each file. If they are selected by time or number, files are
-            not cut.
-        size: the size of a piece in bytes. A larger file is cut, and its points are written to
-            several files.
+        select: the selected scans of each file. A file is not cut if its scans are selected by time
+            or number.
+        size: the size of a piece in bytes. A file that is larger than a piece is cut, and has
+            several outputs.
         force: whether to convert finished pieces again.
 
     Raises:
@@ -576,10 +551,8 @@ def convert(
 def _iter_results(
     executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
-    """Yield the record of each finished piece, and whether it is from an earlier run.
-
-    Pieces for which `done` returns a record are not converted again.
-    """
+    """Yield the record of each finished piece, and whether it is from an earlier run."""
+    # While one task searches for the start of the next piece, others convert earlier pieces.
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
@@ -619,10 +592,7 @@ def _iter_results(
 
 
 def _is_large(piece: FilePiece) -> bool:
-    """Return whether a file must be cut, because it is larger than a piece.
-
-    Returns False if its size is unknown, or if the selection needs all scans of a file.
-    """
+    """Return whether a file has to be cut, because it is larger than a piece."""
     if piece.select.needs_all_scans:
         return False
     with contextlib.suppress(LidarSpecError):
@@ -631,10 +601,7 @@ def _is_large(piece: FilePiece) -> bool:
 
 
 def _check_format(to: str) -> None:
-    """Check that the library of a format is installed, before any input is read.
-
-    The check writes an empty file.
-    """
+    """Check that the library of a format is installed, before any input is read."""
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(ValueError, IndexError):
         write(Path(folder) / f"none.{to}", [])
 
@@ -665,16 +632,15 @@ def read(
 ) -> Any:
     """Return the points of many files as a Dask dataframe, one partition per piece.
 
-    The columns are those of a Parquet file. If a file is larger than a piece, this call reads
-    through the file to cut it into pieces, without computing points. Points are computed only when
-    Dask needs them.
+    The columns are those of a Parquet file. This function reads through large files to cut them
+    into pieces. Dask computes the points when it needs them.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
         sensor: an id, a path or a Sensor; by default, the sensor of each file is detected.
         every_point: whether to include points without a valid return.
-        select: the selected scans of each file. If they are selected by time or number, files are
-            not cut.
+        select: the selected scans of each file. A file is not cut if its scans are selected by time
+            or number.
         size: the size of a piece in bytes. The points of a piece take about ten times as much
             memory.
 
